@@ -1,5 +1,5 @@
-"""GTSAM factors for people seen by calibrated cameras: keys, noise, projection, body priors, motion,
-contact.
+"""GTSAM factors for people seen by calibrated cameras: keys, noise, projection, body priors,
+motion, contact.
 
 Only GTSAM and NumPy. Builders take keys, arrays and noise, and return native
 `gtsam.NonlinearFactor`s for a graph of your own. Units: metres in the world, pixels in the image;
@@ -28,7 +28,12 @@ from factors.keys import (
     velocity_key,
     velocity_keys,
 )
-from factors.lasting import lasting_blocks, lasting_difference_factors, lasting_prior_factors, offset_factors
+from factors.lasting import (
+    lasting_blocks,
+    lasting_difference_factors,
+    lasting_prior_factors,
+    offset_factors,
+)
 from factors.linear import linear_factor
 from factors.motion import (
     CONSTANT_ACCELERATION,

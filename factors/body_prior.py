@@ -30,7 +30,11 @@ def body_prior_factor(
     point = np.asarray(mean, dtype=np.float64)
     if point.shape != (3,) or not np.isfinite(point).all():
         raise ValueError(f"mean must be three finite metres, got {mean}")
-    model = isotropic(3, sigma_m, kernel) if sigma_m is not None else gaussian(np.asarray(covariance), kernel)
+    model = (
+        isotropic(3, sigma_m, kernel)
+        if sigma_m is not None
+        else gaussian(np.asarray(covariance), kernel)
+    )
     return gtsam.PriorFactorPoint3(key, point, model)
 
 
@@ -40,15 +44,17 @@ def body_prior_factors(
     covariances: ArrayLike,
     kernel: Kernel | None = None,
 ) -> list[gtsam.NoiseModelFactor]:
-    """One prior for each of D joints: `keys` (D,), `means` (D, 3) metres, `covariances` (D, 3, 3)."""
+    """One prior for each of D joints: `keys` (D,), `means` (D, 3) metres, `covariances` (D, 3,
+    3).
+    """
     key_list = np.asarray(keys)
     points = np.asarray(means, dtype=np.float64)
     matrices = np.asarray(covariances, dtype=np.float64)
     count = len(key_list)
     if points.shape != (count, 3) or matrices.shape != (count, 3, 3):
         raise ValueError(
-            f"keys must be (D,), means (D, 3), covariances (D, 3, 3), got {key_list.shape}, {points.shape}, "
-            f"{matrices.shape}"
+            f"keys must be (D,), means (D, 3), covariances (D, 3, 3), got {key_list.shape}, "
+            f"{points.shape}, {matrices.shape}"
         )
     if not np.isfinite(points).all():
         raise ValueError("a mean holds a value that is not finite: give no prior to such a joint")

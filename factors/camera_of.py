@@ -45,7 +45,9 @@ def camera_of(pixel: Callable[[Array], Array | None], near: Array) -> Camera | N
         if not np.isfinite(off).all():
             return None
         steps = np.eye(11) * _STEP * _scales(camera)
-        slopes = [(_seen(_moved(camera, d), X) - _seen(_moved(camera, -d), X)).ravel() / 2 for d in steps]
+        slopes = [
+            (_seen(_moved(camera, d), X) - _seen(_moved(camera, -d), X)).ravel() / 2 for d in steps
+        ]
         change = np.linalg.lstsq(np.stack(slopes, axis=1), -off.ravel(), rcond=None)[0]
         camera = _moved(camera, change @ steps)
     return camera if np.abs(_seen(camera, X) - uv).max() < _EXACT_PX * np.abs(uv).max() else None

@@ -37,7 +37,9 @@ def standing_factors(
     if not (_positive(dt) and _positive(q)):
         raise ValueError("dt_s and density must be positive and finite: leave out empty steps")
     models = isotropic_models(3, np.sqrt(q * dt))
-    return list(map(gtsam.BetweenFactorPoint3, before.tolist(), after.tolist(), repeat(np.zeros(3)), models))
+    return list(
+        map(gtsam.BetweenFactorPoint3, before.tolist(), after.tolist(), repeat(np.zeros(3)), models)
+    )
 
 
 def _positive(values: NDArray[np.float64]) -> bool:

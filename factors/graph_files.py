@@ -7,7 +7,8 @@ numbers, in JSON:
 
     {"kind": "projection", "keys": [5], "data": [uv, K, wTc], "noise": R, "kernel": ["huber", 1.5]}
 
-`noise` is the upper triangular R that whitens the residual, R r; `data` are the arrays that `_KINDS` lists.
+`noise` is the upper triangular R that whitens the residual, R r; `data` are the arrays that
+`_KINDS` lists.
 """
 
 import json
@@ -41,9 +42,14 @@ def save_graph(file: str | Path, graph: gtsam.NonlinearFactorGraph, values: gtsa
     types that are not supported: Python functions, linearised factors on poses, constraints.
     """
     writer = _Writer(values)
-    factors = [writer.record(n, graph.at(n)) for n in range(graph.size()) if graph.at(n) is not None]
+    factors = [
+        writer.record(n, graph.at(n)) for n in range(graph.size()) if graph.at(n) is not None
+    ]
     lines = ",\n".join(map(json.dumps, factors))
-    text = f'{{"format": "{FORMAT}",\n"factors": [\n{lines}],\n"values": {json.dumps(writer.values())}}}\n'
+    text = (
+        f'{{"format": "{FORMAT}",\n"factors": [\n{lines}],\n"values": '
+        f"{json.dumps(writer.values())}}}\n"
+    )
     Path(file).write_text(text, encoding="utf-8")
 
 
@@ -67,12 +73,18 @@ def load_graph(file: str | Path) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Valu
             place = f"factor {n}"
             graph.push_back(_factor(record))
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RuntimeError) as error:
-        said = f"{error} is missing" if isinstance(error, KeyError) else str(error).strip().splitlines()[0]
+        said = (
+            f"{error} is missing"
+            if isinstance(error, KeyError)
+            else str(error).strip().splitlines()[0]
+        )
         raise ValueError(f"{file}: {place}: {said[:120]}; {_CURE}") from None
     return graph, values
 
 
-def draw_graph(graph: gtsam.NonlinearFactorGraph, formatter: Callable[[int], str] = format_key) -> str:
+def draw_graph(
+    graph: gtsam.NonlinearFactorGraph, formatter: Callable[[int], str] = format_key
+) -> str:
     """The graph in the language of Graphviz, for `dot -Tsvg`: variables are ellipses; factors are
     boxes, labelled with their kind.
     """
@@ -82,7 +94,9 @@ def draw_graph(graph: gtsam.NonlinearFactorGraph, formatter: Callable[[int], str
         factor = graph.at(n)
         if factor is not None:
             name = _name(factor) or type(factor).__name__
-            lines.append(f'  f{n} [shape=box, style=filled, fillcolor=gray90, label="{_quoted(name)}"];')
+            lines.append(
+                f'  f{n} [shape=box, style=filled, fillcolor=gray90, label="{_quoted(name)}"];'
+            )
             lines += [f"  v{key} -- f{n};" for key in factor.keys()]  # noqa: SIM118
     return "\n".join([*lines, "}\n"])
 
@@ -107,13 +121,17 @@ class _Kind:
     """Constructs a factor from keys, arrays and noise model."""
 
 
-def _triangulation(keys: list[int], uv: Array, K: Array, wTc: Array, noise: Any) -> gtsam.NonlinearFactor:
+def _triangulation(
+    keys: list[int], uv: Array, K: Array, wTc: Array, noise: Any
+) -> gtsam.NonlinearFactor:
     return gtsam.TriangulationFactorCal3_S2(make_camera(K, _pose(wTc).matrix()), uv, noise, keys[0])
 
 
 def _posed(keys: list[int], uv: Array, K: Array, bTc: Array, noise: Any) -> gtsam.NonlinearFactor:
     pose, joint = keys
-    return gtsam.GenericProjectionFactorCal3_S2(uv, noise, pose, joint, make_calibration(K), _pose(bTc))
+    return gtsam.GenericProjectionFactorCal3_S2(
+        uv, noise, pose, joint, make_calibration(K), _pose(bTc)
+    )
 
 
 def _motion(keys: list[int], dt: Array, density: Array, noise: Any) -> gtsam.NonlinearFactor:
@@ -178,7 +196,9 @@ class _Writer:
             if not all(map(self._values.exists, factor.keys())):
                 raise ValueError("has a variable that is not among the values")
             if name is None:
-                raise ValueError("is of a class that cannot be saved; linearise it (gtsam.LinearContainerFactor)")
+                raise ValueError(
+                    "is of a class that cannot be saved; linearise it (gtsam.LinearContainerFactor)"
+                )
             found: dict[str, Any] = {"kind": name, "keys": list(factor.keys())}
             if name == _LINEAR:
                 return found | _linear_data(factor)
@@ -186,7 +206,8 @@ class _Writer:
             if name != "motion":
                 found |= _noise_data(factor.noiseModel())
             for here, there in zip(
-                *(each.linearize(self._values).jacobian() for each in (factor, _factor(found))), strict=True
+                *(each.linearize(self._values).jacobian() for each in (factor, _factor(found))),
+                strict=True,
             ):
                 if not np.abs(here - there).max() <= 1e-9 * max(np.abs(here).max(), 1.0):
                     raise ValueError("would differ when it is read")
@@ -206,7 +227,9 @@ class _Writer:
                 found[name].append([key, (value if name == "point" else value.matrix()).tolist()])
                 break
             else:
-                raise ValueError(f"variable {format_key(key)} is neither Point3 nor Pose3: leave it out")
+                raise ValueError(
+                    f"variable {format_key(key)} is neither Point3 nor Pose3: leave it out"
+                )
         return found
 
     def _data(self, name: str, factor: Any) -> Iterable[Array]:
@@ -237,9 +260,13 @@ class _Writer:
         def pixel(point: Array) -> Array | None:
             at.update(key, point)
             off = np.asarray(factor.unwhitenedError(at))
-            return None if off[0] == off[1] else off + uv  # behind the camera the residual is (2 fx, 2 fx)
+            return (
+                None if off[0] == off[1] else off + uv
+            )  # behind the camera the residual is (2 fx, 2 fx)
 
-        points = near + np.array([[0.0, 0, 0], [0.3, 0.1, -0.2], [-0.2, 0.4, 0.1], [0.1, -0.3, 0.5]])
+        points = near + np.array(
+            [[0.0, 0, 0], [0.3, 0.1, -0.2], [-0.2, 0.4, 0.1], [0.1, -0.3, 0.5]]
+        )
         there = [pixel(each) for each in points]
         for n, camera in enumerate(self._cameras):
             if all(
@@ -287,14 +314,21 @@ def _linear_data(factor: gtsam.LinearContainerFactor) -> dict[str, Any]:
     for key in keys:
         origin.insert(key, np.zeros(3))
     linear = factor.linearize(origin) if factor.isJacobian() else None
-    A, b = linear.jacobian() if isinstance(linear, gtsam.JacobianFactor) else (np.zeros((0, 0)), np.zeros(0))
+    A, b = (
+        linear.jacobian()
+        if isinstance(linear, gtsam.JacobianFactor)
+        else (np.zeros((0, 0)), np.zeros(0))
+    )
     if A.shape[1] != 3 * len(keys):
         raise ValueError(
-            "a linear factor must be a Jacobian on points, because rotations change its point of linearisation"
+            "a linear factor must be a Jacobian on points, because rotations change its point of "
+            "linearisation"
         )
     off = factor.error(origin) - (b @ b) / 2
     if abs(off) > 1e-9 * max(b @ b, 1.0):
-        raise ValueError("has no point of linearisation, and so no error: create it with factors.linear_factor")
+        raise ValueError(
+            "has no point of linearisation, and so no error: create it with factors.linear_factor"
+        )
     return {"data": [A.tolist(), b.tolist()]}
 
 
@@ -304,10 +338,16 @@ def _factor(record: Any) -> gtsam.NonlinearFactor:
     if record["kind"] == _LINEAR:
         return _linear(keys, *record["data"])
     if kind is None:
-        raise ValueError(f"kind must be one of {', '.join(_KINDS)}, {_LINEAR}, got {str(record['kind'])[:40]!r}")
+        raise ValueError(
+            f"kind must be one of {', '.join(_KINDS)}, {_LINEAR}, got {str(record['kind'])[:40]!r}"
+        )
     if len(keys) != kind.keys or len(record["data"]) != len(kind.data):
-        raise ValueError(f"needs {kind.keys} keys and {len(kind.data)} arrays: {', '.join(kind.data)}")
-    arrays = [_array(each, shape) for each, shape in zip(record["data"], kind.data.values(), strict=True)]
+        raise ValueError(
+            f"needs {kind.keys} keys and {len(kind.data)} arrays: {', '.join(kind.data)}"
+        )
+    arrays = [
+        _array(each, shape) for each, shape in zip(record["data"], kind.data.values(), strict=True)
+    ]
     noise = None
     if record["kind"] != "motion":
         R = _array(record["noise"], (kind.rows, kind.rows))
@@ -317,7 +357,9 @@ def _factor(record: Any) -> gtsam.NonlinearFactor:
         if "kernel" in record:
             name, width = record["kernel"]
             if name not in ESTIMATORS or not 0 < float(width) < np.inf:
-                raise ValueError(f"kernel must be one of {', '.join(ESTIMATORS)}, with a positive width")
+                raise ValueError(
+                    f"kernel must be one of {', '.join(ESTIMATORS)}, with a positive width"
+                )
             noise = robust(noise, ESTIMATORS[name].Create(float(width)))
     return kind.make(keys, *arrays, noise)
 
@@ -345,7 +387,9 @@ def _array(numbers: Any, shape: tuple[int, ...]) -> Array:
 
 def _pose(matrix: Array) -> gtsam.Pose3:
     R = matrix[:3, :3]
-    if np.abs(R @ R.T - np.eye(3)).max() > _ROTATION_TOLERANCE or not np.array_equal(matrix[3], [0, 0, 0, 1]):
+    if np.abs(R @ R.T - np.eye(3)).max() > _ROTATION_TOLERANCE or not np.array_equal(
+        matrix[3], [0, 0, 0, 1]
+    ):
         raise ValueError("a pose must be a rotation and a translation, with a last row 0 0 0 1")
     return gtsam.Pose3(matrix)
 

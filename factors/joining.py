@@ -112,14 +112,18 @@ def reported_factor(
         here.insert(pose_key, pose)
         terms.append((pose_key, -root @ goes))
     make: Any = gtsam.JacobianFactor  # its constructors take keys and matrices alternately
-    linear = make(*(each for term in terms for each in term), np.zeros(3), gtsam.noiseModel.Unit.Create(3))
+    linear = make(
+        *(each for term in terms for each in term), np.zeros(3), gtsam.noiseModel.Unit.Create(3)
+    )
     return gtsam.LinearContainerFactor(linear, here)
 
 
 class PeopleInGraph:
     """Makes increments. Its only state is the last frame and time of each joint of each person."""
 
-    def __init__(self, space: KeySpace, *, kernel: Kernel | None = None, link_s: float = 0.25) -> None:
+    def __init__(
+        self, space: KeySpace, *, kernel: Kernel | None = None, link_s: float = 0.25
+    ) -> None:
         """Keys are taken from `space`. If a joint was not seen for longer than `link_s`, seconds,
         no motion factor connects it with its previous state. `link_s` must be shorter than the lag
         of a smoother, which has marginalised older states.
@@ -149,20 +153,28 @@ class PeopleInGraph:
         J = len(one.joints)
         placed = np.asarray(np.isfinite(one.joints).all(axis=-1))
         seen = np.isfinite(one.xy).all(axis=-1) & placed[:, None]
-        last_s, last_frame = self._last.setdefault(one.person, (np.full(J, -np.inf), np.zeros(J, dtype=np.int64)))
+        last_s, last_frame = self._last.setdefault(
+            one.person, (np.full(J, -np.inf), np.zeros(J, dtype=np.int64))
+        )
         if not one.time_s > last_s.max(initial=-np.inf):
-            raise ValueError(f"person {one.person}: frames must be in order of time, but {one.time_s} s is not")
+            raise ValueError(
+                f"person {one.person}: frames must be in order of time, but {one.time_s} s is not"
+            )
         linked = one.time_s - last_s <= self._link_s
         there = np.flatnonzero(seen.any(axis=1))
         x, v = (
-            keys(one.person, np.arange(J), one.frame) for keys in (self.space.positions, self.space.velocities)
+            keys(one.person, np.arange(J), one.frame)
+            for keys in (self.space.positions, self.space.velocities)
         )
         near, start = isotropic(3, _START_M), isotropic(3, CONSTANT_VELOCITY.start[0])
         for joint in there.tolist():
             position, velocity = int(x[joint]), int(v[joint])
             if linked[joint]:
                 before = one.person, joint, int(last_frame[joint])
-                states = [self.space.positions(*before), position], [self.space.velocities(*before), velocity]
+                states = (
+                    [self.space.positions(*before), position],
+                    [self.space.velocities(*before), velocity],
+                )
                 times_s = [last_s[joint], one.time_s]
                 made.graph.push_back(motion_factors(*states, times_s, one.density[joint])[0])
             else:
@@ -175,7 +187,9 @@ class PeopleInGraph:
             made.graph.push_back(factor)
         last_s[there], last_frame[there] = one.time_s, one.frame
 
-    def _seen(self, one: Sighting, seen: NDArray[np.bool_], x: NDArray[np.int64]) -> list[gtsam.NoiseModelFactor]:
+    def _seen(
+        self, one: Sighting, seen: NDArray[np.bool_], x: NDArray[np.int64]
+    ) -> list[gtsam.NoiseModelFactor]:
         posed = {n: each for n, each in enumerate(one.cameras) if isinstance(each, PosedCamera)}
         still = {n: each for n, each in enumerate(one.cameras) if not isinstance(each, PosedCamera)}
         carried = np.array([n in posed for n in range(len(one.cameras))], dtype=bool)
@@ -183,7 +197,12 @@ class PeopleInGraph:
         place = np.searchsorted(list(still), view)
         xy, sigmas = one.xy, one.sigmas_px
         factors = projection_factors(
-            list(still.values()), place, x[joint], xy[joint, view], sigmas[joint, view], self._kernel
+            list(still.values()),
+            place,
+            x[joint],
+            xy[joint, view],
+            sigmas[joint, view],
+            self._kernel,
         )
         joint, view = np.nonzero(seen & carried)
         on = [posed[each] for each in view.tolist()]

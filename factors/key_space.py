@@ -37,15 +37,23 @@ class KeySpace:
     def __post_init__(self) -> None:
         if isinstance(self.space, str):
             if len(self.space) != 1 or not self.space.isascii() or not self.space.isprintable():
-                raise ValueError(f"space must be one ASCII character, such as 'p', or a range, got {self.space!r}")
+                raise ValueError(
+                    "space must be one ASCII character, such as 'p', or a range, got "
+                    f"{self.space!r}"
+                )
         elif self.space.step != 1 or not 0 <= self.space.start <= self.space.stop <= 2**63:
-            raise ValueError(f"space must be a character, or a range of step 1 within 0 to 2^63, got {self.space}")
+            raise ValueError(
+                "space must be a character, or a range of step 1 within 0 to 2^63, got "
+                f"{self.space}"
+            )
         if self.people < 1 or self.joints < 1:
-            raise ValueError(f"people and joints must be 1 or more, got {self.people} and {self.joints}")
+            raise ValueError(
+                f"people and joints must be 1 or more, got {self.people} and {self.joints}"
+            )
         if self.frames < 1:
             raise ValueError(
-                f"space {self.space} is too small for one frame: give {self._per_frame} keys, or fewer people or"
-                " joints"
+                f"space {self.space} is too small for one frame: give {self._per_frame} keys, or "
+                "fewer people or joints"
             )
 
     @property
@@ -83,7 +91,9 @@ class KeySpace:
         """
         rest, _ = divmod(int(key) - self.keys.start, len(_KINDS))
         if key not in self.keys or rest >= self.frames * self.people * self.joints:
-            raise ValueError(f"{gtsam.DefaultKeyFormatter(int(key))} is not a key of the space {self.space}")
+            raise ValueError(
+                f"{gtsam.DefaultKeyFormatter(int(key))} is not a key of the space {self.space}"
+            )
         rest, joint = divmod(rest, self.joints)
         frame, person = divmod(rest, self.people)
         return JointKey(person, joint, frame)
@@ -101,13 +111,15 @@ class KeySpace:
     def _per_frame(self) -> int:
         return len(_KINDS) * self.people * self.joints
 
-    def _pack(self, kind: int, person: int, joints: ArrayLike, frames: ArrayLike) -> NDArray[np.int64]:
+    def _pack(
+        self, kind: int, person: int, joints: ArrayLike, frames: ArrayLike
+    ) -> NDArray[np.int64]:
         joint, frame = (np.asarray(each, dtype=np.int64) for each in (joints, frames))
         for name, value, count in (("joint", joint, self.joints), ("frame", frame, self.frames)):
             if value.size and not (value.min() >= 0 and value.max() < count):
                 raise ValueError(
-                    f"{name} must be 0 to {count - 1} in this space, got {value.min()} to {value.max()};"
-                    " give a larger space"
+                    f"{name} must be 0 to {count - 1} in this space, got {value.min()} to "
+                    f"{value.max()}; give a larger space"
                 )
         row = (frame * self.people + int(person) % self.people) * self.joints + joint
         return self.keys.start + row * len(_KINDS) + kind

@@ -5,11 +5,12 @@ A key is a 17-digit number, read from left to right:
 
     kind, 1 digit | person or view, 5 digits | joint, 3 digits | frame, 8 digits
 
-so 1 00003 004 00000012 is the position of joint 4 of person 3 in frame 12. GTSAM cuts what it prints of a
-`gtsam.Symbol` to eight digits behind the character, which is too little for three numbers; a key without a
-character is printed whole, in messages, drawings and `Values.print`. `format_key` spells it out. Symbols (`x5`,
-`l3`) have a character in their upper bits and are larger, plain numbers of your own are smaller: all three fit
-into one graph. Keys of one joint over time are consecutive, sorted by kind, person, joint, frame.
+so 1 00003 004 00000012 is the position of joint 4 of person 3 in frame 12. GTSAM cuts what it
+prints of a `gtsam.Symbol` to eight digits behind the character, which is too little for three
+numbers; a key without a character is printed whole, in messages, drawings and `Values.print`.
+`format_key` spells it out. Symbols (`x5`, `l3`) have a character in their upper bits and are
+larger, plain numbers of your own are smaller: all three fit into one graph. Keys of one joint over
+time are consecutive, sorted by kind, person, joint, frame.
 """
 
 from typing import NamedTuple
@@ -93,13 +94,15 @@ def velocity_keys(person: int, joints: ArrayLike, frames: ArrayLike = 0) -> NDAr
 
 
 def state_keys(person: int, joints: ArrayLike, frames: ArrayLike, order: int) -> NDArray[np.int64]:
-    """Keys (..., order) of a joint's position, velocity and, where `order` is 3, acceleration (m/s²); `joints` and
-    `frames` broadcast against each other.
+    """Keys (..., order) of a joint's position, velocity and, where `order` is 3, acceleration
+    (m/s²); `joints` and `frames` broadcast against each other.
     """
     return np.stack([_pack(kind, person, joints, frames) for kind in _STATE[:order]], axis=-1)
 
 
-def offset_keys(person: int, joints: ArrayLike, frames: ArrayLike = 0, source: int = 0) -> NDArray[np.int64]:
+def offset_keys(
+    person: int, joints: ArrayLike, frames: ArrayLike = 0, source: int = 0
+) -> NDArray[np.int64]:
     """`offset_key` for arrays: `joints` and `frames` broadcast against each other."""
     return _pack(_offset(source), person, joints, frames)
 
@@ -142,7 +145,9 @@ def format_key(key: int) -> str:
 
 def _offset(source: int) -> int:
     if source not in range(_SOURCES):
-        raise ValueError(f"source in a key must be a whole number, 0 to {_SOURCES - 1}, got {source}")
+        raise ValueError(
+            f"source in a key must be a whole number, 0 to {_SOURCES - 1}, got {source}"
+        )
     return _OFFSET + int(source)
 
 
@@ -154,9 +159,13 @@ def _pack(kind: int, first: int, joint: ArrayLike, frame: ArrayLike) -> NDArray[
         ("frame", frames, MAX_FRAME),
     ):
         if value.size and not (value.min() >= 0 and value.max() <= limit):
-            raise ValueError(f"{name} in a key must be 0 to {limit}, got {value.min()} to {value.max()}")
+            raise ValueError(
+                f"{name} in a key must be 0 to {limit}, got {value.min()} to {value.max()}"
+            )
         if np.any(value % 1 != 0):
-            raise ValueError(f"{name} in a key must be a whole number, got {value[value % 1 != 0].flat[0]}")
+            raise ValueError(
+                f"{name} in a key must be a whole number, got {value[value % 1 != 0].flat[0]}"
+            )
     base = kind * _PER_KIND + int(first) * _PER_PERSON
     return base + joints.astype(np.int64) * _PER_JOINT + frames.astype(np.int64)
 

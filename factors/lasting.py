@@ -9,7 +9,7 @@ the symmetric square root of the information, R_t C_t R_t = I, and w the white (
 of the variance:
 
     r = R_t (x_t - m_t) - sqrt(1 - w) P_t b_t  ~  N(0, w I)
-    r = b' - a b                               ~  N(0, (1 - a²) I),   a = exp(-dt / correlation_s),   b_0 ~ N(0, I)
+    r = b' - a b  ~  N(0, (1 - a²) I),  a = exp(-dt / correlation_s),  b_0 ~ N(0, I)
 
 P_t = R_t R_t^+ projects on the range of R_t. It is the identity, except for a measurement by one
 ray: this constrains neither the joint nor the offset along the ray.
@@ -34,7 +34,8 @@ def offset_factors(
     times, keys = np.asarray(times_s, dtype=np.float64), np.asarray(offset_keys)
     if keys.shape != times.shape or times.ndim != 1 or not rise(times):
         raise ValueError(
-            f"offset_keys and times_s must be (T,), times finite and rising; got {keys.shape}, {times.shape}"
+            f"offset_keys and times_s must be (T,), times finite and rising; got {keys.shape}, "
+            f"{times.shape}"
         )
     if not (np.isfinite(correlation_s) and correlation_s > 0):
         raise ValueError(f"correlation_s must be positive, got {correlation_s}")
@@ -43,7 +44,9 @@ def offset_factors(
     unit, zero, eye = noiseModel.Unit.Create(3), np.zeros(3), np.eye(3)
     links = [
         gtsam.JacobianFactor(key, -a * s * eye, after, s * eye, zero, unit)
-        for (key, after), a, s in zip(pairwise(keys.tolist()), kept.tolist(), scale.tolist(), strict=True)
+        for (key, after), a, s in zip(
+            pairwise(keys.tolist()), kept.tolist(), scale.tolist(), strict=True
+        )
     ]
     first = [gtsam.PriorFactorPoint3(key, zero, unit) for key in keys[:1].tolist()]
     return [*first, *contained(links, keys)]
@@ -64,13 +67,17 @@ def lasting_prior_factors(
     points, whiten = np.asarray(means, dtype=np.float64), np.asarray(roots, dtype=np.float64)
     positions, offsets = np.asarray(keys), np.asarray(offset_keys)
     count = len(positions)
-    if not (offsets.shape == (count,) and points.shape == (count, 3) and whiten.shape == (count, 3, 3)):
+    if not (
+        offsets.shape == (count,) and points.shape == (count, 3) and whiten.shape == (count, 3, 3)
+    ):
         raise ValueError(
-            f"keys and offset_keys must be (D,), means (D, 3), roots (D, 3, 3), got {positions.shape}, "
-            f"{offsets.shape}, {points.shape}, {whiten.shape}"
+            "keys and offset_keys must be (D,), means (D, 3), roots (D, 3, 3), got "
+            f"{positions.shape}, {offsets.shape}, {points.shape}, {whiten.shape}"
         )
     if not (np.isfinite(points).all() and np.isfinite(whiten).all()):
-        raise ValueError("a mean or a root holds a value that is not finite: give no prior to such a joint")
+        raise ValueError(
+            "a mean or a root holds a value that is not finite: give no prior to such a joint"
+        )
     if not 0 < white_share < 1:
         raise ValueError(f"white_share must be between 0 and 1, got {white_share}")
     scaled, of_offsets, right = lasting_blocks(points, whiten, white_share)
@@ -104,33 +111,46 @@ def lasting_difference_factors(
     metres, with correlated errors. These have `covariances` (D, 3, 3), positive definite, m², of
     which the share `white_share` is independent in each frame.
 
-        r = R (y - x - d) - sqrt(1 - w) b  ~  N(0, w I), with R the symmetric root of the information.
+        r = R (y - x - d) - sqrt(1 - w) b  ~  N(0, w I),
+
+        with R the symmetric root of the information.
     """
     away, shape = np.asarray(differences, dtype=np.float64), np.shape(keys)
     values, vectors = np.linalg.eigh(np.asarray(covariances, dtype=np.float64))
-    if not (shape == np.shape(of_keys) == np.shape(offset_keys) == away.shape[:1] == values.shape[:1]):
-        raise ValueError("keys, of_keys and offset_keys must be (D,), differences (D, 3), covariances (D, 3, 3)")
+    if not (
+        shape == np.shape(of_keys) == np.shape(offset_keys) == away.shape[:1] == values.shape[:1]
+    ):
+        raise ValueError(
+            "keys, of_keys and offset_keys must be (D,), differences (D, 3), covariances (D, 3, 3)"
+        )
     if not (np.isfinite(away).all() and (values > 0).all()):
         raise ValueError("differences must be finite and covariances positive definite")
     if not 0 < white_share < 1:
         raise ValueError(f"white_share must be between 0 and 1, got {white_share}")
     scaled = (vectors / np.sqrt(white_share * values)[:, None]) @ vectors.mT
-    right, every = (scaled @ away[..., None])[..., 0], [np.asarray(each) for each in (keys, of_keys, offset_keys)]
+    right, every = (
+        (scaled @ away[..., None])[..., 0],
+        [np.asarray(each) for each in (keys, of_keys, offset_keys)],
+    )
     reported, of, offsets = (each.tolist() for each in every)
     of_offset = repeat(-np.sqrt((1.0 - white_share) / white_share) * np.eye(3))
     unit = repeat(noiseModel.Unit.Create(3))
-    linear = map(gtsam.JacobianFactor, reported, scaled, of, -scaled, offsets, of_offset, right, unit)
+    linear = map(
+        gtsam.JacobianFactor, reported, scaled, of, -scaled, offsets, of_offset, right, unit
+    )
     return contained(linear, np.concatenate(every))
 
 
 def _projectors(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
-    """R R^+ of each R (D, 3, 3): the projectors on their ranges, the identity exactly where R has full rank.
+    """R R^+ of each R (D, 3, 3): the projectors on their ranges, the identity exactly where R has
+    full rank.
 
     Singular values below 1e-5 of the largest are treated as rounding errors: R is the root of an
     information matrix with relative errors of 1e-10.
     """
     projectors = np.tile(np.eye(3), (len(matrices), 1, 1))
-    # The determinant over the trace cubed is less than the smallest singular value over the largest.
+    # The determinant over the trace cubed is less than the smallest singular value over the
+    # largest.
     open_ones = np.linalg.det(matrices) <= 1e-5 * np.trace(matrices, axis1=1, axis2=2) ** 3
     left, values, _ = np.linalg.svd(matrices[open_ones])
     ranged = left * (values > 1e-5 * values[:, :1])[:, None]

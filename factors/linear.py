@@ -9,7 +9,10 @@ from numpy.typing import ArrayLike, NDArray
 
 
 def linear_factor(
-    keys: ArrayLike, matrices: Sequence[ArrayLike], measured: ArrayLike = 0.0, sigma: ArrayLike = 1.0
+    keys: ArrayLike,
+    matrices: Sequence[ArrayLike],
+    measured: ArrayLike = 0.0,
+    sigma: ArrayLike = 1.0,
 ) -> gtsam.LinearContainerFactor:
     """Linear factor on K variables: r = sum_k A_k x_k - z  ~  N(0, diag(sigma²)).
 
@@ -28,7 +31,9 @@ def linear_factor(
     blocks = [_block(each) for each in matrices]
     rows = len(blocks[0])
     if any(block.shape != (rows, 3) for block in blocks):
-        raise ValueError(f"matrices must be (M, 3), all of as many rows, got {[block.shape for block in blocks]}")
+        raise ValueError(
+            f"matrices must be (M, 3), all of as many rows, got {[block.shape for block in blocks]}"
+        )
     z, deviation = (np.asarray(each, dtype=np.float64) for each in (measured, sigma))
     for name, value in (("measured", z), ("sigma", deviation)):
         if value.shape not in ((), (rows,)):

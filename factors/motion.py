@@ -46,22 +46,32 @@ class Motion:
 
     def __post_init__(self) -> None:
         if self.order not in ORDERS or len(self.start) != self.order - 1:
-            raise ValueError(f"order must be one of {ORDERS} and start that many less one, got {self}")
+            raise ValueError(
+                f"order must be one of {ORDERS} and start that many less one, got {self}"
+            )
 
     def transition(self, dt_s: ArrayLike) -> Array:
         """F (..., n, n) over steps of `dt_s` (...), positive, seconds."""
         h, places = np.asarray(dt_s, dtype=np.float64), range(self.order)
-        return matrices([[h ** (j - i) / factorial(j - i) if j >= i else 0 * h for j in places] for i in places])
+        return matrices(
+            [[h ** (j - i) / factorial(j - i) if j >= i else 0 * h for j in places] for i in places]
+        )
 
     def noise(self, dt_s: ArrayLike, density: ArrayLike = 1.0) -> Array:
         """Covariance q Q (..., n, n) over steps of `dt_s` (...), positive, seconds, for densities q
         (...).
         """
-        q, h = np.asarray(density, dtype=np.float64), dt_s if isinstance(dt_s, float) else np.asarray(dt_s)
+        q, h = (
+            np.asarray(density, dtype=np.float64),
+            dt_s if isinstance(dt_s, float) else np.asarray(dt_s),
+        )
         left = range(self.order - 1, -1, -1)
         # The integral over dt of (u^i / i!) (u^j / j!).
         return matrices(
-            [[q * h ** (i + j + 1) / ((i + j + 1) * factorial(i) * factorial(j)) for j in left] for i in left]
+            [
+                [q * h ** (i + j + 1) / ((i + j + 1) * factorial(i) * factorial(j)) for j in left]
+                for i in left
+            ]
         )
 
     def density(self, acceleration: ArrayLike, within_s: float = MEASURED_S) -> Array:
@@ -84,7 +94,9 @@ class Motion:
         both = np.outer(turn, turn)
         return both * F, both * Q
 
-    def factors(self, keys: ArrayLike, times_s: ArrayLike, density: ArrayLike) -> list[gtsam.NonlinearFactor]:
+    def factors(
+        self, keys: ArrayLike, times_s: ArrayLike, density: ArrayLike
+    ) -> list[gtsam.NonlinearFactor]:
         """T - 1 native, linear factors between the T consecutive states of one joint.
 
         `keys` (T, n) are the states' `Point3` variables, position first; `times_s` (T,) are
@@ -92,7 +104,10 @@ class Motion:
         """
         times, states = np.asarray(times_s, dtype=np.float64), np.asarray(keys)
         if states.shape != (len(times), self.order):
-            raise ValueError(f"keys must be (T, {self.order}) and times_s (T,), got {states.shape}, {times.shape}")
+            raise ValueError(
+                f"keys must be (T, {self.order}) and times_s (T,), got {states.shape}, "
+                f"{times.shape}"
+            )
         if not rise(times):
             raise ValueError("times_s must be finite and rise from state to state")
         densities = np.broadcast_to(np.asarray(density, dtype=np.float64), max(len(times) - 1, 0))
@@ -100,16 +115,24 @@ class Motion:
             raise ValueError("psd must be positive and finite, m²/s³ (or m²/s⁵ of jerk)")
         return self._factors(states, times, densities)
 
-    def _factors(self, states: NDArray[np.int64], times: Array, densities: Array) -> list[gtsam.NonlinearFactor]:
+    def _factors(
+        self, states: NDArray[np.int64], times: Array, densities: Array
+    ) -> list[gtsam.NonlinearFactor]:
         """One Gaussian p(s' | s) for each step, with the whitened residual r = s' - F s."""
         eye, unit = np.eye(3), noiseModel.Unit.Create(3 * self.order)
         linear = []
         for before, after, dt, q in zip(
-            states[:-1].tolist(), states[1:].tolist(), np.diff(times).tolist(), densities, strict=True
+            states[:-1].tolist(),
+            states[1:].tolist(),
+            np.diff(times).tolist(),
+            densities,
+            strict=True,
         ):
             root = np.linalg.cholesky(np.linalg.inv(self.noise(dt, q))).T
             blocks = np.kron(np.hstack([root, -root @ self.transition(dt)]), eye)
-            terms = list(zip([*after, *before], np.split(blocks, 2 * self.order, axis=1), strict=True))
+            terms = list(
+                zip([*after, *before], np.split(blocks, 2 * self.order, axis=1), strict=True)
+            )
             conditional = gtsam.GaussianConditional(terms, self.order, np.zeros(len(blocks)), unit)
             linear.append(gtsam.JacobianFactor(conditional))
         return contained(linear, states)
@@ -121,9 +144,13 @@ class ConstantVelocity(Motion):
     r = [x' - x - dt v,  v' - v]  ~  N(0, q [[dt³/3, dt²/2], [dt²/2, dt]])
     """
 
-    def _factors(self, states: NDArray[np.int64], times: Array, densities: Array) -> list[gtsam.NonlinearFactor]:
+    def _factors(
+        self, states: NDArray[np.int64], times: Array, densities: Array
+    ) -> list[gtsam.NonlinearFactor]:
         states_at = zip(*states.T.tolist(), times.tolist(), strict=True)
-        every = [gtsam.StateData(position, velocity, time) for position, velocity, time in states_at]
+        every = [
+            gtsam.StateData(position, velocity, time) for position, velocity, time in states_at
+        ]
         diagonals = np.repeat(densities[:, None], 3, axis=1)
         return list(map(gtsam.WnoaMotionFactorPoint3, every[:-1], every[1:], diagonals))
 
@@ -155,12 +182,16 @@ def motion_factors(
     """`CONSTANT_VELOCITY.factors` of positions `keys` (T,) and velocities `velocity_keys` (T,)."""
     positions, velocities = np.asarray(keys), np.asarray(velocity_keys)
     if positions.shape != velocities.shape:
-        raise ValueError(f"keys and velocity_keys must be (T,), got {positions.shape}, {velocities.shape}")
+        raise ValueError(
+            f"keys and velocity_keys must be (T,), got {positions.shape}, {velocities.shape}"
+        )
     return CONSTANT_VELOCITY.factors(np.stack([positions, velocities], axis=-1), times_s, psd)
 
 
 def motion_covariance(dt_s: ArrayLike, psd: ArrayLike) -> Array:
-    """Covariance (..., 6, 6) of [x' - x - dt v, v' - v] over steps `dt_s` (...): m², m²/s, m²/s²."""
+    """Covariance (..., 6, 6) of [x' - x - dt v, v' - v] over steps `dt_s` (...): m², m²/s,
+    m²/s².
+    """
     return np.asarray(np.kron(CONSTANT_VELOCITY.noise(dt_s, psd), np.eye(3)), dtype=np.float64)
 
 
@@ -169,7 +200,9 @@ def rise(times_s: NDArray[np.float64]) -> bool:
     return bool(np.isfinite(times_s).all() and (np.diff(times_s) > 0).all())
 
 
-def contained(linear: Iterable[gtsam.JacobianFactor], keys: NDArray[np.int64]) -> list[gtsam.NonlinearFactor]:
+def contained(
+    linear: Iterable[gtsam.JacobianFactor], keys: NDArray[np.int64]
+) -> list[gtsam.NonlinearFactor]:
     """Linear factors on `Point3` variables `keys` (D,) as factors of a nonlinear graph.
 
     They get the linearisation point zero: without one their error is always 0.

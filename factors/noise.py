@@ -14,7 +14,8 @@ from gtsam import noiseModel
 from numpy.typing import ArrayLike, NDArray
 
 KernelName = Literal["huber", "cauchy", "geman_mcclure", "tukey"]
-"""Robust kernels. The weight falls as 1/r (huber), 1/r² (cauchy), 1/r⁴ (geman_mcclure), or to 0 (tukey)."""
+"""Robust kernels. The weight falls as 1/r (huber), 1/r² (cauchy), 1/r⁴ (geman_mcclure), or to 0
+(tukey)."""
 
 Kernel = noiseModel.mEstimator.Base
 """Type of the argument `kernel`: any of GTSAM's M-estimators. One object may be shared by many
@@ -66,7 +67,9 @@ def kernel_weight(
     r = np.asarray(whitened_norm, dtype=np.float64)
     if name is None:
         return np.ones_like(r)
-    robust_kernel(name, width_sigma)  # raises ValueError for an unknown name or a width that is not positive
+    robust_kernel(
+        name, width_sigma
+    )  # raises ValueError for an unknown name or a width that is not positive
     width = DEFAULT_WIDTH_SIGMA[name] if width_sigma is None else float(width_sigma)
     ratio = (r / width) ** 2
     if name == "huber":
@@ -96,7 +99,9 @@ def sigma_px(
     The arrays broadcast against each other. ValueError if a confidence, depth or focal length is
     not positive: gate such observations out first.
     """
-    w, depth, focal = (np.asarray(value, dtype=np.float64) for value in (confidence, depth_m, focal_px))
+    w, depth, focal = (
+        np.asarray(value, dtype=np.float64) for value in (confidence, depth_m, focal_px)
+    )
     for name, value in (("confidence", w), ("depth_m", depth), ("focal_px", focal)):
         if not np.all((value > 0) & np.isfinite(value)):
             raise ValueError(f"{name} must be positive and finite: drop observations of no weight")
@@ -133,17 +138,23 @@ def robust(base: noiseModel.Base, kernel: Kernel | None) -> noiseModel.Base:
     return base if kernel is None else noiseModel.Robust.Create(kernel, base)
 
 
-def isotropic_models(dimension: int, sigmas: ArrayLike, kernel: Kernel | None = None) -> list[noiseModel.Base]:
+def isotropic_models(
+    dimension: int, sigmas: ArrayLike, kernel: Kernel | None = None
+) -> list[noiseModel.Base]:
     """One isotropic noise model for each of `sigmas` (D,): `isotropic` for an array."""
     values = np.asarray(sigmas, dtype=np.float64)
     if values.ndim != 1 or not np.all((values > 0) & np.isfinite(values)):
         raise ValueError("sigmas must be (D,), positive and finite: drop observations of no weight")
-    models: list[noiseModel.Base] = list(map(noiseModel.Isotropic.Sigma, repeat(dimension), values.tolist()))
+    models: list[noiseModel.Base] = list(
+        map(noiseModel.Isotropic.Sigma, repeat(dimension), values.tolist())
+    )
     return models if kernel is None else list(map(noiseModel.Robust.Create, repeat(kernel), models))
 
 
 def check_covariances(covariances: NDArray[np.float64]) -> None:
-    """ValueError unless every one of `covariances` (D, N, N) is finite, symmetric and positive definite."""
+    """ValueError unless every one of `covariances` (D, N, N) is finite, symmetric and positive
+    definite.
+    """
     if covariances.ndim != 3 or covariances.shape[1] != covariances.shape[2]:
         raise ValueError(f"covariances must be square matrices (D, N, N), got {covariances.shape}")
     if not np.isfinite(covariances).all():
@@ -152,11 +163,14 @@ def check_covariances(covariances: NDArray[np.float64]) -> None:
     skew = np.abs(covariances - covariances.transpose(0, 2, 1)).max(axis=(1, 2), initial=0.0)
     # Symmetry is tested up to rounding errors; the Cholesky factorisation reads only one triangle.
     if np.any(skew > 1e-9 * scale):
-        raise ValueError(f"covariance {np.argmax(skew > 1e-9 * scale)} is not symmetric: give (C + Cᵀ) / 2")
+        raise ValueError(
+            f"covariance {np.argmax(skew > 1e-9 * scale)} is not symmetric: give (C + Cᵀ) / 2"
+        )
     try:
         np.linalg.cholesky(covariances)
     except np.linalg.LinAlgError:
         smallest = np.linalg.eigvalsh(covariances)[:, 0]
         raise ValueError(
-            f"covariance {smallest.argmin()} is not positive definite: add a small variance to its diagonal"
+            f"covariance {smallest.argmin()} is not positive definite: add a small variance to "
+            "its diagonal"
         ) from None

@@ -10,7 +10,9 @@ from numpy.typing import ArrayLike
 from factors.noise import check_covariances
 
 
-def odometry_factors(keys: ArrayLike, wTb: ArrayLike, covariances: ArrayLike) -> list[gtsam.NonlinearFactor]:
+def odometry_factors(
+    keys: ArrayLike, wTb: ArrayLike, covariances: ArrayLike
+) -> list[gtsam.NonlinearFactor]:
     """T - 1 factors between consecutive poses `keys` (T,), `Pose3`, world from carrier, from the
     odometry `wTb` (T, 4, 4).
 
@@ -24,8 +26,8 @@ def odometry_factors(keys: ArrayLike, wTb: ArrayLike, covariances: ArrayLike) ->
     count = len(key)
     if poses.shape != (count, 4, 4) or covariance.shape != (max(count - 1, 0), 6, 6):
         raise ValueError(
-            f"keys must be (T,), wTb (T, 4, 4), covariances (T - 1, 6, 6), got {key.shape}, {poses.shape}, "
-            f"{covariance.shape}"
+            f"keys must be (T,), wTb (T, 4, 4), covariances (T - 1, 6, 6), got {key.shape}, "
+            f"{poses.shape}, {covariance.shape}"
         )
     check_covariances(covariance)
     steps = map(gtsam.Pose3, np.linalg.inv(poses[:-1]) @ poses[1:])

@@ -25,11 +25,12 @@ def to_pixels(
 def project_with_jacobian(
     points_world: NDArray[np.float64], K: NDArray[np.float64], cTw: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Pixels (..., 2), depths (...,) and derivatives (..., 2, 3), pixels per metre, of `points_world` (..., 3).
+    """Pixels (..., 2), depths (...,) and derivatives (..., 2, 3), pixels per metre, of
+    `points_world` (..., 3).
 
-    `K` (..., 3, 3) in pixels and `cTw` (..., 3, 4), camera from world, broadcast against the points. Pixels and
-    derivatives are NaN where the depth is not positive. With R the rotation, K' the upper 2 x 2 of K and z the
-    depth,
+    `K` (..., 3, 3) in pixels and `cTw` (..., 3, 4), camera from world, broadcast against the
+    points. Pixels and derivatives are NaN where the depth is not positive. With R the rotation, K'
+    the upper 2 x 2 of K and z the depth,
 
         d uv / d point = (K' R[:2] - (uv - c) R[2]) / z
     """

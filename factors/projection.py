@@ -22,7 +22,8 @@ from factors.noise import Kernel, KernelName, isotropic, isotropic_models, kerne
 
 
 def make_camera(K: ArrayLike, wTc: ArrayLike) -> gtsam.PinholeCameraCal3_S2:
-    """Make GTSAM's camera from `K` (3, 3) in pixels and the world-from-camera pose `wTc` (4, 4) in metres.
+    """Make GTSAM's camera from `K` (3, 3) in pixels and the world-from-camera pose `wTc` (4, 4) in
+    metres.
 
     OpenCV's convention: x right, y down, z forward. Make it once per view; factors can share it.
     """
@@ -71,15 +72,19 @@ def projection_factors(
     points = np.asarray(xy, dtype=np.float64)
     views, key_list = np.asarray(view), np.asarray(keys)
     count = len(points)
-    if points.shape != (count, 2) or not views.shape == key_list.shape == np.shape(sigmas_px) == (count,):
+    if points.shape != (count, 2) or not views.shape == key_list.shape == np.shape(sigmas_px) == (
+        count,
+    ):
         raise ValueError(
-            f"view, keys and sigmas_px must be (D,) and xy (D, 2), got {views.shape}, {key_list.shape}, "
-            f"{np.shape(sigmas_px)}, {points.shape}"
+            f"view, keys and sigmas_px must be (D,) and xy (D, 2), got {views.shape}, "
+            f"{key_list.shape}, {np.shape(sigmas_px)}, {points.shape}"
         )
     if not np.isfinite(points).all():
         raise ValueError("xy holds a value that is not finite: drop unseen joints first")
     if count and (views.min() < 0 or views.max() >= len(cameras)):
-        raise ValueError(f"view must be 0 to {len(cameras) - 1}, got {views.min()} to {views.max()}")
+        raise ValueError(
+            f"view must be 0 to {len(cameras) - 1}, got {views.min()} to {views.max()}"
+        )
     models = isotropic_models(2, sigmas_px, kernel)
     chosen = [cameras[index] for index in views.tolist()]
     return list(map(gtsam.TriangulationFactorCal3_S2, chosen, points, models, key_list.tolist()))
@@ -107,11 +112,21 @@ def moving_projection_factors(
     """
     position, velocity = np.asarray(keys), np.asarray(velocity_keys)
     at, slope, off = (np.asarray(each, dtype=np.float64) for each in (points, slopes, residuals))
-    lead, sigma, count = np.asarray(lead_s, dtype=np.float64), np.asarray(sigmas_px, dtype=np.float64), len(at)
+    lead, sigma, count = (
+        np.asarray(lead_s, dtype=np.float64),
+        np.asarray(sigmas_px, dtype=np.float64),
+        len(at),
+    )
     shapes = [np.shape(each) for each in (position, velocity, lead, sigma, at, slope, off)]
     if shapes != [(count,)] * 4 + [(count, 3), (count, 2, 3), (count, 2)]:
-        raise ValueError(f"keys, lead_s and sigmas_px must be (D,), points (D, 3), slopes (D, 2, 3), got {shapes}")
-    if not all(np.isfinite(each).all() for each in (lead, sigma, at, slope, off)) or not (sigma > 0).all():
+        raise ValueError(
+            "keys, lead_s and sigmas_px must be (D,), points (D, 3), slopes (D, 2, 3), got "
+            f"{shapes}"
+        )
+    if (
+        not all(np.isfinite(each).all() for each in (lead, sigma, at, slope, off))
+        or not (sigma > 0).all()
+    ):
         raise ValueError("every observation must be finite and its sigma positive")
     weight = np.sqrt(kernel_weight(kernel, np.linalg.norm(off, axis=1) / sigma, width)) / sigma
     slope = slope * weight[:, None, None]
@@ -149,7 +164,9 @@ def posed_projection_factor(
     model: noiseModel.Base = isotropic(2, sigma_px, kernel)
     if body_T_sensor is None:
         return gtsam.GenericProjectionFactorCal3_S2(_pixel(uv), model, pose_key, key, calibration)
-    return gtsam.GenericProjectionFactorCal3_S2(_pixel(uv), model, pose_key, key, calibration, body_T_sensor)
+    return gtsam.GenericProjectionFactorCal3_S2(
+        _pixel(uv), model, pose_key, key, calibration, body_T_sensor
+    )
 
 
 def posed_projection_factors(
@@ -171,11 +188,20 @@ def posed_projection_factors(
     points, chosen = np.asarray(xy, dtype=np.float64), np.asarray(view)
     poses, joints, count = np.asarray(pose_keys), np.asarray(keys), len(points)
     shapes = [each.shape for each in (chosen, poses, joints)]
-    if points.shape != (count, 2) or shapes != [(count,)] * 3 or not len(sensors) == np.size(sigmas_px) == count:
-        raise ValueError(f"view, pose_keys and keys must be (D,), xy (D, 2), got {shapes} and {points.shape}")
+    if (
+        points.shape != (count, 2)
+        or shapes != [(count,)] * 3
+        or not len(sensors) == np.size(sigmas_px) == count
+    ):
+        raise ValueError(
+            f"view, pose_keys and keys must be (D,), xy (D, 2), got {shapes} and {points.shape}"
+        )
     if not np.isfinite(points).all():
         raise ValueError("xy holds a value that is not finite: drop unseen joints first")
-    models, lenses = isotropic_models(2, sigmas_px, kernel), [calibrations[each] for each in chosen.tolist()]
+    models, lenses = (
+        isotropic_models(2, sigmas_px, kernel),
+        [calibrations[each] for each in chosen.tolist()],
+    )
     given = points, models, poses.tolist(), joints.tolist(), lenses, sensors
     return list(map(gtsam.GenericProjectionFactorCal3_S2, *given))
 
@@ -186,7 +212,9 @@ def in_front(depth_m: ArrayLike, min_depth_m: float = 0.1) -> NDArray[np.bool_]:
 
 
 def inlier_gate(residual_px: ArrayLike, rho_2d_px: ArrayLike) -> NDArray[np.bool_]:
-    """delta_ij of Eq. 2: which reprojection distances (...,) are under `rho_2d_px` (...,); NaN is not."""
+    """delta_ij of Eq. 2: which reprojection distances (...,) are under `rho_2d_px` (...,); NaN is
+    not.
+    """
     rho = np.asarray(rho_2d_px, dtype=np.float64)
     if np.any(rho <= 0):
         raise ValueError(f"rho_2d_px must be positive, got {rho.min()}")

@@ -30,7 +30,9 @@ def joint_information(
     """
     points = np.asarray(points_world, dtype=np.float64)
     joints, views = np.asarray(joint, dtype=np.intp), np.asarray(view, dtype=np.intp)
-    _, _, jacobian = project_with_jacobian(points[joints], np.asarray(K)[views], np.asarray(cTw)[views])
+    _, _, jacobian = project_with_jacobian(
+        points[joints], np.asarray(K)[views], np.asarray(cTw)[views]
+    )
     sigmas = np.asarray(sigmas_px, dtype=np.float64)
     if not np.all((sigmas > 0) & np.isfinite(sigmas)):
         raise ValueError("sigmas_px must be positive and finite: drop observations of no weight")

@@ -20,11 +20,13 @@ def assert_jacobian(
     rtol: float = 1e-6,
     atol: float = 1e-8,
 ) -> None:
-    """AssertionError unless the factor's Jacobian at `values` equals central differences of its error.
+    """AssertionError unless the factor's Jacobian at `values` equals central differences of its
+    error.
 
-    Every variable is perturbed by `step` along each axis of its tangent space (metres, radians). Entries may
-    differ by `rtol` of the Jacobian's largest entry plus `atol`; the truncation error of a pinhole projection
-    is well below that for points more than 10 cm away. Choose a point at which no entry happens to be zero.
+    Every variable is perturbed by `step` along each axis of its tangent space (metres, radians).
+    Entries may differ by `rtol` of the Jacobian's largest entry plus `atol`; the truncation error
+    of a pinhole projection is well below that for points more than 10 cm away. Choose a point at
+    which no entry happens to be zero.
     """
     analytic = analytic_jacobian(factor, values)
     numeric = numeric_jacobian(factor, values, step)
@@ -32,7 +34,8 @@ def assert_jacobian(
     worst = np.abs(analytic - numeric).max(initial=0.0)
     if not worst <= bound:  # NaN fails too
         raise AssertionError(
-            f"Jacobian is off by {worst:.3g} (allowed {bound:.3g}); analytic\n{analytic}\nnumeric\n{numeric}"
+            f"Jacobian is off by {worst:.3g} (allowed {bound:.3g}); "
+            f"analytic\n{analytic}\nnumeric\n{numeric}"
         )
 
 
@@ -60,11 +63,15 @@ def analytic_jacobian(factor: Factor, values: gtsam.Values) -> NDArray[np.float6
     whitened = np.linalg.norm(_whitened(factor, values))
     scale = np.linalg.norm(right_hand_side) / whitened if whitened > 0 else 1.0
     if scale == 0.0:
-        raise AssertionError("the robust kernel gives this factor no weight: test closer to the truth")
+        raise AssertionError(
+            "the robust kernel gives this factor no weight: test closer to the truth"
+        )
     return np.asarray(jacobian) / scale
 
 
-def numeric_jacobian(factor: Factor, values: gtsam.Values, step: float = 1e-5) -> NDArray[np.float64]:
+def numeric_jacobian(
+    factor: Factor, values: gtsam.Values, step: float = 1e-5
+) -> NDArray[np.float64]:
     """Central differences of the residual whitened by its Gaussian noise, in the order of the
     factor's keys.
     """

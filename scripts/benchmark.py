@@ -75,7 +75,9 @@ class Spent:
 
 def main() -> None:
     """Run the measurements and print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     data = os.environ.get("SHAPEPOSE_DATA", HERE.parent / "shared")
     parser.add_argument(
         "--against", metavar="COMMIT", help="compare with this commit, which is checked out beside"
@@ -84,8 +86,12 @@ def main() -> None:
         "--cases", nargs="*", default=list(CASES), choices=CASES, metavar="CASE", help=str([*CASES])
     )
     parser.add_argument("--rounds", type=int, default=5, help="counted runs of each")
-    parser.add_argument("--data", type=Path, default=data, help="folder with data/shelf, or with calibration.json")
-    parser.add_argument("--frames", type=int, help="the first frames of each recording only (default: all)")
+    parser.add_argument(
+        "--data", type=Path, default=data, help="folder with data/shelf, or with calibration.json"
+    )
+    parser.add_argument(
+        "--frames", type=int, help="the first frames of each recording only (default: all)"
+    )
     arguments = parser.parse_args()
     console = Console()
     console.print(_machine(), highlight=False)
@@ -100,13 +106,18 @@ def main() -> None:
             console.print(_table(case if "--frames" in more else f"{case}: {frames} frames", spent))
 
 
-def compare(trees: dict[str, Path], options: Sequence[str], work: Path, rounds: int) -> dict[str, list[Spent]]:
+def compare(
+    trees: dict[str, Path], options: Sequence[str], work: Path, rounds: int
+) -> dict[str, list[Spent]]:
     """Run the command in each tree, alternately, `rounds` times after a warm-up; presets only in
     this tree.
     """
     spent: dict[str, list[Spent]] = {name: [] for name in trees}
     at = options.index("--preset") if "--preset" in options else len(options)
-    own = {name: [*options[:at], *(options[at:] if name == "here" else options[at + 2 :])] for name in trees}
+    own = {
+        name: [*options[:at], *(options[at:] if name == "here" else options[at + 2 :])]
+        for name in trees
+    }
     for name in trees:
         short = [] if "--frames" in options else ["--frames", "0:8"]
         spend(trees[name], [*own[name], *short], work / "results")
@@ -119,12 +130,24 @@ def compare(trees: dict[str, Path], options: Sequence[str], work: Path, rounds: 
 def spend(tree: Path, options: Sequence[str], output: Path) -> Spent:
     """Run `reconstruct` from the checkout `tree`; if it fails, raise its error message."""
     workers = [] if "--workers" in options else ["--workers", "1"]
-    command = [sys.executable, "-m", "shapepose_fg", "reconstruct", *options, *workers, "--overwrite"]
+    command = [
+        sys.executable,
+        "-m",
+        "shapepose_fg",
+        "reconstruct",
+        *options,
+        *workers,
+        "--overwrite",
+    ]
     environment = os.environ | _ONE_THREAD | {"PYTHONPATH": str(tree)}
     with tempfile.TemporaryFile() as said:
         start = time.perf_counter()
         process = subprocess.Popen(
-            [*command, "--output", str(output)], cwd=output.parent, env=environment, stdout=said, stderr=said
+            [*command, "--output", str(output)],
+            cwd=output.parent,
+            env=environment,
+            stdout=said,
+            stderr=said,
         )
         _, status, used = os.wait4(process.pid, 0)
         wall_s = time.perf_counter() - start
@@ -144,7 +167,9 @@ def to_and_fro(recording: DetectionSequence, frames: int) -> Recording:
     """
     count = len(recording)
     turns = (divmod(frame, count) for frame in range(frames))
-    return Recording(recording.skeleton, [recording[p if turn % 2 == 0 else count - 1 - p] for turn, p in turns])
+    return Recording(
+        recording.skeleton, [recording[p if turn % 2 == 0 else count - 1 - p] for turn, p in turns]
+    )
 
 
 @contextmanager
@@ -154,11 +179,15 @@ def _checkouts(commit: str | None, work: Path) -> Iterator[dict[str, Path]]:
         yield {"here": HERE}
         return
     git = ["git", "-C", str(HERE), "worktree"]
-    subprocess.run([*git, "add", "--detach", str(work / "against"), commit], check=True, capture_output=True)
+    subprocess.run(
+        [*git, "add", "--detach", str(work / "against"), commit], check=True, capture_output=True
+    )
     try:
         yield {commit: work / "against", "here": HERE}
     finally:
-        subprocess.run([*git, "remove", "--force", str(work / "against")], check=True, capture_output=True)
+        subprocess.run(
+            [*git, "remove", "--force", str(work / "against")], check=True, capture_output=True
+        )
 
 
 def _written(kind: str, data: Path, folder: Path, frames: int | None) -> tuple[list[str], int]:
@@ -169,7 +198,12 @@ def _written(kind: str, data: Path, folder: Path, frames: int | None) -> tuple[l
     count = _LONG if kind == "long" else len(recording)
     count = min(count, frames or count)
     write_association(to_and_fro(recording, count), rig, folder)
-    named = ["--calibration", str(folder / "calibration.json"), "--detections", str(folder / "detection")]
+    named = [
+        "--calibration",
+        str(folder / "calibration.json"),
+        "--detections",
+        str(folder / "detection"),
+    ]
     return [*named, "--fps", str(fps)], count
 
 
@@ -188,7 +222,9 @@ def _crowd(data: Path) -> tuple[DetectionSequence, Rig, float]:
     """Eight people and six cameras: salsa from recorded motions, or the built-in scene."""
     motions = data / "data" / "cmu_mocap" / "cmu_smpl24.npz"
     if motions.is_file():
-        scene = sequence("salsa", "report", Mocap.load(motions), cameras=6, until=408).part(range(108, 408))
+        scene = sequence("salsa", "report", Mocap.load(motions), cameras=6, until=408).part(
+            range(108, 408)
+        )
     else:
         scene = built_in_scene(people=8)
     return simulate(scene), scene.rig, scene.fps
@@ -202,7 +238,10 @@ def _machine() -> str:
     named = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
     numbers = versions()
     packages = ", ".join(f"{name} {numbers[name]}" for name in ("python", "numpy", "gtsam"))
-    return f"{[*named, platform.processor() or platform.machine()][0]}, {cores()} cores{load}\n{packages}"
+    return (
+        f"{[*named, platform.processor() or platform.machine()][0]}, {cores()} "
+        f"cores{load}\n{packages}"
+    )
 
 
 def _table(title: str, spent: dict[str, list[Spent]]) -> Table:
@@ -214,7 +253,9 @@ def _table(title: str, spent: dict[str, list[Spent]]) -> Table:
     table.add_column("ratio", justify="right")
 
     def row(label: str, values: list[list[float]], digits: int, style: str | None = None) -> None:
-        cells = [f"{median(v):.{digits}f} ({min(v):.{digits}f} to {max(v):.{digits}f})" for v in values]
+        cells = [
+            f"{median(v):.{digits}f} ({min(v):.{digits}f} to {max(v):.{digits}f})" for v in values
+        ]
         first, last = median(values[0]), median(values[-1])
         if math.isnan(last):
             return

@@ -1,4 +1,5 @@
-"""Build sdist and wheel, install the wheel into an empty environment, and use it: python scripts/check_package.py
+"""Build sdist and wheel, install the wheel into an empty environment, and use it: python
+scripts/check_package.py
 
 The wheel is built from the sdist, so that files missing in the sdist are noticed. The environment
 reuses the dependencies of the running one (torch is a large download), but nothing from this
@@ -36,28 +37,42 @@ def run(words):
 
 run("simulate demo --people 1 --cameras 3 --frames :6 --output in")
 run("reconstruct --calibration in/calibration.json --detections in --fps 25 --output results")
-assert len(shapepose_fg.Reconstruction.load("results")) == 6 and Path("results/report.html").is_file()
+assert len(shapepose_fg.Reconstruction.load("results")) == 6
+assert Path("results/report.html").is_file()
 """
 VERSIONS = """
 import platform
 from importlib.metadata import version
 names = "numpy scipy numba gtsam opencv-python-headless pydantic typer rich".split()
-print(f"Python {platform.python_version()}", *(f"{name} {version(name)}" for name in names), sep=", ")
+versions = (f"{name} {version(name)}" for name in names)
+print(f"Python {platform.python_version()}", *versions, sep=", ")
 """
 
 
 def main() -> None:
     """Create and test the environments one after the other."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--versions", nargs="+", choices=("oldest", "newest"), help="versions of dependencies")
-    parser.add_argument("--python", nargs="*", default=[sys.executable], help="interpreters; by default this one")
-    parser.add_argument("--tests", nargs="*", default=["tests"], help="files of tests; none: only the demo")
-    parser.add_argument("--folder", type=Path, help="folder in which environments stay, for the next time")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--versions", nargs="+", choices=("oldest", "newest"), help="versions of dependencies"
+    )
+    parser.add_argument(
+        "--python", nargs="*", default=[sys.executable], help="interpreters; by default this one"
+    )
+    parser.add_argument(
+        "--tests", nargs="*", default=["tests"], help="files of tests; none: only the demo"
+    )
+    parser.add_argument(
+        "--folder", type=Path, help="folder in which environments stay, for the next time"
+    )
     arguments = parser.parse_args()
     failed = False
     with tempfile.TemporaryDirectory() as temporary:
         folder = (arguments.folder or Path(temporary)).absolute()
-        tries = [(python, which) for python in arguments.python for which in arguments.versions or ()]
+        tries = [
+            (python, which) for python in arguments.python for which in arguments.versions or ()
+        ]
         for python, which in tries or [(sys.executable, "built")]:
             begin, place = time.monotonic(), folder / f"{Path(python).name}-{which}"
             place.mkdir(parents=True, exist_ok=True)
@@ -65,7 +80,9 @@ def main() -> None:
                 said = tried(python, which, place, arguments.tests) if tries else built(place)
             except RuntimeError as error:
                 failed, said = True, f"failed: {error}"
-            print(f"{python}, {which}: {said} ({(time.monotonic() - begin) / 60:.0f} min)", flush=True)
+            print(
+                f"{python}, {which}: {said} ({(time.monotonic() - begin) / 60:.0f} min)", flush=True
+            )
     sys.exit(failed)
 
 
@@ -76,7 +93,9 @@ def run(place: Path, *command: object) -> str:
     words = [str(each) for each in command]
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     environment |= {"OMP_NUM_THREADS": "1"}
-    done = subprocess.run(words, cwd=place, env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        words, cwd=place, env=environment, capture_output=True, text=True, check=False
+    )
     lines = (done.stdout + done.stderr).strip().splitlines()
     last = [each for each in lines if not each.startswith("WARNING")][-25:]
     if done.returncode != 0:
@@ -90,7 +109,18 @@ def built(place: Path) -> str:
     wheel = next((place / "dist").glob("*.whl"))
     venv.create(place / "empty", with_pip=False)
     python = place / "empty" / "bin" / "python"
-    run(place, sys.executable, "-m", "pip", "--python", python, "install", "--quiet", "--no-deps", wheel)
+    run(
+        place,
+        sys.executable,
+        "-m",
+        "pip",
+        "--python",
+        python,
+        "install",
+        "--quiet",
+        "--no-deps",
+        wheel,
+    )
     # After the environment's own packages, and without links left by `pip install -e`.
     site = Path(sysconfig.get_path("purelib", vars={"base": str(place / "empty")}))
     paths = [each for each in sys.path if each.endswith("site-packages")]
@@ -116,7 +146,9 @@ def tried(python: str, which: str, place: Path, tests: list[str]) -> str:
     summary, versions = "demo only", run(place, own, "-c", VERSIONS)
     if tests:
         run(place, *install, "--no-deps", "-e", ROOT)
-        summary = run(ROOT, own, "-m", "pytest", "-m", "not slow", "-n", "2", "--dist", "loadfile", *tests)
+        summary = run(
+            ROOT, own, "-m", "pytest", "-m", "not slow", "-n", "2", "--dist", "loadfile", *tests
+        )
     return f"passed: {versions}: {summary}"
 
 

@@ -46,7 +46,9 @@ LEVELS = ((0.02, 0.04), (0.02, 0.12), (0.06, 0.12))
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--rigs", default="0:20", help="which rooms, first:stop")
     parser.add_argument("--output", type=Path, help="CSV file with a line for each check")
     parser.add_argument("--only", choices=("faults", "biases"))
@@ -58,10 +60,14 @@ def main() -> None:
         scene = built_in_scene(seed, people=people, cameras=cameras, frames=FRAMES)
         seen, room = simulate(scene, seed=seed), (seed, people, cameras)
         for each in _faults(seen, scene, rng) if arguments.only != "biases" else ():
-            found = [f for f in check_setup(each.detections, each.rig).findings if not _of_several(f)]
+            found = [
+                f for f in check_setup(each.detections, each.rig).findings if not _of_several(f)
+            ]
             possible = [*found, *(other for f in found[:1] for other in f.instead)]
             first_named, named = each.named_by(found[:1]), each.named_by(possible)
-            rows.append((*room, "fault", each.what, first_named and len(found) == 1, named, _words(found)))
+            rows.append(
+                (*room, "fault", each.what, first_named and len(found) == 1, named, _words(found))
+            )
             print(*rows[-1], flush=True)
         for what, detections in _biased(seen, scene, rng) if arguments.only != "faults" else ():
             found = check_setup(detections, scene.rig).findings
@@ -76,7 +82,15 @@ def main() -> None:
             counts[kind, name].append((bool(first_named), bool(named)))
     for (kind, what), each in counts.items():
         one, either = np.sum(each, axis=0)
-        print(kind, what, len(each), "accused" if kind == "sound" else "named first", one, "named", either)
+        print(
+            kind,
+            what,
+            len(each),
+            "accused" if kind == "sound" else "named first",
+            one,
+            "named",
+            either,
+        )
 
 
 def _of_several(finding: Finding) -> bool:
@@ -88,7 +102,9 @@ def _words(found: list[Finding] | tuple[Finding, ...]) -> str:
 
 
 def _faults(seen: Recording, scene: Scene, rng: np.random.Generator) -> Iterator[Spoiled]:
-    """One fault of each kind, on a randomly drawn camera; all faults move joints by 2 cm or more."""
+    """One fault of each kind, on a randomly drawn camera; all faults move joints by 2 cm or
+    more.
+    """
     rig = scene.rig
 
     def view() -> int:
@@ -99,10 +115,18 @@ def _faults(seen: Recording, scene: Scene, rng: np.random.Generator) -> Iterator
 
     for degrees in (1.0, 2.0, 5.0, 20.0):
         v = view()
-        yield Spoiled(f"turned {degrees:g}", seen, turned(rig, v, degrees, rng.normal(size=3)), Kind.TURNED, (v,))
+        yield Spoiled(
+            f"turned {degrees:g}",
+            seen,
+            turned(rig, v, degrees, rng.normal(size=3)),
+            Kind.TURNED,
+            (v,),
+        )
     for metres in (0.1, 0.3):
         v = view()
-        yield Spoiled(f"moved {metres:g}", seen, moved(rig, v, metres, rng.normal(size=3)), Kind.MOVED, (v,))
+        yield Spoiled(
+            f"moved {metres:g}", seen, moved(rig, v, metres, rng.normal(size=3)), Kind.MOVED, (v,)
+        )
     for factor in (1.08, 1.5):
         v, by = view(), factor ** sign()
         yield Spoiled(f"focal length {factor:g}", seen, zoomed(rig, v, by), Kind.FOCAL, (v,))
@@ -119,13 +143,21 @@ def _faults(seen: Recording, scene: Scene, rng: np.random.Generator) -> Iterator
     yield Spoiled("mirrored", mirrored(seen, rig, v := view()), rig, Kind.MIRRORED, (v,))
     yield Spoiled("picture size", resized(seen, (v := view(),), 0.5), rig, Kind.RESIZED, (v,))
     v, half = view(), FRAMES // 2
-    yield Spoiled("bumped 3", turning(seen, rig, v, lambda t: 3.0 * (t >= half)), rig, Kind.BUMPED, (v,))
     yield Spoiled(
-        "drifting 8", turning(seen, rig, v := view(), lambda t: 8 * t / FRAMES), rig, Kind.DRIFTING, (v,)
+        "bumped 3", turning(seen, rig, v, lambda t: 3.0 * (t >= half)), rig, Kind.BUMPED, (v,)
+    )
+    yield Spoiled(
+        "drifting 8",
+        turning(seen, rig, v := view(), lambda t: 8 * t / FRAMES),
+        rig,
+        Kind.DRIFTING,
+        (v,),
     )
 
 
-def _biased(seen: Recording, scene: Scene, rng: np.random.Generator) -> Iterator[tuple[str, Recording]]:
+def _biased(
+    seen: Recording, scene: Scene, rng: np.random.Generator
+) -> Iterator[tuple[str, Recording]]:
     """The recording as detected by detectors with lasting biases."""
     shape = scene.people, 25, len(scene.rig)
     people = np.array([scene.truth_at(frame) for frame in range(len(seen))])
@@ -140,9 +172,15 @@ def _biased(seen: Recording, scene: Scene, rng: np.random.Generator) -> Iterator
             ("by joint, one view", one_view),
             ("one person in one view", one_person),
         ):
-            yield f"{what}, {100 * low:g} to {100 * high:g} %", biased(seen, scene.rig, people, bias)
+            yield (
+                f"{what}, {100 * low:g} to {100 * high:g} %",
+                biased(seen, scene.rig, people, bias),
+            )
     sizes = rng.uniform(-0.08, 0.08, (shape[0], 1, shape[2], 1))
-    yield "size by person and view, up to 8 %", biased(seen, scene.rig, people, np.zeros((*shape, 2)), sizes)
+    yield (
+        "size by person and view, up to 8 %",
+        biased(seen, scene.rig, people, np.zeros((*shape, 2)), sizes),
+    )
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""Fit the parameters of joint covariances (`estimation/covariance_calibration.py`) to the errors in simulated
-recordings.
+"""Fit the parameters of joint covariances (`estimation/covariance_calibration.py`) to the errors in
+simulated recordings.
 
-    python scripts/fit_covariances.py --mocap ../shared/data/cmu_mocap/cmu_smpl24.npz --output calibration.json
+    python scripts/fit_covariances.py --mocap cmu_smpl24.npz --output calibration.json
 
 Crowds, crossings and pairs with two to six cameras, 4 s each; half an hour on one core. The mean
 log score of the true joint under its Gaussian is maximised. Joints seen by two or more views, by
@@ -43,7 +43,8 @@ CASES: tuple[tuple[str, Split, int, int], ...] = (
     ("salsa", "tune", 7013, 2), ("crossing", "tune", 7014, 2),
 )  # fmt: skip
 """Scene, split, seed, number of cameras. Seeds of `report` are those used during development; they
-are needed because exchanged limbs are rare, and long ones did not occur with the seeds of `tune`."""
+are needed because exchanged limbs are rare, and long ones did not occur with the seeds of
+`tune`."""
 FRAMES, FPS = 120, 30.0
 SHARES = (0.5, 0.7, 1.0)
 """Shares in the log score of joints that are seen by no view, by one view, and by two or more."""
@@ -58,7 +59,9 @@ ALIKE = ("Nose Eye Ear", "Neck", "Shoulder", "Elbow", "Wrist", "Hip", "Knee", "A
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--mocap", type=Path, required=True, help="file of recorded motions")
     parser.add_argument("--output", type=Path, required=True, help="JSON file to be written")
     arguments = parser.parse_args()
@@ -76,7 +79,9 @@ def mean_law(laws: list[NoiseLaw]) -> dict:
         np.average(values, axis=0, weights=weights)
         for values in (np.square([law.times for law in laws]), [law.gross for law in laws])
     )
-    return NoiseLaw(tuple(np.sqrt(squared).round(2).tolist()), tuple(gross.round(3).tolist())).as_dict()
+    return NoiseLaw(
+        tuple(np.sqrt(squared).round(2).tolist()), tuple(gross.round(3).tolist())
+    ).as_dict()
 
 
 def errors(
@@ -93,12 +98,17 @@ def errors(
         scene = whole.part(range(FRAMES))
     detections, seen = simulate(scene, seed=seed), []
     truly = Calibration.covariance
-    with patch.object(Calibration, "covariance", lambda self, clues: seen.append(clues) or truly(self, clues)):
+    with patch.object(
+        Calibration, "covariance", lambda self, clues: seen.append(clues) or truly(self, clues)
+    ):
         times = FrameTimes.from_fps(FPS, len(detections))
         people = reconstruct(detections, scene.rig, times=times, cuts=scene.cuts)
     laws.append(NoiseLaw.from_dict(people.run["noise_law"]))
     for clues in seen:
-        found, true = match_people(clues.frame, clues.joints, scene.keypoints), np.full(clues.joints.shape, np.nan)
+        found, true = (
+            match_people(clues.frame, clues.joints, scene.keypoints),
+            np.full(clues.joints.shape, np.nan),
+        )
         true[found.row] = scene.keypoints[found.frame, found.person]
         yield clues, clues.joints - true
 
@@ -107,7 +117,10 @@ def fitted(found: list[tuple[CovarianceFeatures, np.ndarray]]) -> dict:
     """The fitted parameters, as the content of the output file."""
     names = BODY_25.joints
     group = np.array(
-        [next(n for n, each in enumerate(ALIKE) if name.endswith(tuple(each.split()))) for name in names]
+        [
+            next(n for n, each in enumerate(ALIKE) if name.endswith(tuple(each.split())))
+            for name in names
+        ]
     )
     parts = []
     for clues, off in found:
@@ -127,17 +140,23 @@ def fitted(found: list[tuple[CovarianceFeatures, np.ndarray]]) -> dict:
         torch.full((count,), value, dtype=off.dtype, requires_grad=True)
         for count, value in ((len(ALIKE), -0.5), (2, 0.5), (3, 0.0))
     )
-    optimiser = torch.optim.LBFGS([log_scale, powers, log_added], max_iter=100, line_search_fn="strong_wolfe")
+    optimiser = torch.optim.LBFGS(
+        [log_scale, powers, log_added], max_iter=100, line_search_fn="strong_wolfe"
+    )
 
     def squares() -> tuple[torch.Tensor, torch.Tensor]:
         C = torch.exp(log_scale[which] + features @ powers)[:, None, None] * covariance
         root = torch.linalg.cholesky(C + (torch.exp(log_added)[:, None, None, None] * added).sum(0))
-        return root, (torch.linalg.solve_triangular(root, off[..., None], upper=False) ** 2).sum((-1, -2))
+        return root, (torch.linalg.solve_triangular(root, off[..., None], upper=False) ** 2).sum(
+            (-1, -2)
+        )
 
     def loss() -> torch.Tensor:
         optimiser.zero_grad()
         root, squared = squares()
-        squared = torch.where(squared > FAR, FAR * (1 + torch.log(squared.clamp(min=FAR) / FAR)), squared)
+        squared = torch.where(
+            squared > FAR, FAR * (1 + torch.log(squared.clamp(min=FAR) / FAR)), squared
+        )
         lost = squared / 2 + torch.log(torch.diagonal(root, dim1=-2, dim2=-1)).sum(-1)
         total = (share[views] * lost).sum()
         total.backward()
@@ -146,7 +165,10 @@ def fitted(found: list[tuple[CovarianceFeatures, np.ndarray]]) -> dict:
     optimiser.step(loss)
     # Quantile regression: ratio of the 95 % quantile of squared distances to that of a Gaussian, as
     # a function of the uncertainty of a person.
-    squared, wider = torch.log(squares()[1].detach() / AT_95), torch.zeros(2, dtype=off.dtype, requires_grad=True)
+    squared, wider = (
+        torch.log(squares()[1].detach() / AT_95),
+        torch.zeros(2, dtype=off.dtype, requires_grad=True),
+    )
     optimiser = torch.optim.LBFGS([wider], max_iter=100, line_search_fn="strong_wolfe")
 
     def outside() -> torch.Tensor:
@@ -163,7 +185,9 @@ def fitted(found: list[tuple[CovarianceFeatures, np.ndarray]]) -> dict:
     scale = (times * torch.exp(log_scale)).tolist()
     weights = (*powers.tolist(), *(times * torch.exp(log_added)).tolist(), of_person)
     return {
-        "about": f"scripts/fit_covariances.py: {len(off)} joints of simulated people, cases {CASES}",
+        "about": (
+            f"scripts/fit_covariances.py: {len(off)} joints of simulated people, cases {CASES}"
+        ),
         "scale": {name: round(scale[n], 3) for name, n in zip(names, group.tolist(), strict=True)},
         **{name: round(value, 3) for name, value in zip(WEIGHTS, weights, strict=True)},
     }

@@ -17,11 +17,12 @@ PAGE = ROOT / "docs" / "licences.md"
 EXTRAS = ("detect", "export", "view", "archive", "photos", "cluster", "ros", "hdf5", "train")
 HEAD = """# Licences of what is installed with it
 
-With this page you can check the licences of all packages that are installed. `pip install shapepose-fg` installs
-the first list, and its extras the second. The names of the licences are those in the metadata of the packages.
+With this page you can check the licences of all packages that are installed. `pip install
+shapepose-fg` installs the first list, and its extras the second. The names of the licences are
+those in the metadata of the packages.
 
-None of them requires that programs which use it have the same licence. opencv-python-headless contains the
-libraries of FFmpeg (LGPL-2.1); they are separate files that may be exchanged.
+None of them requires that programs which use it have the same licence. opencv-python-headless
+contains the libraries of FFmpeg (LGPL-2.1); they are separate files that may be exchanged.
 
 Our code is under the MIT licence. The sources of the body and the priors are in the
 [README](../README.md#licence-and-credits).
@@ -69,8 +70,14 @@ def licence(of: Distribution) -> str:
     text = (metadata.get("License") or "").strip()
     if text and len(text) < 40 and "\n" not in text:
         return text
-    classifiers = [each.split(" :: ")[-1] for each in metadata.get_all("Classifier", []) if each[:7] == "License"]
-    named: list[str] = [str(_SHORT.get(each.lower(), each)) for each in classifiers if each != "OSI Approved"]
+    classifiers = [
+        each.split(" :: ")[-1]
+        for each in metadata.get_all("Classifier", [])
+        if each[:7] == "License"
+    ]
+    named: list[str] = [
+        str(_SHORT.get(each.lower(), each)) for each in classifiers if each != "OSI Approved"
+    ]
     return " or ".join(named) or "see its own files"
 
 
@@ -82,7 +89,9 @@ def page() -> str:
         under: dict[str, list[str]] = {}
         for name, each in rows.items():
             under.setdefault(licence(each), []).append(name)
-        text += f"\n{title}\n\n" + "".join(f"- {each}: {', '.join(under[each])}\n" for each in sorted(under))
+        text += f"\n{title}\n\n" + "".join(
+            f"- {each}: {', '.join(under[each])}\n" for each in sorted(under)
+        )
     return text
 
 

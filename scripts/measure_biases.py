@@ -24,7 +24,9 @@ RATIOS = (0.3, 1.0, 3.0)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("calibration", type=Path)
     parser.add_argument("detections", type=Path)
     parser.add_argument("--up", help="the axis that is up, where the calibration does not say it")

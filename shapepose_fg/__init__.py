@@ -4,8 +4,8 @@ import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-# Or MKL, which torch brings, rounds by where in memory an array happens to lie, and the last digits of a result
-# depend on the number of processes.
+# Or MKL, which torch brings, rounds by where in memory an array happens to lie, and the last digits
+# of a result depend on the number of processes.
 os.environ.setdefault("MKL_CBWR", "AUTO")
 
 
@@ -37,7 +37,8 @@ _HOMES = {
     "refine_trajectories": "shapepose_fg.pipeline.pipeline",
     "write_rig": "shapepose_fg.io.calibration",
 }
-"""Module of each public name, which is imported on first use, so that this import loads no torch."""
+"""Module of each public name, which is imported on first use, so that this import loads no
+torch."""
 
 
 def __getattr__(name: str) -> Any:

@@ -8,11 +8,12 @@ import signal
 def main() -> None:
     """Run the command line. Until it is loaded, Ctrl-C ends the program without a message.
 
-    An eighth of a second of processor time is saved: garbage collection hardly visits imported modules, and they
-    are not torn down at the end.
+    An eighth of a second of processor time is saved: garbage collection hardly visits imported
+    modules, and they are not torn down at the end.
     """
     gc.set_threshold(50_000, 20, 100)
-    # NumPy's matrices are small here: its threads wait for each other, a tenth of all processor time.
+    # NumPy's matrices are small here: its threads wait for each other, a tenth of all processor
+    # time.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, lambda *_: os._exit(130))

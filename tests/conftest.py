@@ -1,4 +1,6 @@
-"""Shared fixtures: where the real recordings are, cameras around a room, and people seen without error."""
+"""Shared fixtures: where the real recordings are, cameras around a room, and people seen without
+error.
+"""
 
 import os
 import pickle
@@ -23,8 +25,8 @@ from shapepose_fg.core.skeleton import BODY_25, Skeleton
 from shapepose_fg.pipeline.pipeline import reconstruct
 from shapepose_fg.simulation import Scene, built_in_scene, simulate
 
-# Some tests import others from this folder, where `factors` is the folder of the library's tests: the project goes
-# first, for processes that are begun by a test, too.
+# Some tests import others from this folder, where `factors` is the folder of the library's tests:
+# the project goes first, for processes that are begun by a test, too.
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 SEED = int(os.environ.get("SHAPEPOSE_TEST_SEED", "0"))
@@ -38,13 +40,18 @@ def pytest_configure() -> None:
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_make_collect_report(collector: pytest.Collector) -> Generator[None, pytest.CollectReport, Any]:
+def pytest_make_collect_report(
+    collector: pytest.Collector,
+) -> Generator[None, pytest.CollectReport, Any]:
     """Let every other process of pytest-xdist read the test files from the last one back.
 
     What pytest makes of a file is kept: each file is done by one process, and the others find it.
     """
     report = yield
-    if isinstance(collector, pytest.Directory) and os.environ.get("PYTEST_XDIST_WORKER", "gw0")[-1] in "13579":
+    if (
+        isinstance(collector, pytest.Directory)
+        and os.environ.get("PYTEST_XDIST_WORKER", "gw0")[-1] in "13579"
+    ):
         report.result.reverse()
     return report
 
@@ -59,9 +66,13 @@ _seeded = np.random.default_rng
 
 
 def _other_generator(seed: object = None) -> np.random.Generator:
-    """The generator of a seed together with `SEED`; what the program itself draws stays as it is."""
+    """The generator of a seed together with `SEED`; what the program itself draws stays as it
+    is.
+    """
     caller = sys._getframe(1).f_globals.get("__name__", "")
-    drawn = caller.startswith("shapepose_fg.simulation") or not caller.startswith(("shapepose_fg", "factors"))
+    drawn = caller.startswith("shapepose_fg.simulation") or not caller.startswith(
+        ("shapepose_fg", "factors")
+    )
     if not drawn or not isinstance(seed, int | np.integer | list | tuple):
         return _seeded(seed)
     return _seeded([SEED, *np.atleast_1d(np.asarray(seed, dtype=np.uint64)).tolist()])
@@ -72,25 +83,32 @@ STANDING = np.array(
     [
         [0, -0.1, 1.55], [0, 0, 1.42], [-0.18, 0, 1.40], [-0.35, 0, 1.15], [-0.45, -0.1, 0.95],
         [0.18, 0, 1.40], [0.35, 0, 1.15], [0.45, -0.1, 0.95], [0, 0, 0.92], [-0.1, 0, 0.92],
-        [-0.11, -0.02, 0.5], [-0.12, 0.03, 0.08], [0.1, 0, 0.92], [0.11, -0.02, 0.5], [0.12, 0.03, 0.08],
-        [-0.03, -0.09, 1.59], [0.03, -0.09, 1.59], [-0.07, 0, 1.57], [0.07, 0, 1.57], [0.14, -0.15, 0.02],
-        [0.19, -0.12, 0.02], [0.12, 0.08, 0.03], [-0.14, -0.15, 0.02], [-0.19, -0.12, 0.02], [-0.12, 0.08, 0.03],
+        [-0.11, -0.02, 0.5], [-0.12, 0.03, 0.08], [0.1, 0, 0.92], [0.11, -0.02, 0.5],
+        [0.12, 0.03, 0.08], [-0.03, -0.09, 1.59], [0.03, -0.09, 1.59], [-0.07, 0, 1.57],
+        [0.07, 0, 1.57], [0.14, -0.15, 0.02], [0.19, -0.12, 0.02], [0.12, 0.08, 0.03],
+        [-0.14, -0.15, 0.02], [-0.19, -0.12, 0.02], [-0.12, 0.08, 0.03],
     ]
 )  # fmt: skip
 
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
-    """The folder of real recordings (`SHAPEPOSE_DATA`, else ../shared); skips where there is none."""
+    """The folder of real recordings (`SHAPEPOSE_DATA`, else ../shared); skips where there is
+    none.
+    """
     root = Path(os.environ.get("SHAPEPOSE_DATA", Path(__file__).parents[2] / "shared"))
     if not (root / "data").is_dir():
-        pytest.skip(f"no real recordings at {root}: set SHAPEPOSE_DATA to their folder to run this test")
+        pytest.skip(
+            f"no real recordings at {root}: set SHAPEPOSE_DATA to their folder to run this test"
+        )
     return root / "data"
 
 
 @pytest.fixture(scope="session")
 def shared_cases(shared_data) -> Path:
-    """The folder of files that other programs wrote, and of what people reported; skips where there is none."""
+    """The folder of files that other programs wrote, and of what people reported; skips where there
+    is none.
+    """
     cases = shared_data.parent / "cases"
     if not cases.is_dir():
         pytest.skip(f"no cases at {cases}")
@@ -99,7 +117,9 @@ def shared_cases(shared_data) -> Path:
 
 @dataclass(frozen=True)
 class Dance:
-    """Four people in close motion before six cameras, 1.6 s, and their reconstruction by default."""
+    """Four people in close motion before six cameras, 1.6 s, and their reconstruction by
+    default.
+    """
 
     scene: Scene
     recording: Recording
@@ -109,7 +129,9 @@ class Dance:
 
 @pytest.fixture(scope="session")
 def dance(tmp_path_factory) -> Dance:
-    """The reconstruction that tests share: pytest-xdist's first process makes it, the others read it."""
+    """The reconstruction that tests share: pytest-xdist's first process makes it, the others read
+    it.
+    """
     scene = built_in_scene(seed=0, frames=40)
     recording, times = simulate(scene, seed=0), FrameTimes.from_fps(scene.fps, len(scene))
     folder = tmp_path_factory.getbasetemp()
@@ -132,17 +154,25 @@ def five_cameras() -> Rig:
 def two_people() -> NDArray[np.float64]:
     """(2, 25, 3) two people 0.9 m apart, who face different ways."""
     turn = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    return np.stack([STANDING - np.array([0.45, 0.0, 0.0]), STANDING @ turn + np.array([0.45, 0.1, 0.0])])
+    return np.stack(
+        [STANDING - np.array([0.45, 0.0, 0.0]), STANDING @ turn + np.array([0.45, 0.1, 0.0])]
+    )
 
 
 @pytest.fixture(scope="session")
 def seen_exactly():
-    """A function (rig, people (P, J, 3)) -> Detections: every joint in every view, affinities 0.9 and 0."""
+    """A function (rig, people (P, J, 3)) -> Detections: every joint in every view, affinities 0.9
+    and 0.
+    """
     return detect_exactly
 
 
-def detect_exactly(rig: Rig, people: NDArray[np.float64], skeleton: Skeleton = BODY_25) -> Detections:
-    """Every joint of every person in every view where it is, confidence 0.8; candidates in random order."""
+def detect_exactly(
+    rig: Rig, people: NDArray[np.float64], skeleton: Skeleton = BODY_25
+) -> Detections:
+    """Every joint of every person in every view where it is, confidence 0.8; candidates in random
+    order.
+    """
     xy, _ = rig.project(people)
     view, _, joint = (index.ravel() for index in np.indices(xy.shape[:3]))
     order = np.random.default_rng(0).permutation(len(view))
@@ -161,7 +191,9 @@ def detect_exactly(rig: Rig, people: NDArray[np.float64], skeleton: Skeleton = B
 
 @pytest.fixture(scope="session")
 def crowded(five_cameras, two_people) -> Detections:
-    """Four people close to each other: 4 px of noise, a fifth missed, a false candidate for every third joint."""
+    """Four people close to each other: 4 px of noise, a fifth missed, a false candidate for every
+    third joint.
+    """
     rng = np.random.default_rng(5)
     people = np.concatenate([two_people, two_people[::-1] + np.array([0.1, 0.5, 0.0])])
     xy, _ = five_cameras.project(people)
@@ -183,7 +215,9 @@ def crowded(five_cameras, two_people) -> Detections:
                 if own or rng.random() < 0.3:
                     pairs.append((head, tail))
                     affinity.append(rng.uniform(0.3, 1.0) if own else rng.uniform(0.0, 0.5))
-    confidence = np.where(person >= 0, rng.uniform(0.3, 1.0, len(view)), rng.uniform(0.1, 0.6, len(view)))
+    confidence = np.where(
+        person >= 0, rng.uniform(0.3, 1.0, len(view)), rng.uniform(0.1, 0.6, len(view))
+    )
     return Detections(view, joint, xy, confidence, np.array(pairs), np.array(affinity))
 
 

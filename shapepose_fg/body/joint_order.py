@@ -46,15 +46,23 @@ class _Distances:
 def _distances(dimensions: int) -> _Distances:
     """Statistics of distances in 3D (3), or in images of upright cameras (2)."""
     rng = np.random.default_rng(0)
-    betas, pose = np.clip(rng.normal(size=(_POSES, 10)), -2, 2), PosePrior.default().sample(rng, _POSES)
+    betas, pose = (
+        np.clip(rng.normal(size=(_POSES, 10)), -2, 2),
+        PosePrior.default().sample(rng, _POSES),
+    )
     body = BodyModel.default().with_keypoints(BODY_POINTS)
     nowhere = np.zeros((_POSES, 3))
     points = body.keypoints(BodyParameters(betas, nowhere, pose, nowhere))
     if dimensions == 2:
-        azimuth, elevation = rng.uniform(0, 2 * np.pi, _POSES), np.arcsin(rng.uniform(-0.2, 0.85, _POSES))
+        azimuth, elevation = (
+            rng.uniform(0, 2 * np.pi, _POSES),
+            np.arcsin(rng.uniform(-0.2, 0.85, _POSES)),
+        )
         ahead = np.stack([np.sin(azimuth), np.zeros(_POSES), np.cos(azimuth)], axis=1)
         right = np.stack([-np.cos(azimuth), np.zeros(_POSES), np.sin(azimuth)], axis=1)
-        up = np.sin(elevation)[:, None] * ahead + np.cos(elevation)[:, None] * np.array([0.0, 1.0, 0.0])
+        up = np.sin(elevation)[:, None] * ahead + np.cos(elevation)[:, None] * np.array(
+            [0.0, 1.0, 0.0]
+        )
         points = np.einsum("npx,nyx->npy", points, np.stack([right, up], axis=1))
     points = points + _NOISE_M * rng.normal(size=points.shape)
     apart = np.linalg.norm(points[:, :, None] - points[:, None], axis=-1)
@@ -87,7 +95,9 @@ def fit_of_order(people: Array, points: Sequence[str]) -> Array:
     return np.where(count >= _LEAST_PAIRS, _mean(_log_density(off, sigma)), np.nan)
 
 
-def exchanges(people: Array, points: Sequence[str], groups: Sequence[Sequence[tuple[int, int]]]) -> list[int]:
+def exchanges(
+    people: Array, points: Sequence[str], groups: Sequence[Sequence[tuple[int, int]]]
+) -> list[int]:
     """Improve the order `points` (K) of the joints of people (N, K, 2 or 3): the order that fits a
     body better.
 

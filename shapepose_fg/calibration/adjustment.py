@@ -22,8 +22,8 @@ from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.decompositions import nearest_rotation
 
 TURN, MOVE, FOCAL, CENTRE, LENS = slice(0, 3), slice(3, 6), slice(6, 7), slice(7, 9), slice(9, 13)
-"""Slices of a camera's parameters: rotation, rad, and translation, m, along its own axes; log of the focal
-length; principal point, px; k1 k2 p1 p2."""
+"""Slices of a camera's parameters: rotation, rad, and translation, m, along its own axes; log of
+the focal length; principal point, px; k1 k2 p1 p2."""
 Q = 13
 _HELD = 1e-6
 """Standard deviation of fixed parameters, rad or m."""
@@ -40,7 +40,9 @@ bumped camera must not pull the rig."""
 
 @dataclass(frozen=True)
 class Freedom:
-    """Prior standard deviations of the cameras' parameters from the values in their file; 0: fixed."""
+    """Prior standard deviations of the cameras' parameters from the values in their file; 0:
+    fixed.
+    """
 
     turn_deg: float = 1.0
     """Rotation, degrees."""
@@ -57,7 +59,9 @@ class Freedom:
     def sigmas(self) -> Array:
         """(Q,) prior standard deviation of each parameter of a camera."""
         turn, move = np.radians(self.turn_deg) / np.sqrt(3), self.move_m / np.sqrt(3)
-        return np.array([turn] * 3 + [move] * 3 + [self.focal] + [self.centre_px] * 2 + [self.lens] * 4)
+        return np.array(
+            [turn] * 3 + [move] * 3 + [self.focal] + [self.centre_px] * 2 + [self.lens] * 4
+        )
 
 
 @dataclass(frozen=True)
@@ -76,7 +80,9 @@ class Adjusted:
     residuals."""
 
     def sigma(self, part: slice) -> Array:
-        """(V,) standard deviation of some of the parameters together: root of their summed variances."""
+        """(V,) standard deviation of some of the parameters together: root of their summed
+        variances.
+        """
         variance = np.einsum("vqvq->vq", self.covariance)[:, part]
         return np.sqrt(np.maximum(variance, 0.0).sum(axis=1))
 
@@ -105,8 +111,14 @@ def adjust(
     points = people.points[person, joint]
     key = np.unique(person * people.points.shape[1] + joint, return_inverse=True)[1]
     xy = people.xy[person, joint, view]
-    models = isotropic_models(2, scale * people.sigma_px[person, joint, view], robust_kernel("cauchy"))
-    seen = gtsam_unstable.ProjectionFactorPPPCCal3DS2 if free else gtsam_unstable.ProjectionFactorPPPCCal3_S2
+    models = isotropic_models(
+        2, scale * people.sigma_px[person, joint, view], robust_kernel("cauchy")
+    )
+    seen = (
+        gtsam_unstable.ProjectionFactorPPPCCal3DS2
+        if free
+        else gtsam_unstable.ProjectionFactorPPPCCal3_S2
+    )
     joints = [L(each) for each in key.tolist()]
     poses, lenses = ([letter(each) for each in view.tolist()] for letter in (X, C))
     for each in zip(xy, models, poses, joints, lenses, strict=True):
@@ -121,7 +133,9 @@ def adjust(
         values.insert(X(each), gtsam.Pose3(camera.wTc))
         values.insert(C(each), _lens(camera, free))
         sigmas = freedom.sigmas / weight
-        pose = diagonal(np.full(6, _HELD) if each == reference else np.maximum(sigmas[:6], _HELD), kernel)
+        pose = diagonal(
+            np.full(6, _HELD) if each == reference else np.maximum(sigmas[:6], _HELD), kernel
+        )
         priors.addPriorPose3(X(each), gtsam.Pose3(before.wTc), pose)
         noise = gaussian(_lens_covariance(before, sigmas, free))
         factor = gtsam.PriorFactorCal3DS2 if free else gtsam.PriorFactorCal3_S2
@@ -139,21 +153,29 @@ def adjust(
     both = gtsam.NonlinearFactorGraph(graph)
     both.push_back(priors)
     found = gtsam.LevenbergMarquardtOptimizer(both, values, params).optimize()
-    rig = replace(start, cameras=tuple(_camera(start.cameras[v], found, v, free) for v in range(len(start))))
+    rig = replace(
+        start, cameras=tuple(_camera(start.cameras[v], found, v, free) for v in range(len(start)))
+    )
     moved = np.full_like(people.points, np.nan)
     moved[person[first], joint[first]] = [found.atPoint3(joints[place]) for place in first.tolist()]
     placed = replace(people, points=moved)
     # A joint behind a camera has no constraints, so that its position needs a prior.
     depth = np.moveaxis(rig.project(moved)[1], 0, 2)[person, joint, view]
     for each in dict.fromkeys(joints[place] for place in np.flatnonzero(depth <= 0).tolist()):
-        graph.addPriorPoint3(each, found.atPoint3(each), gtsam.noiseModel.Isotropic.Sigma(3, _ANYWHERE_M))
-    information = _information(graph, found, list(dict.fromkeys(joints)), view.tolist(), rig, free) / dilution
+        graph.addPriorPoint3(
+            each, found.atPoint3(each), gtsam.noiseModel.Isotropic.Sigma(3, _ANYWHERE_M)
+        )
+    information = (
+        _information(graph, found, list(dict.fromkeys(joints)), view.tolist(), rig, free) / dilution
+    )
     covariance = _covariance(information, rig, freedom.sigmas, reference, scaled)
     return Adjusted(rig, covariance, placed, scale * misfit(placed, rig, scale))
 
 
 def misfit(people: People, rig: Rig, scale: float = 1.0) -> float:
-    """Ratio of the median residual to its expectation under the standard deviations (times `scale`): ideally 1."""
+    """Ratio of the median residual to its expectation under the standard deviations (times
+    `scale`): ideally 1.
+    """
     views = people.seen.sum(axis=-1, keepdims=True)
     seen, _ = rig.project(people.points)
     away = np.linalg.norm(np.moveaxis(seen, 0, 2) - people.xy, axis=-1) / (scale * people.sigma_px)
@@ -180,13 +202,21 @@ def _lens_columns(camera: Camera, free: bool) -> Array:
 
 def _lens_covariance(camera: Camera, sigmas: Array, free: bool) -> Array:
     columns = _lens_columns(camera, free)
-    held = np.diag(np.r_[_HELD_PX * np.ones(5), _HELD_PX / camera.K[0, 0] * np.ones(4)][: len(columns)]) ** 2
+    held = (
+        np.diag(
+            np.r_[_HELD_PX * np.ones(5), _HELD_PX / camera.K[0, 0] * np.ones(4)][: len(columns)]
+        )
+        ** 2
+    )
     return columns @ np.diag(sigmas[6:] ** 2) @ columns.T + held
 
 
 def _camera(camera: Camera, values: gtsam.Values, view: int, free: bool) -> Camera:
     """The adjusted camera."""
-    wTc, lens = values.atPose3(X(view)).matrix(), values.atCal3DS2(C(view)) if free else values.atCal3_S2(C(view))
+    wTc, lens = (
+        values.atPose3(X(view)).matrix(),
+        values.atCal3DS2(C(view)) if free else values.atCal3_S2(C(view)),
+    )
     K, distortion = lens.K(), camera.distortion.copy()
     if free:
         distortion[:4] = lens.vector()[5:]
@@ -222,7 +252,9 @@ def _information(
     return to.T @ information @ to
 
 
-def _covariance(information: Array, rig: Rig, sigmas: Array, reference: int | None, scaled: bool) -> Array:
+def _covariance(
+    information: Array, rig: Rig, sigmas: Array, reference: int | None, scaled: bool
+) -> Array:
     """(V, Q, V, Q) covariance of the cameras' parameters, without rigid motion, or scaling, of the
     whole rig.
     """
@@ -235,7 +267,9 @@ def _covariance(information: Array, rig: Rig, sigmas: Array, reference: int | No
     inner = np.linalg.inv(information[np.ix_(used, used)] + np.diag(weight))
     if reference is None:
         whole = np.zeros((V, Q, 7 if scaled else 6))
-        whole[:, :6, :6] = [gtsam.Pose3(camera.wTc).inverse().AdjointMap() for camera in rig.cameras]
+        whole[:, :6, :6] = [
+            gtsam.Pose3(camera.wTc).inverse().AdjointMap() for camera in rig.cameras
+        ]
         if scaled:
             away = rig.centres - rig.centres.mean(axis=0)
             whole[:, 3:6, 6] = [

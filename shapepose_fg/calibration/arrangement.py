@@ -18,12 +18,14 @@ from shapepose_fg.core.decompositions import rigid
 from shapepose_fg.setup_check.fit import difference
 
 _TREES = 100
-"""Number of spanning trees that are tried: the best, and random ones weighted by the scores of pairs."""
+"""Number of spanning trees that are tried: the best, and random ones weighted by the scores of
+pairs."""
 _AGREE_DEG = 8.0
-"""Deviation within which a pair agrees, degrees: right pairs are off by 0.3 to 4 in simulated recordings and on
-Shelf."""
+"""Deviation within which a pair agrees, degrees: right pairs are off by 0.3 to 4 in simulated
+recordings and on Shelf."""
 _LEAST, _LENGTH = np.radians(0.3), 0.1
-"""Minimum standard deviation of a pair's rotation and direction, rad, and of its length, as a share."""
+"""Minimum standard deviation of a pair's rotation and direction, rad, and of its length, as a
+share."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,9 @@ class Edge:
         bTa = rigid(pair.R, metres * pair.t)
         way = pair.t / np.linalg.norm(pair.t)
         covariance = pair.covariance + _LEAST**2 * np.diag(np.r_[1.0, 1, 1, 0, 0, 0])
-        covariance[3:, 3:] += _LEAST**2 * (np.eye(3) - np.outer(way, way)) + _LENGTH**2 * np.outer(way, way)
+        covariance[3:, 3:] += _LEAST**2 * (np.eye(3) - np.outer(way, way)) + _LENGTH**2 * np.outer(
+            way, way
+        )
         to = np.kron(np.diag([1.0, metres]), pair.R.T)
         return cls(bTa, pair.score, to @ covariance @ to.T)
 
@@ -55,7 +59,8 @@ def arranged(edges: Mapping[tuple[int, int], Edge], views: int) -> Array:
     for trial in range(_TREES):
         luck = rng.gumbel(size=len(edges)) if trial > 0 else np.zeros(len(edges))
         order = sorted(
-            zip(edges, luck.tolist(), strict=True), key=lambda each: -edges[each[0]].score - 0.15 * each[1]
+            zip(edges, luck.tolist(), strict=True),
+            key=lambda each: -edges[each[0]].score - 0.15 * each[1],
         )
         poses = _tree([pair for pair, _ in order], edges, views)
         if (agree := agreement(poses, edges)) > most:
@@ -106,5 +111,7 @@ def _together(poses: Array, edges: Mapping[tuple[int, int], Edge]) -> Array:
 def parts(pairs: Mapping[tuple[int, int], object], views: int) -> list[list[int]]:
     """The connected components of cameras under `pairs`, the largest first."""
     ends = np.array(list(pairs), dtype=np.intp).reshape(-1, 2).T
-    count, part = connected_components(coo_array((np.ones(ends.shape[1]), tuple(ends)), shape=(views, views)))
+    count, part = connected_components(
+        coo_array((np.ones(ends.shape[1]), tuple(ends)), shape=(views, views))
+    )
     return sorted((np.flatnonzero(part == n).tolist() for n in range(count)), key=len, reverse=True)

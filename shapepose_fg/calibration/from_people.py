@@ -37,7 +37,8 @@ from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.setup_check.matching import Sightings
 
 _BURST_S, _BURSTS = 10.0, 6
-"""Duration of the intervals in which people are tracked, s, and their number, spread over the recording."""
+"""Duration of the intervals in which people are tracked, s, and their number, spread over the
+recording."""
 _FEW, _ROUGH, _ROUNDS, _HALF_ROUNDS = 30, 6, 6, 2
 """Number of frames in the first rounds, number of these rounds, of rounds with all frames, and of
 rounds with each half of them."""
@@ -46,11 +47,14 @@ _STILL_DEG = 0.03
 _LEAST_SCORE, _LEAST_S = 0.15, 3.0
 """Minimum score of a pair of cameras, and minimum common person-seconds."""
 _MOST_SIGMA_DEG, _MOST_APART_DEG = 1.0, 2.0
-"""Maximum standard deviation of a rotation, and maximum difference between halves of the recording, degrees."""
+"""Maximum standard deviation of a rotation, and maximum difference between halves of the recording,
+degrees."""
 _UNUSUAL = 3.0
 """Maximum deviation of stature, in standard deviations, for people assumed to be adults."""
 _FREE = Freedom(turn_deg=20.0, move_m=1.0)
-_FILM = "film two or more people for a minute who walk through all views, near and far, not on one line"
+_FILM = (
+    "film two or more people for a minute who walk through all views, near and far, not on one line"
+)
 
 
 class Undetermined(ValueError):
@@ -97,7 +101,10 @@ class Calibrated:
 
     def as_dict(self) -> dict[str, Any]:
         """All figures as plain values."""
-        sigmas = {"turn_deg": np.degrees(self.adjusted.sigma(TURN)), "move_mm": 1e3 * self.adjusted.sigma(MOVE)}
+        sigmas = {
+            "turn_deg": np.degrees(self.adjusted.sigma(TURN)),
+            "move_mm": 1e3 * self.adjusted.sigma(MOVE),
+        }
         sigmas |= {"focal_percent": 100 * self.adjusted.sigma(FOCAL)}
         cameras = [
             {
@@ -113,13 +120,21 @@ class Calibrated:
             for view, camera in enumerate(self.rig.cameras)
         ]
         floor = self.world.floor
-        about = {"held_out_px": round(self.held_out_px, 3), "sigma_scale": round(self.world.sigma_scale, 4)}
+        about = {
+            "held_out_px": round(self.held_out_px, 3),
+            "sigma_scale": round(self.world.sigma_scale, 4),
+        }
         about |= {
             "stature_m": round(self.world.stature_m, 3),
             "people_at_once": self.world.persons,
             "upright": round(self.world.upright, 3),
         }
-        return {"cameras": cameras, **about, "floor_found": floor is not None, "notes": list(self.notes)}
+        return {
+            "cameras": cameras,
+            **about,
+            "floor_found": floor is not None,
+            "notes": list(self.notes),
+        }
 
 
 def calibrate(
@@ -156,7 +171,10 @@ def calibrate(
         pairs = _pairs(detections, rig, times, frames, told)
         if len(connected := parts(pairs, views)) > 1:
             raise Undetermined(tuple(_apart(rig, connected)))
-        edges = {pair: _edge(each, detections.skeleton, measured.stature_m) for pair, each in pairs.items()}
+        edges = {
+            pair: _edge(each, detections.skeleton, measured.stature_m)
+            for pair, each in pairs.items()
+        }
         few = footage.at(taken[np.unique(np.linspace(0, len(taken) - 1, _FEW).astype(np.intp))])
         start = how.settled(few, rig.at_poses(arranged(edges, views)), _ROUGH).rig
     adjusted = how.settled(footage, start, _ROUNDS)
@@ -173,17 +191,27 @@ def calibrate(
         sigma = sigma_of_scale(at_once(adjusted.people), measured.stature_m is not None)
     new, world = levelled(adjusted.rig, adjusted.people, detections.skeleton, sigma)
     moved = new.cameras[0].wTc @ np.linalg.inv(adjusted.rig.cameras[0].wTc)
-    people = replace(adjusted.people, points=adjusted.people.points @ moved[:3, :3].T + moved[:3, 3])
-    found = _judged(replace(adjusted, rig=new, people=people), world, halves, np.concatenate(missed), footage)
+    people = replace(
+        adjusted.people, points=adjusted.people.points @ moved[:3, :3].T + moved[:3, 3]
+    )
+    found = _judged(
+        replace(adjusted, rig=new, people=people), world, halves, np.concatenate(missed), footage
+    )
     usual = _UNUSUAL * sigma_of_scale(world.persons, False)
     if not measured.distances or abs(np.log(world.stature_m / ADULT_M)) < usual:
         return found
     tall = f"the median stature of people is {world.stature_m:.2f} m"
-    return replace(found, notes=(f"{tall}; if they are adults, measure the distance of the cameras again",))
+    return replace(
+        found, notes=(f"{tall}; if they are adults, measure the distance of the cameras again",)
+    )
 
 
 def _pairs(
-    detections: DetectionSequence | OneClock, rig: Rig, times: FrameTimes, frames: range, told: Callable[[], None]
+    detections: DetectionSequence | OneClock,
+    rig: Rig,
+    times: FrameTimes,
+    frames: range,
+    told: Callable[[], None],
 ) -> dict[tuple[int, int], Relative]:
     """Relative poses of pairs of cameras with sufficient evidence."""
     taken = times.frame_s[frames.start : frames.stop]
@@ -218,8 +246,8 @@ def _apart(rig: Rig, connected: list[list[int]]) -> list[str]:
     """Cameras that share too little with the others, in words."""
     most = " ".join(rig.names[view] for view in connected[0])
     return [
-        f"{_named(rig, part)}: too few people are seen there and by {most} at the same times, or cameras are"
-        f" not synchronised; {_FILM}, where views overlap"
+        f"{_named(rig, part)}: too few people are seen there and by {most} at the same times, or "
+        f"cameras are not synchronised; {_FILM}, where views overlap"
         for part in connected[1:]
     ]
 
@@ -232,7 +260,10 @@ def _named(rig: Rig, views: Iterable[int]) -> str:
 
 def _edge(pair: Relative, skeleton: Skeleton, stature_m: float | None) -> Edge:
     people = People(
-        np.zeros(len(pair.points), np.intp), pair.points[..., None, :2], pair.points[..., :1], pair.points
+        np.zeros(len(pair.points), np.intp),
+        pair.points[..., None, :2],
+        pair.points[..., :1],
+        pair.points,
     )
     metres = scale_of(people, skeleton, stature_m)
     return Edge.of(pair, metres if np.isfinite(metres) else 3.0)
@@ -250,20 +281,24 @@ class _How:
     told: Callable[[int], None]
 
     def settled(self, footage: Footage, now: Rig, rounds: int) -> Adjusted:
-        """Cameras after several rounds of association and adjustment, starting at `now`, in metres."""
+        """Cameras after several rounds of association and adjustment, starting at `now`, in
+        metres.
+        """
         adjusted: Adjusted | None = None
         for step in range(rounds):
             people = footage.people(now)
             if len(people) < LEAST_PEOPLE or not people.seen.any():
                 raise Undetermined(
                     (
-                        f"only {len(people)} people are seen by two cameras at once, but at least 10 are needed;"
-                        f" {_FILM}",
+                        f"only {len(people)} people are seen by two cameras at once, but at "
+                        f"least 10 are needed; {_FILM}",
                     )
                 )
             given = self.given.at_poses(now.wTc)
             spread = dilution(self.times.frame_s[np.unique(people.frame)])
-            adjusted = adjust(given, now, people, self.freedom, spread, misfit(people, now), scaled=True)
+            adjusted = adjust(
+                given, now, people, self.freedom, spread, misfit(people, now), scaled=True
+            )
             factor = scale_of(adjusted.people, self.skeleton, self.stature_m)
             if not np.isfinite(factor):
                 raise Undetermined(
@@ -292,14 +327,18 @@ def _grown(adjusted: Adjusted, factor: float) -> Adjusted:
     )
 
 
-def _judged(adjusted: Adjusted, world: World, halves: list[Rig], missed: Array, footage: Footage) -> Calibrated:
+def _judged(
+    adjusted: Adjusted, world: World, halves: list[Rig], missed: Array, footage: Footage
+) -> Calibrated:
     """The validated result; raises Undetermined with the problems."""
     rig, people = adjusted.rig, adjusted.people
     apart_deg, apart_m = _apart_by(*halves)
     counts = people.seen.any(axis=1).sum(axis=0)
     seen = np.bincount(footage.sightings.view, minlength=len(rig))
     held = float(np.nanmedian(missed)) if np.isfinite(missed).any() else np.nan
-    found = Calibrated(adjusted, world, apart_deg, apart_m, held, counts, counts / np.maximum(seen, 1), missed)
+    found = Calibrated(
+        adjusted, world, apart_deg, apart_m, held, counts, counts / np.maximum(seen, 1), missed
+    )
     sigma = np.degrees(adjusted.sigma(TURN))
     few, vague = counts < LEAST_PEOPLE, sigma > _MOST_SIGMA_DEG
     torn = apart_deg > _MOST_APART_DEG
@@ -307,10 +346,21 @@ def _judged(adjusted: Adjusted, world: World, halves: list[Rig], missed: Array, 
         (
             few,
             counts,
-            f"only {{}} people are seen by another camera, too, but at least {LEAST_PEOPLE} are needed",
+            (
+                f"only {{}} people are seen by another camera, too, but at least {LEAST_PEOPLE} "
+                "are needed"
+            ),
         ),
-        (~few & vague, sigma.round(1), "the motion of the people determines the rotation to {} degrees only"),
-        (~few & ~vague & torn, apart_deg.round(1), "the two halves of the recording are {} degrees apart"),
+        (
+            ~few & vague,
+            sigma.round(1),
+            "the motion of the people determines the rotation to {} degrees only",
+        ),
+        (
+            ~few & ~vague & torn,
+            apart_deg.round(1),
+            "the two halves of the recording are {} degrees apart",
+        ),
     )
     problems = [
         f"{_named(rig, views)}: {words.format(', '.join(map(str, amounts[views])))}; {_FILM}"

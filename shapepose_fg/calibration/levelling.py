@@ -46,7 +46,10 @@ class Measured:
         Raises InputError if distances contradict each other.
         """
         rig, V = adjusted.rig, len(adjusted.rig)
-        length, metres = np.empty(len(self.distances)), np.array([each for *_, each in self.distances])
+        length, metres = (
+            np.empty(len(self.distances)),
+            np.array([each for *_, each in self.distances]),
+        )
         sigma = np.empty(len(self.distances))
         for n, (a, b, _) in enumerate(self.distances):
             away = rig.centres[a] - rig.centres[b]
@@ -62,8 +65,8 @@ class Measured:
         if abs(said[worst] - log) > _CONTRADICTS * sigma[worst]:
             a, b, given = self.distances[worst]
             raise InputError(
-                f"distance of {rig.names[a]} and {rig.names[b]}: people and the other distances give"
-                f" {np.exp(log) * length[worst]:.2f} m instead of {given:g} m; measure again"
+                f"distance of {rig.names[a]} and {rig.names[b]}: people and the other distances "
+                f"give {np.exp(log) * length[worst]:.2f} m instead of {given:g} m; measure again"
             )
         return float(np.exp(log)), float(1 / np.sqrt(weight.sum()))
 
@@ -82,7 +85,8 @@ class World:
     """Floor under the ankles, in the frame before levelling; None if they are not on a
     level plane."""
     upright: float
-    """Agreement of people's upright directions: the length of their trunks' mean direction, 1 at most."""
+    """Agreement of people's upright directions: the length of their trunks' mean direction, 1 at
+    most."""
 
 
 def scale_of(people: People, skeleton: Skeleton, stature_m: float | None) -> float:
@@ -109,7 +113,9 @@ def sigma_of_scale(persons: int, known: bool) -> float:
     """Standard deviation of the scale, as a share, from the bones of `persons` people, of `known`
     stature or not.
     """
-    return float(np.hypot((_KNOWN_PERSON if known else _PERSON) / np.sqrt(max(persons, 1)), _COMMON))
+    return float(
+        np.hypot((_KNOWN_PERSON if known else _PERSON) / np.sqrt(max(persons, 1)), _COMMON)
+    )
 
 
 def levelled(rig: Rig, people: People, skeleton: Skeleton, sigma_scale: float) -> tuple[Rig, World]:
@@ -125,7 +131,11 @@ def levelled(rig: Rig, people: People, skeleton: Skeleton, sigma_scale: float) -
     floor: Floor | None = None
     for _ in range(2):
         height = ankles @ up
-        low = ankles[np.arange(len(ankles)), height.argmin(axis=1)] if height.size > 0 else np.zeros((0, 3))
+        low = (
+            ankles[np.arange(len(ankles)), height.argmin(axis=1)]
+            if height.size > 0
+            else np.zeros((0, 3))
+        )
         found = find_floor(low, np.arange(len(low)), up, _LEAN_RAD)
         floor = found if isinstance(found, Floor) else None
         up = floor.normal if floor is not None else up

@@ -33,7 +33,8 @@ class Scan:
     size: Array
     """(S,) size of each person of the other camera, rad."""
     first: Index
-    """(T + 1,) index of the first person of each of the other camera's frames, from frame `begin` on."""
+    """(T + 1,) index of the first person of each of the other camera's frames, from frame `begin`
+    on."""
     begin: int
     """First frame of the other camera."""
 
@@ -57,10 +58,26 @@ class Scan:
         """
         cost, count = np.zeros(len(lags)), np.zeros(len(lags))
         normal, rays = np.ascontiguousarray(self.normal), np.ascontiguousarray(self.rays)
-        _scan(normal, rays, self.frame, self.size, self.first, self.begin, lags, GATE, MIN_JOINTS, cost, count)
+        _scan(
+            normal,
+            rays,
+            self.frame,
+            self.size,
+            self.first,
+            self.begin,
+            lags,
+            GATE,
+            MIN_JOINTS,
+            cost,
+            count,
+        )
         last = self.begin + len(self.first) - 2
-        both = np.minimum(self.frame.max() + lags, last) - np.maximum(self.frame.min() + lags, self.begin)
-        enough = (both >= common) & (count >= 0.2 * len(self.frame) * np.minimum(common / np.ptp(self.frame), 1))
+        both = np.minimum(self.frame.max() + lags, last) - np.maximum(
+            self.frame.min() + lags, self.begin
+        )
+        enough = (both >= common) & (
+            count >= 0.2 * len(self.frame) * np.minimum(common / np.ptp(self.frame), 1)
+        )
         return np.where(enough & (count > 0), cost / np.maximum(count, 1), np.nan)
 
 
@@ -102,13 +119,17 @@ def _scan(
 
 
 def normals(rays: Array, views: Views, a: int, b: int) -> Array:
-    """(..., 3) unit normals of the planes through rays of camera `a` and the centre of camera `b`."""
+    """(..., 3) unit normals of the planes through rays of camera `a` and the centre of camera
+    `b`.
+    """
     centres = centres_of(views)
     normal = np.cross(centres[b] - centres[a], rays)
     return np.asarray(normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12))
 
 
-def chosen(curves: dict[tuple[int, int], Array], lags: Index, views: int, around: int) -> tuple[Array, Array]:
+def chosen(
+    curves: dict[tuple[int, int], Array], lags: Index, views: int, around: int
+) -> tuple[Array, Array]:
     """(V,) shifts relative to the first camera, and their prominence (V,).
 
     Cameras are added one by one in order of prominence, each at the offset that fits all those
@@ -134,7 +155,9 @@ def chosen(curves: dict[tuple[int, int], Array], lags: Index, views: int, around
     def best(view: int, placed: dict[int, int]) -> tuple[float, int]:
         low, high = min(placed.values()) - half, max(placed.values()) + half
         tried = np.arange(low, high + 1)
-        worth = np.sum([fit(one, view, tried - at) for one, at in placed.items()], axis=0) / np.sqrt(len(placed))
+        worth = np.sum(
+            [fit(one, view, tried - at) for one, at in placed.items()], axis=0
+        ) / np.sqrt(len(placed))
         top = int(np.argmax(worth))
         far = np.abs(tried - tried[top]) * step > around
         return float(worth[top] - worth[far].max(initial=0.0)), int(tried[top])
@@ -149,6 +172,8 @@ def chosen(curves: dict[tuple[int, int], Array], lags: Index, views: int, around
     for _ in range(2):
         for view in range(views):
             placed[view] = best(view, {one: at for one, at in placed.items() if one != view})[1]
-    sure = np.array([best(view, {o: at for o, at in placed.items() if o != view})[0] for view in range(views)])
+    sure = np.array(
+        [best(view, {o: at for o, at in placed.items() if o != view})[0] for view in range(views)]
+    )
     shift = np.array([placed[view] for view in range(views)]) * step
     return shift - shift[0], sure

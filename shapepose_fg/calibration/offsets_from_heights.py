@@ -34,8 +34,8 @@ _AROUND_S = 0.3
 _LEAST_ALIKE = 0.1
 """Minimum correlation that is used; that of different people is lower."""
 _PEAKS, _PAIRS = 8, 3
-"""Number of offsets per pair of cameras, or of groups of cameras, that are tested, and number of pairs that
-test them."""
+"""Number of offsets per pair of cameras, or of groups of cameras, that are tested, and number of
+pairs that test them."""
 _SURE = 2.0
 """Minimum of an offset's prominence times the score of the fitting pose (`Relative.score`): wrong
 ones are below 1.6, four in five correct ones above, on Shelf and in simulations."""
@@ -69,7 +69,9 @@ def offsets_without_poses(
         if (a, b, apart) not in fits:
             moved = replace(tracks[b], frame=tracks[b].frame - apart * step)
             found = relative(tracks[a], moved, fps)
-            fits[a, b, apart] = 0.0 if found is None else found.score * min(1.0, found.seconds / _FITS_S)
+            fits[a, b, apart] = (
+                0.0 if found is None else found.score * min(1.0, found.seconds / _FITS_S)
+            )
         return fits[a, b, apart]
 
     groups = [{view: 0} for view in range(len(tracks))]
@@ -77,11 +79,17 @@ def offsets_without_poses(
         offers = [
             (worth, one, other, apart)
             for one, other in combinations(range(len(groups)), 2)
-            for worth, apart in _peaks(groups[one], groups[other], curves, most, round(_AROUND_S * fps / step))
+            for worth, apart in _peaks(
+                groups[one], groups[other], curves, most, round(_AROUND_S * fps / step)
+            )
         ]
         best = (-1.0, 0, 1, 0)
         for worth, one, other, apart in sorted(offers, reverse=True):
-            pairs = [(a, b, apart + groups[other][b] - groups[one][a]) for a in groups[one] for b in groups[other]]
+            pairs = [
+                (a, b, apart + groups[other][b] - groups[one][a])
+                for a in groups[one]
+                for b in groups[other]
+            ]
             pairs.sort(key=lambda pair: -curves[pair[:2]][np.clip(pair[2] + most, 0, 2 * most)])
             merit = worth * float(np.mean([fit(*pair) for pair in pairs[:_PAIRS]]))
             best = max(best, (merit, one, other, apart))
@@ -96,7 +104,11 @@ def offsets_without_poses(
 
 
 def _peaks(
-    one: dict[int, int], other: dict[int, int], curves: dict[tuple[int, int], Array], most: int, around: int
+    one: dict[int, int],
+    other: dict[int, int],
+    curves: dict[tuple[int, int], Array],
+    most: int,
+    around: int,
 ) -> list[tuple[float, int]]:
     """Offsets between two groups of cameras with their prominence, the best first."""
     total = np.zeros(2 * most + 1)
@@ -128,7 +140,9 @@ def _rises(tracks: Tracks, step: int, fps: float) -> _Rises:
     """Vertical speeds of joints, one sample every `step` frames."""
     values = tracks.speed[:, :, 1] / tracks.size[:, None]
     known = np.abs(values) < _FASTEST / fps  # false for NaN
-    (values,) = fast_part((np.where(known, values, 0.0),), known, tracks.track, tracks.track, _BRISK_S * fps)
+    (values,) = fast_part(
+        (np.where(known, values, 0.0),), known, tracks.track, tracks.track, _BRISK_S * fps
+    )
     kept = np.flatnonzero(tracks.frame % step == 0)
     _, first = np.unique(tracks.track[kept], return_index=True)
     begins = (tracks.frame[kept] // step)[first]
@@ -146,10 +160,16 @@ def _add_likeness(worth: Array, a: _Rises, b: _Rises, least: int) -> None:
             apart = np.arange(1 - len(one), len(other))
             dots = fftconvolve(other, one[::-1], axes=0).sum(axis=1)
             start, stop = np.maximum(0, -apart), np.minimum(len(one), len(other) - apart)
-            power, power_other = (np.append(0.0, np.cumsum((each**2).sum(axis=1))) for each in (one, other))
-            energy = (power[stop] - power[start]) * (power_other[stop + apart] - power_other[start + apart])
+            power, power_other = (
+                np.append(0.0, np.cumsum((each**2).sum(axis=1))) for each in (one, other)
+            )
+            energy = (power[stop] - power[start]) * (
+                power_other[stop + apart] - power_other[start + apart]
+            )
             square = dots**2 / np.maximum(energy, 1e-12)
             place = begin_other - begin_one + apart + len(worth) // 2
             alike = (stop - start >= least) & (dots > 0) & (square > _LEAST_ALIKE**2)
             alike &= (place >= 0) & (place < len(worth))
-            worth[place[alike]] -= (stop - start)[alike] * np.log(np.maximum(1 - square[alike], 1e-6))
+            worth[place[alike]] -= (stop - start)[alike] * np.log(
+                np.maximum(1 - square[alike], 1e-6)
+            )

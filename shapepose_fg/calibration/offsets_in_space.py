@@ -55,8 +55,12 @@ class InSpace:
         """
         tracks, views, shift, fps = pairwise.tracks, pairwise.views, pairwise.shift, pairwise.fps
         step = max(1, round(fps / 15))
-        low = min(int((each.frame - at).min(initial=0)) for each, at in zip(tracks, shift, strict=True))
-        high = max(int((each.frame - at).max(initial=0)) for each, at in zip(tracks, shift, strict=True))
+        low = min(
+            int((each.frame - at).min(initial=0)) for each, at in zip(tracks, shift, strict=True)
+        )
+        high = max(
+            int((each.frame - at).max(initial=0)) for each, at in zip(tracks, shift, strict=True)
+        )
         every = np.arange(low, high + 1, step)
         busy = sum(len(each.frame) for each in tracks) / max(high - low, 1)
         count = min(len(every), int(_MOST_PLACED / max(busy, 1.0)))
@@ -74,7 +78,9 @@ class InSpace:
             track.append(which)
             xy.append(_pixels(each.at(which, times[row] + shift[v])[0], views, v))
         xy, whose = np.concatenate(xy), np.concatenate(track)
-        seen = Sightings(np.concatenate(time), np.concatenate(view), xy, np.isfinite(xy[..., 0]).astype(float))
+        seen = Sightings(
+            np.concatenate(time), np.concatenate(view), xy, np.isfinite(xy[..., 0]).astype(float)
+        )
         enough = np.isfinite(xy[..., 0]).sum(axis=1) >= MIN_JOINTS
         seen, whose = seen.rows(enough), whose[enough]
         groups = Pairs.of(seen, views).groups(len(seen), tuple(range(len(tracks))))
@@ -91,8 +97,8 @@ class InSpace:
         return cls(tracks, views, shift, times[groups.frame[many]], member[many], step, fps)
 
     def settled(self) -> tuple[Array, Array]:
-        """(V,) shifts in frames and their covariance (V, V) relative to the first camera; infinite where
-        unknown.
+        """(V,) shifts in frames and their covariance (V, V) relative to the first camera; infinite
+        where unknown.
         """
         V, shift = len(self.tracks), self.shift.copy()
         late, errors = self.all_late(shift)
@@ -100,7 +106,10 @@ class InSpace:
         late, errors = self.all_late(shift)
         # A clock offset also changes the triangulation, and joints with larger residuals have
         # smaller weights.
-        slope = np.stack([self.all_late(shift + _NUDGE * one)[0] - late for one in np.eye(V)], axis=1) / _NUDGE
+        slope = (
+            np.stack([self.all_late(shift + _NUDGE * one)[0] - late for one in np.eye(V)], axis=1)
+            / _NUDGE
+        )
         inverse = np.linalg.pinv((slope - slope[0])[1:, 1:], rcond=1e-3)
         for _ in range(2):
             shift[1:] -= np.clip(inverse @ (late - late[0])[1:], -1.0, 1.0)
@@ -118,15 +127,26 @@ class InSpace:
         return np.array([late for late, _ in each]), np.stack([error for _, error in each], axis=1)
 
     def seen(self, shift: Array) -> tuple[Array, Array, Array, Array]:
-        """Directions and their speeds (P, J, V, 3), pixels (P, J, V, 2), and sizes (P, V) in rad."""
+        """Directions and their speeds (P, J, V, 3), pixels (P, J, V, 2), and sizes (P, V) in
+        rad.
+        """
         parts = []
         for view, each in enumerate(self.tracks):
-            rays, speed, size = each.at(np.maximum(self.member[:, view], 0), self.time + shift[view])
+            rays, speed, size = each.at(
+                np.maximum(self.member[:, view], 0), self.time + shift[view]
+            )
             there = self.member[:, view] >= 0
             rays = np.where(there[:, None, None], rays, np.nan)
-            parts.append((rays, speed, _pixels(rays, self.views, view), np.where(there, size, np.nan)))
+            parts.append(
+                (rays, speed, _pixels(rays, self.views, view), np.where(there, size, np.nan))
+            )
         rays, speed, xy, size = zip(*parts, strict=True)
-        return np.stack(rays, axis=2), np.stack(speed, axis=2), np.stack(xy, axis=2), np.stack(size, axis=1)
+        return (
+            np.stack(rays, axis=2),
+            np.stack(speed, axis=2),
+            np.stack(xy, axis=2),
+            np.stack(size, axis=1),
+        )
 
     def _moving(self, points: Array, speed: Array) -> Array:
         """(P, J, 3) velocities of joints at `points`, metres per frame, from changes of directions
@@ -134,15 +154,21 @@ class InSpace:
         """
         away = points[:, :, None] - centres_of(self.views)
         far = np.linalg.norm(away, axis=-1)[..., None]
-        across = (np.eye(3) - (away / far)[..., :, None] * (away / far)[..., None, :]) / far[..., None] ** 2
+        across = (np.eye(3) - (away / far)[..., :, None] * (away / far)[..., None, :]) / far[
+            ..., None
+        ] ** 2
         known = np.isfinite(speed) & np.isfinite(far)
         A = np.where(known[..., :1, None], across, 0.0).sum(axis=2)
         b = np.where(known, speed / far, 0.0).sum(axis=2)
         enough = known[..., 0].sum(axis=2) >= 2
         A[~enough] = np.eye(3)
-        return np.where(enough[..., None], np.linalg.solve(A + 1e-6 * np.eye(3), b[..., None])[..., 0], np.nan)
+        return np.where(
+            enough[..., None], np.linalg.solve(A + 1e-6 * np.eye(3), b[..., None])[..., 0], np.nan
+        )
 
-    def late(self, view: int, rays: Array, speed: Array, xy: Array, size: Array) -> tuple[float, Array]:
+    def late(
+        self, view: int, rays: Array, speed: Array, xy: Array, size: Array
+    ) -> tuple[float, Array]:
         """Delay of one camera's clock relative to the others' triangulation, frames; and the
         contributions of B blocks (B,).
 
@@ -169,7 +195,10 @@ class InSpace:
             if len(rows) < 6:
                 continue
             grid = np.full((4, at[-1] + 1, *there.shape[1:]), np.nan)
-            grid[0, at], grid[1, at] = there[rows], rays[rows] / np.linalg.norm(rays[rows], axis=-1, keepdims=True)
+            grid[0, at], grid[1, at] = (
+                there[rows],
+                rays[rows] / np.linalg.norm(rays[rows], axis=-1, keepdims=True),
+            )
             grid[1] -= grid[0]
             grid[2, at], grid[3, at] = theirs[rows], speed[rows, :, view]
             whose = float(np.median(size[rows, view]))
@@ -178,15 +207,21 @@ class InSpace:
             fine = (length[1] < GATE / 2) & (length[2] < fastest) & (length[3] < fastest)
             grid[:, ~fine] = np.nan
             miss, calm, fast = (
-                without_means(each, np.isfinite(each[..., :1]), FAST_S * self.fps / self.step)[at] / whose
+                without_means(each, np.isfinite(each[..., :1]), FAST_S * self.fps / self.step)[at]
+                / whose
                 for each in grid[1:]
             )
             length = np.linalg.norm(miss, axis=-1)
             usual = np.array(
-                [np.median(each[np.isfinite(each)]) if np.isfinite(each).any() else 1.0 for each in length.T]
+                [
+                    np.median(each[np.isfinite(each)]) if np.isfinite(each).any() else 1.0
+                    for each in length.T
+                ]
             )
             width = 3.0 * np.maximum(usual, _LEAST_MISS)
-            weights.append(np.where(np.isfinite(length), 1 / (1 + (length / width) ** 2) ** 2 / width**2, 0.0))
+            weights.append(
+                np.where(np.isfinite(length), 1 / (1 + (length / width) ** 2) ** 2 / width**2, 0.0)
+            )
             off.append(np.nan_to_num(miss))
             change.append(np.nan_to_num(calm))
             own.append(np.nan_to_num(fast))
@@ -203,7 +238,9 @@ class InSpace:
             return 0.0, np.full(blocks, np.inf)
         score = (weight * (calm * miss).sum(axis=-1)).sum(axis=1)
         when = ((time - self.time.min()) // block).astype(np.intp)
-        (when, _), each = np.unique(np.stack([when, np.concatenate(whom)]), axis=1, return_inverse=True)
+        (when, _), each = np.unique(
+            np.stack([when, np.concatenate(whom)]), axis=1, return_inverse=True
+        )
         score, gains = np.bincount(each.reshape(-1), score), np.bincount(each.reshape(-1), gains)
         late, trust = score.sum() / gain, np.ones(len(score))
         for _ in range(_REWEIGHED):

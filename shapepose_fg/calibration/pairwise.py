@@ -15,7 +15,8 @@ from shapepose_fg.core.camera import Views
 from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS
 
 _GATE = 0.06
-"""Largest distance between the rays of two tracks of one person, as a share of the person's size."""
+"""Largest distance between the rays of two tracks of one person, as a share of the person's
+size."""
 _MOST_SAMPLES = 3000
 """Maximum number of frames of tracks that are compared for a pair of cameras."""
 
@@ -44,9 +45,13 @@ class Pairwise:
         row, track = np.nonzero((at[:, None] >= begins) & (at[:, None] <= lasts - 1))
         miss, _ = self.miss(a, b, rows[row], track, apart)
         seen = np.isfinite(miss)
-        mean = np.where(seen, np.minimum(np.abs(miss), GATE), 0).sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
+        mean = np.where(seen, np.minimum(np.abs(miss), GATE), 0).sum(axis=1) / np.maximum(
+            seen.sum(axis=1), 1
+        )
         mean[seen.sum(axis=1) < MIN_JOINTS] = GATE
-        for who, whom, each in zip(one.track[rows[row]].tolist(), track.tolist(), mean.tolist(), strict=True):
+        for who, whom, each in zip(
+            one.track[rows[row]].tolist(), track.tolist(), mean.tolist(), strict=True
+        ):
             found.setdefault((who, whom), []).append(each)
         error = {pair: float(np.mean(each)) for pair, each in found.items() if len(each) >= 3}
         kept = {pair for pair, each in error.items() if each < gate}
@@ -65,7 +70,9 @@ class Pairwise:
         return [pair for pair in sorted(kept) if not rival(pair, 0) and not rival(pair, 1)]
 
     def matched(self, a: int, b: int) -> tuple[Index, Index]:
-        """Rows of camera a's tracks (N,), and the tracks of camera b (N,) that are the same person."""
+        """Rows of camera a's tracks (N,), and the tracks of camera b (N,) that are the same
+        person.
+        """
         one, pairs = self.tracks[a], self.same(a, b)
         stop = np.append(one.first[1:], len(one.frame))
         rows = [np.arange(one.first[who], stop[who]) for who, _ in pairs]
@@ -99,7 +106,10 @@ class Pairwise:
                     continue
                 width = 3.8 * np.median(np.abs(miss[known]))
                 pace = max(float(np.median(np.diff(self.tracks[a].frame[rows]))), 1.0)
-                both = np.where(known, np.clip(miss, -width, width), 0.0), np.where(known, change, 0.0)
+                both = (
+                    np.where(known, np.clip(miss, -width, width), 0.0),
+                    np.where(known, change, 0.0),
+                )
                 smooth = FAST_S * self.fps / pace
                 miss, change = fast_part(both, known, self.tracks[a].track[rows], track, smooth)
                 width = 3.8 * np.median(np.abs(miss[known]))
@@ -126,7 +136,9 @@ class Pairwise:
         return shift, covariance
 
 
-def fast_part(values: tuple[Array, ...], known: Mask, one: Index, other: Index, width: float) -> tuple[Array, ...]:
+def fast_part(
+    values: tuple[Array, ...], known: Mask, one: Index, other: Index, width: float
+) -> tuple[Array, ...]:
     """Values (N, J) minus their local means over time, per track: this removes
     correlated errors.
     """

@@ -58,12 +58,16 @@ class Footage:
     """(J,) names of the joints."""
 
     @classmethod
-    def of(cls, detections: DetectionSequence | OneClock, rig: Rig, times: FrameTimes, frames: range) -> "Footage":
+    def of(
+        cls, detections: DetectionSequence | OneClock, rig: Rig, times: FrameTimes, frames: range
+    ) -> "Footage":
         """Sightings in frames spread over the recording, as many as add information."""
         taken = times.frame_s[frames.start : frames.stop]
         lasts = float(taken[-1] - taken[0])
         count = max(2, min(_MOST_FRAMES, len(taken), 1 + int(lasts / _LEAST_STEP_S)))
-        wanted = np.searchsorted(taken, taken[0] + np.linspace(0.0, lasts, count)).clip(0, len(taken) - 1)
+        wanted = np.searchsorted(taken, taken[0] + np.linspace(0.0, lasts, count)).clip(
+            0, len(taken) - 1
+        )
         chosen = frames.start + np.unique(wanted)
         sightings = seen_at(detections, chosen.tolist())
         thin = -(-len(sightings) // _MOST_SIGHTINGS)
@@ -73,7 +77,9 @@ class Footage:
             here = sightings.view == view
             xy[here] = camera.distort(xy[here].reshape(-1, 2)).reshape(xy[here].shape)
         skeleton = detections.skeleton
-        return cls(replace(sightings, xy=xy), tuple(skeleton.joints[joint] for joint in skeleton.core))
+        return cls(
+            replace(sightings, xy=xy), tuple(skeleton.joints[joint] for joint in skeleton.core)
+        )
 
     def at(self, frames: Index) -> "Footage":
         """The sightings in some of the frames."""
@@ -96,7 +102,9 @@ class Footage:
         near = (placed.depth > _MIN_DEPTH_M) & (placed.miss_px < GATE * size[:, None])
         weight = _NOISE.weight(confidence) / _NOISE.scatter(self.joints)[:, None] ** 2
         at = np.where(near, placed.depth, np.nan)
-        sigma = np.hypot(_NOISE.floor_rad * rig.focal_px, _NOISE.sigma_m * rig.focal_px / at) / np.sqrt(weight)
+        sigma = np.hypot(
+            _NOISE.floor_rad * rig.focal_px, _NOISE.sigma_m * rig.focal_px / at
+        ) / np.sqrt(weight)
         placeable = _well_placed(placed.points, sigma * at / rig.focal_px, rig)
         points = np.where(placeable[..., None], placed.points, np.nan)
         return People(groups.frame, xy, np.where(placeable[..., None], sigma, np.nan), points)
@@ -123,7 +131,9 @@ def missed_px(people: People, rig: Rig) -> Array:
     weight = np.where(np.isfinite(people.sigma_px), 1.0, 0.0)
     size = size_of(np.moveaxis(people.xy, 2, 1))
     if len(rig) == 2:
-        return np.where(weight > 0, triangulate(people.xy, weight, size, Views.of(rig)).miss_px, np.nan)
+        return np.where(
+            weight > 0, triangulate(people.xy, weight, size, Views.of(rig)).miss_px, np.nan
+        )
     for view, camera in enumerate(rig.cameras):
         others, xy = weight.copy(), people.xy.copy()
         others[:, :, view], xy[:, :, view] = 0.0, np.nan

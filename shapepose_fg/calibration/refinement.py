@@ -9,7 +9,17 @@ from typing import Any
 import numpy as np
 
 from shapepose_fg.body.model.rotation import exp_so3
-from shapepose_fg.calibration.adjustment import CENTRE, FOCAL, LENS, MOVE, TURN, Adjusted, Freedom, adjust, misfit
+from shapepose_fg.calibration.adjustment import (
+    CENTRE,
+    FOCAL,
+    LENS,
+    MOVE,
+    TURN,
+    Adjusted,
+    Freedom,
+    adjust,
+    misfit,
+)
 from shapepose_fg.calibration.levelling import scaled
 from shapepose_fg.calibration.people import LEAST_PEOPLE, Footage, missed_px
 from shapepose_fg.core.arrays import Array, Index
@@ -25,10 +35,11 @@ from shapepose_fg.setup_check.small_errors import Problem
 _ROUNDS = 4
 """Number of rounds, each with people associated by the cameras of the round before."""
 _SAME_PERSON = 2.5
-"""Number of joints of one person in one view whose correlated errors count as one independent error."""
+"""Number of joints of one person in one view whose correlated errors count as one independent
+error."""
 _ERRORS = ((0.45, 3.5), (0.25, 0.25), (0.30, 0.0))
-"""Shares of a detector's errors, and their time constants, s: measured on simulated recordings, whose detector
-has Shelf's statistics (0.8 after a frame, 0.35 after a second, 0.1 after four)."""
+"""Shares of a detector's errors, and their time constants, s: measured on simulated recordings,
+whose detector has Shelf's statistics (0.8 after a frame, 0.35 after a second, 0.1 after four)."""
 _UNKNOWN = 0.8
 """Ratio of posterior to prior standard deviation above which a parameter is undetermined."""
 
@@ -86,8 +97,8 @@ class Refinement:
         return scaled(self.rig, stature_m / self.stature_m, self.rig.centres.mean(axis=0))
 
     def change(self) -> dict[str, Array]:
-        """(V,) change of each camera: rotation in degrees, translation in mm, focal length in %, principal
-        point in pixels.
+        """(V,) change of each camera: rotation in degrees, translation in mm, focal length in %,
+        principal point in pixels.
         """
         turn, move, focal, centre = [], [], [], []
         for old, new in zip(self.given.cameras, self.adjusted.rig.cameras, strict=True):
@@ -96,7 +107,10 @@ class Refinement:
             move.append(1e3 * way)
             focal.append(100 * (new.K[0, 0] / old.K[0, 0] - 1))
             centre.append(np.hypot(*(new.K[:2, 2] - old.K[:2, 2])))
-        return {name: np.array(each) for name, each in zip(_UNITS, (turn, move, focal, centre), strict=True)}
+        return {
+            name: np.array(each)
+            for name, each in zip(_UNITS, (turn, move, focal, centre), strict=True)
+        }
 
     def sigma(self) -> dict[str, Array]:
         """(V,) standard deviations of what `change` gives, in the same units."""
@@ -142,7 +156,10 @@ def refine(
     """
     freedom = Freedom() if freedom is None else freedom
     given, right, findings = put_right(detections, rig, frames)
-    footage, start = Footage.of(detections, rig, times, frames), _found_again(findings, right.views, rig)
+    footage, start = (
+        Footage.of(detections, rig, times, frames),
+        _found_again(findings, right.views, rig),
+    )
     taken = np.unique(footage.sightings.frame)
     halves = np.array_split(taken, 2)
     spans = [(taken, taken), (halves[0], halves[1]), (halves[1], halves[0])]
@@ -163,8 +180,8 @@ def refine(
     missed = (np.concatenate(before), np.concatenate(after))
     if not np.isfinite(missed[0]).any():
         raise InputError(
-            "no joint is seen by three cameras in the frames for validation, so a refinement cannot be"
-            " validated; give more frames"
+            "no joint is seen by three cameras in the frames for validation, so a refinement "
+            "cannot be validated; give more frames"
         )
     was, now = (float(np.nanmedian(each)) for each in missed)
     counts = found[0].people.seen.any(axis=1).sum(axis=0)
@@ -187,7 +204,14 @@ def _found_again(findings: list[Finding], found: Views, rig: Rig) -> Rig:
         right, down = (found.K[view] - camera.K)[:2, 2] / camera.K[0, 0]  # similar to a rotation
         cTw = exp_so3(np.array([-down, right, 0.0])) @ found.cTw[view]
         if difference(cTw, camera.cTw)[0] > _BUMPED_DEG:
-            new = (camera.name, camera.K, cTw, camera.image_size, camera.distortion.tolist(), camera.lens)
+            new = (
+                camera.name,
+                camera.K,
+                cTw,
+                camera.image_size,
+                camera.distortion.tolist(),
+                camera.lens,
+            )
             wTc = Camera.from_camera_from_world(*new).wTc
             cameras[view] = replace(camera, wTc=wTc)
     return replace(rig, cameras=tuple(cameras))
@@ -207,8 +231,9 @@ def _fitted(
         people = footage.people(rig_now)
         if len(people) < LEAST_PEOPLE or not people.seen.any():
             raise InputError(
-                f"only {len(people)} people are seen by two cameras at once in the checked frames, but at least"
-                " 10 are needed; film people where views overlap, or run shapepose-fg check-calibration"
+                f"only {len(people)} people are seen by two cameras at once in the checked "
+                "frames, but at least 10 are needed; film people where views overlap, or run "
+                "shapepose-fg check-calibration"
             )
         spread = dilution(times.frame_s[np.unique(people.frame)])
         adjusted = adjust(rig, rig_now, people, freedom, spread, misfit(people, rig_now), reference)
@@ -223,13 +248,17 @@ def dilution(time_s: Array) -> float:
     frames at `time_s` (T,).
     """
     apart = np.abs(time_s[:, None] - time_s)
-    alike = sum(share * (np.exp(-apart / lasts) if lasts > 0 else apart == 0) for share, lasts in _ERRORS)
+    alike = sum(
+        share * (np.exp(-apart / lasts) if lasts > 0 else apart == 0) for share, lasts in _ERRORS
+    )
     return float(_SAME_PERSON * np.sum(alike) / len(time_s))
 
 
 def _undetermined(adjusted: Adjusted, freedom: Freedom, counts: Index) -> list[str]:
     """Parameters that the people do not determine, in words."""
-    prior = {name: float(np.sqrt((freedom.sigmas[part] ** 2).sum())) for name, part in PARTS.items()}
+    prior = {
+        name: float(np.sqrt((freedom.sigmas[part] ** 2).sum())) for name, part in PARTS.items()
+    }
     words = {
         "turn": "its rotation",
         "move": "its position",
@@ -244,9 +273,16 @@ def _undetermined(adjusted: Adjusted, freedom: Freedom, counts: Index) -> list[s
             notes.append(f"camera {camera.name}: {few}; it is not changed")
             continue
         sigmas = {name: adjusted.sigma(part)[view] for name, part in PARTS.items()}
-        unknown = [words[name] for name in PARTS if prior[name] > 0 and sigmas[name] > _UNKNOWN * prior[name]]
+        unknown = [
+            words[name]
+            for name in PARTS
+            if prior[name] > 0 and sigmas[name] > _UNKNOWN * prior[name]
+        ]
         if unknown:
-            what = f"the motion of the people determines {' or '.join(unknown)} no better than the prior"
+            what = (
+                f"the motion of the people determines {' or '.join(unknown)} no better than the "
+                "prior"
+            )
             cure = "film people who walk through the whole picture, near and far"
             notes.append(f"camera {camera.name}: {what}; {cure}")
     return notes

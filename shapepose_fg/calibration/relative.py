@@ -34,8 +34,8 @@ _GATE = 0.06
 _CLIP = 0.15
 """Limit of a joint's residual in the mean; larger ones are of other people."""
 _SAMPLES = 60
-"""Number of samples of five joints per pair of tracks; two thirds of a person's joints are inliers in simulated
-recordings."""
+"""Number of samples of five joints per pair of tracks; two thirds of a person's joints are inliers
+in simulated recordings."""
 _FINALISTS = 6
 """Number of hypotheses that are refined."""
 _STEPS = 8
@@ -53,12 +53,13 @@ class Relative:
     t: Array
     """(3,) direction of the translation, of length one."""
     score: float
-    """Share of the common sightings that are matched, weighted by their residuals. It is 1 if all match
-    with zero residual, and 0 if none match."""
+    """Share of the common sightings that are matched, weighted by their residuals. It is 1 if all
+    match with zero residual, and 0 if none match."""
     seconds: float
     """Person-seconds that are matched."""
     covariance: Array
-    """(6, 6) covariance of a small rotation w before R, rad, and of a change of t, which is 0 along t."""
+    """(6, 6) covariance of a small rotation w before R, rad, and of a change of t, which is 0 along
+    t."""
     points: Array
     """(N, J, 3) matched people in camera a's frame, in lengths of t; NaN unless seen by both."""
 
@@ -74,20 +75,26 @@ class _Together:
         self.tracks, self.pair = np.unique(np.stack([a, b], axis=1), axis=0, return_inverse=True)
         self.pair = self.pair.reshape(-1)
         self.count = np.bincount(self.pair, minlength=len(self.tracks))
-        self.possible = int(np.minimum((rows[0] >= 0).sum(axis=0), (rows[1] >= 0).sum(axis=0)).sum())
+        self.possible = int(
+            np.minimum((rows[0] >= 0).sum(axis=0), (rows[1] >= 0).sum(axis=0)).sum()
+        )
         self.rays = (np.ascontiguousarray(one.rays), np.ascontiguousarray(other.rays))
         self.size = (one.size, other.size)
         self.alike = _at_once(rows[0]), _at_once(rows[1])
 
     def misses(self, E: Array) -> Array:
-        """(H, K) residuals of pairs of tracks under essential matrices (H, 3, 3), as shares of people's size."""
+        """(H, K) residuals of pairs of tracks under essential matrices (H, 3, 3), as shares of
+        people's size.
+        """
         total, count = (np.zeros((len(E), len(self.tracks))) for _ in range(2))
         _misses(*self.rays, *self.size, self.rows, self.pair, np.ascontiguousarray(E), total, count)
         enough = count >= 0.5 * self.count
         return np.where(enough & (count > 0), total / np.maximum(count, 1), _CLIP)
 
     def chosen(self, miss: Array) -> tuple[Mask, float]:
-        """Which pairs of tracks (K,) are one person each, greedily by residual, and their total score."""
+        """Which pairs of tracks (K,) are one person each, greedily by residual, and their total
+        score.
+        """
         worth = np.maximum(1 - miss / _GATE, 0.0) * self.count
         order = np.argsort(-worth, kind="stable")
         kept, (a, b) = np.zeros(len(miss), dtype=bool), self.tracks.T
@@ -135,17 +142,31 @@ def _guesses(one: Tracks, other: Tracks, seen: _Together) -> Array:
         a, b = seen.tracks[pair].tolist()
         begin = max(one.frame[one.first[a]], other.frame[other.first[b]])
         end = min(one.lasts[a], other.lasts[b])
-        frames = np.unique(np.linspace(begin, end, _JOINTS_A_TRY // one.rays.shape[1]).astype(np.intp))
-        rows = [each.first[k] + frames - each.frame[each.first[k]] for each, k in ((one, a), (other, b))]
+        frames = np.unique(
+            np.linspace(begin, end, _JOINTS_A_TRY // one.rays.shape[1]).astype(np.intp)
+        )
+        rows = [
+            each.first[k] + frames - each.frame[each.first[k]] for each, k in ((one, a), (other, b))
+        ]
         x, y = one.rays[rows[0]], other.rays[rows[1]]
-        both = np.isfinite(x[..., 0]) & np.isfinite(y[..., 0]) & (x[..., 2] > 0.1) & (y[..., 2] > 0.1)
+        both = (
+            np.isfinite(x[..., 0]) & np.isfinite(y[..., 0]) & (x[..., 2] > 0.1) & (y[..., 2] > 0.1)
+        )
         if both.sum() < _LEAST_TRY:
             continue
         size = float(np.sqrt(np.median(one.size[rows[0]]) * np.median(other.size[rows[1]])))
-        flat_x, flat_y = (np.ascontiguousarray(each[both][:, :2] / each[both][:, 2:]) for each in (x, y))
+        flat_x, flat_y = (
+            np.ascontiguousarray(each[both][:, :2] / each[both][:, 2:]) for each in (x, y)
+        )
         agree = _RANSAC * size
         E, _ = cv2.findEssentialMat(
-            flat_x, flat_y, np.eye(3), method=cv2.RANSAC, prob=0.999, threshold=agree, maxIters=_SAMPLES
+            flat_x,
+            flat_y,
+            np.eye(3),
+            method=cv2.RANSAC,
+            prob=0.999,
+            threshold=agree,
+            maxIters=_SAMPLES,
         )
         if E is not None and E.shape[0] >= 3:
             found += [np.asarray(each, dtype=np.float64) for each in E.reshape(-1, 3, 3)]
@@ -167,7 +188,9 @@ def _settled(E: Array, seen: _Together, fps: float, looks: Index) -> Relative | 
         if best is not None and score <= best.score:
             return best
         points, ahead = _meeting(R, t, a, b)
-        share = float(ahead[np.isfinite(points[..., 0])].mean()) if np.isfinite(points).any() else 0.0
+        share = (
+            float(ahead[np.isfinite(points[..., 0])].mean()) if np.isfinite(points).any() else 0.0
+        )
         step = float(np.median(np.diff(looks))) / fps if len(looks) > 1 else _LOOK_S
         best = Relative(R, t, score * max(0.0, 2 * share - 1), len(a) * step, covariance, points)
         kept = new
@@ -175,7 +198,9 @@ def _settled(E: Array, seen: _Together, fps: float, looks: Index) -> Relative | 
 
 
 def _in_front(E: Array, a: Array, b: Array) -> tuple[Array, Array]:
-    """Choose the pose, of the four of an essential matrix, with most joints in front of both cameras."""
+    """Choose the pose, of the four of an essential matrix, with most joints in front of both
+    cameras.
+    """
     one, two, t = (np.asarray(each, dtype=np.float64) for each in cv2.decomposeEssentialMat(E))
     ways = [(R, sign * t[:, 0]) for R, sign in product((one, two), (1.0, -1.0))]
     return max(ways, key=lambda way: int(_meeting(*way, a, b)[1].sum()))
@@ -205,8 +230,12 @@ def refined_pose(R: Array, t: Array, a: Array, b: Array, size: Array) -> tuple[A
         # Sampson's distance, of an angle on both sides, as a part of people's size.
         scale = size * np.sqrt((Ea**2).sum(axis=1) + (Eb**2).sum(axis=1))
         r = (b * Ea).sum(axis=1) / scale
-        # b . [t] (w x R a) = (b x t) . (w x R a) = w . (R a x (b x t)); b . (dt x R a) = dt . (R a x b)
-        J = np.concatenate([_crossed(turned, b @ hat(t)), _crossed(turned, b)], axis=1) / scale[:, None]
+        # b . [t] (w x R a) = (b x t) . (w x R a) = w . (R a x (b x t)); b . (dt x R a) = dt . (R a
+        # x b)
+        J = (
+            np.concatenate([_crossed(turned, b @ hat(t)), _crossed(turned, b)], axis=1)
+            / scale[:, None]
+        )
         to = np.zeros((5, 6))
         to[:3, :3], to[3:, 3:] = np.eye(3), basis_across(t)
         J, usual = J @ to.T, max(_RANSAC / 2, float(np.median(np.abs(r))))
@@ -224,7 +253,9 @@ def refined_pose(R: Array, t: Array, a: Array, b: Array, size: Array) -> tuple[A
 
 def _crossed(a: Array, b: Array) -> Array:
     """(N, 3) cross products; ten times as fast as np.cross."""
-    return np.stack([a[:, i] * b[:, k] - a[:, k] * b[:, i] for i, k in ((1, 2), (2, 0), (0, 1))], axis=1)
+    return np.stack(
+        [a[:, i] * b[:, k] - a[:, k] * b[:, i] for i, k in ((1, 2), (2, 0), (0, 1))], axis=1
+    )
 
 
 def _rows(tracks: Tracks, looks: Index) -> Index:

@@ -45,7 +45,9 @@ maximum drift searched for there, s."""
 
 @dataclass(frozen=True)
 class Synchronised:
-    """Time offsets of cameras: frame f of camera v, at t = f / fps on its own clock, was exposed at `at(t)`."""
+    """Time offsets of cameras: frame f of camera v, at t = f / fps on its own clock, was exposed at
+    `at(t)`.
+    """
 
     offset_s: Array
     """(V,) offset at `middle_s`, seconds; 0 for the first camera."""
@@ -88,8 +90,8 @@ class Synchronised:
         """Cameras whose offset the people's motion does not determine, in words."""
         cure = "film people who walk about and wave, in view of all cameras"
         return [
-            f"camera {name}: the motion of the people does not determine its offset, because other offsets fit"
-            f" about as well; {cure}"
+            f"camera {name}: the motion of the people does not determine its offset, because "
+            f"other offsets fit about as well; {cure}"
             for name, sure, sigma in zip(rig.names, self.sure, self.sigma_s, strict=True)
             if sure < _SURE or not sigma < _WORST_S
         ]
@@ -139,7 +141,9 @@ def offsets(
     views = Views.of(rig)
     for view, name in enumerate(rig.names):
         if (sightings.view == view).sum() < _LEAST_SEEN:
-            raise InputError(f"camera {name}: too few people are seen to estimate the times of its frames")
+            raise InputError(
+                f"camera {name}: too few people are seen to estimate the times of its frames"
+            )
     start = -np.rint(around_s * fps).astype(np.intp)
     # Frames are counted on the clock of the first camera: with `shift` zero all clocks agree.
     sightings = replace(sightings, frame=sightings.frame - start[sightings.view])

@@ -53,7 +53,9 @@ class Tracks:
         return self.frame[np.append(self.first[1:], len(self.frame))[: len(self.first)] - 1]
 
     def at(self, track: Index, time: Array) -> tuple[Array, Array, Array]:
-        """Directions (N, J, 3), their speeds and sizes (N,) of tracks (N,) at `time` (N,), frames; NaN outside."""
+        """Directions (N, J, 3), their speeds and sizes (N,) of tracks (N,) at `time` (N,), frames;
+        NaN outside.
+        """
         stop = np.append(self.first[1:], len(self.frame))
         before = np.floor(time).astype(np.intp)
         row = self.first[track] + before - self.frame[self.first[track]]
@@ -72,10 +74,15 @@ class Tracks:
         rays, size = rays_of(seen, views), seen.size_px / views.focal_px[view]
         shortest = max(4, round(_SHORTEST_S * fps))
         parts = [rows for rows in _followed(seen) if len(rows) >= shortest]
-        frames = [np.arange(int(seen.frame[rows[0]]), int(seen.frame[rows[-1]]) + 1) for rows in parts]
+        frames = [
+            np.arange(int(seen.frame[rows[0]]), int(seen.frame[rows[-1]]) + 1) for rows in parts
+        ]
         joints = seen.xy.shape[1]
         every = [_smoothed(rays[rows], seen.frame[rows], _SMOOTH_S * fps) for rows in parts]
-        sizes = [np.interp(f, seen.frame[rows], size[rows]) for f, rows in zip(frames, parts, strict=True)]
+        sizes = [
+            np.interp(f, seen.frame[rows], size[rows])
+            for f, rows in zip(frames, parts, strict=True)
+        ]
         lengths = [len(each) for each in frames]
         none = np.zeros((0, joints, 3))
         return cls(
@@ -104,7 +111,9 @@ class OneClock:
         return self.sightings.rows(np.isin(self.sightings.frame, np.fromiter(frames, np.intp)))
 
 
-def on_one_clock(sightings: Sightings, following: Index, shift: Array, skeleton: Skeleton) -> OneClock:
+def on_one_clock(
+    sightings: Sightings, following: Index, shift: Array, skeleton: Skeleton
+) -> OneClock:
     """The sightings on the common clock: frame t of it is frame t + shift[v] of camera v,
     interpolated linearly.
 
@@ -121,7 +130,11 @@ def on_one_clock(sightings: Sightings, following: Index, shift: Array, skeleton:
     ends = [(int(frame[view == v].min()), int(frame[view == v].max())) for v in np.unique(view)]
     begin, end = sorted(first for first, _ in ends)[1:2], sorted(last for _, last in ends)[-2:-1]
     span = range(begin[0], end[0] + 1) if begin else range(0)
-    return OneClock(skeleton, Sightings(frame, view, xy, np.where(np.isfinite(xy[..., 0]), confidence, 0.0)), span)
+    return OneClock(
+        skeleton,
+        Sightings(frame, view, xy, np.where(np.isfinite(xy[..., 0]), confidence, 0.0)),
+        span,
+    )
 
 
 def next_of(sightings: Sightings) -> Index:
@@ -138,7 +151,11 @@ def next_of(sightings: Sightings) -> Index:
 
 def seen_at(detections: "DetectionSequence | OneClock", frames: Iterable[int]) -> Sightings:
     """The 2D people of some frames, on the common clock for `OneClock`."""
-    return detections.at(frames) if isinstance(detections, OneClock) else Sightings.of(detections, frames)
+    return (
+        detections.at(frames)
+        if isinstance(detections, OneClock)
+        else Sightings.of(detections, frames)
+    )
 
 
 def _followed(seen: Sightings) -> list[Index]:
@@ -152,7 +169,10 @@ def _followed(seen: Sightings) -> list[Index]:
         free = set(rows.tolist())
         if open_:
             last = np.array([each[-1] for each in open_])
-            away = np.linalg.norm(seen.xy[last][:, None] - seen.xy[rows], axis=-1) / seen.size_px[rows][:, None]
+            away = (
+                np.linalg.norm(seen.xy[last][:, None] - seen.xy[rows], axis=-1)
+                / seen.size_px[rows][:, None]
+            )
             cost = np.minimum(median_of(away, MIN_JOINTS), 1.0)
             for one, other in zip(*linear_sum_assignment(cost), strict=True):
                 if cost[one, other] < _SAME:
@@ -185,7 +205,13 @@ def lines(values: Array, width: float) -> tuple[Array, Array]:
         return np.asarray(correlate1d(each, near * apart**power, axis=0, mode="constant"))
 
     there, full = known.astype(np.float64), np.where(known, values, 0.0)
-    w0, w1, w2, y0, y1 = around(there, 0), around(there, 1), around(there, 2), around(full, 0), around(full, 1)
+    w0, w1, w2, y0, y1 = (
+        around(there, 0),
+        around(there, 1),
+        around(there, 2),
+        around(full, 0),
+        around(full, 1),
+    )
     spread = w0 * w2 - w1**2
     spread = np.where((w0 > _LEAST_AROUND) & (spread > _LEAST_SPREAD * width**2), spread, np.nan)
     return (w2 * y0 - w1 * y1) / spread, (w0 * y1 - w1 * y0) / spread

@@ -58,12 +58,17 @@ def calibrate_unsynchronised(
             progress(begin + round(100 * step / steps), total)
 
         try:
-            found, problems = calibrate(seen, rig, times, seen.frames, focal, measured, part, start), ()
+            found, problems = (
+                calibrate(seen, rig, times, seen.frames, focal, measured, part, start),
+                (),
+            )
         except Undetermined as refused:
             if refused.found is None:
                 raise
             found, problems = refused.found, refused.problems
-        offset, sigma, sure = offsets(sightings, found.rig, fps, frames, most_s, np.zeros(V), lambda *_: None)
+        offset, sigma, sure = offsets(
+            sightings, found.rig, fps, frames, most_s, np.zeros(V), lambda *_: None
+        )
         before, shift = shift, -offset * fps
         if np.abs(shift - before).max() < _STILL_S * fps:
             break

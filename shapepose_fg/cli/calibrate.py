@@ -33,7 +33,8 @@ if TYPE_CHECKING:
 
 _CAMERAS = "Prior knowledge"
 _FILE_OFF, _GUESS_OFF = 0.02, 0.2
-"""Relative prior standard deviations of focal lengths from a calibration, and from a field of view."""
+"""Relative prior standard deviations of focal lengths from a calibration, and from a field of
+view."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,13 +43,17 @@ class LensOptions:
 
     detections: Path = option(INPUT, "Folder with the 2D detections of all cameras.", REQUIRED)
     skeleton: str | None = option(
-        INPUT, "Keypoint layout of the detector: a name such as COCO_17, or a TOML file.", metavar="NAME"
+        INPUT,
+        "Keypoint layout of the detector: a name such as COCO_17, or a TOML file.",
+        metavar="NAME",
     )
-    calibration: Path | None = option(INPUT, "Calibration with the intrinsics; poses in it are ignored.")
+    calibration: Path | None = option(
+        INPUT, "Calibration with the intrinsics; poses in it are ignored."
+    )
     field_of_view: list[str] | None = option(
         INPUT,
-        "Instead of a calibration: horizontal field of view in degrees, or a photo with EXIF; of one camera:"
-        " CAMERA=...",
+        "Instead of a calibration: horizontal field of view in degrees, or a photo with EXIF; of "
+        "one camera: CAMERA=...",
         metavar="DEG",
     )
     image_size: str | None = option(INPUT, "Picture size, if no file contains it.", metavar="WxH")
@@ -62,7 +67,9 @@ class LensOptions:
         from shapepose_fg.io.lenses import lenses_of
 
         if (self.calibration is None) == (self.field_of_view is None):
-            raise InputError("--calibration, --field-of-view: the focal lengths are needed; give one of them")
+            raise InputError(
+                "--calibration, --field-of-view: the focal lengths are needed; give one of them"
+            )
         size = picture_size(self.image_size)
         if self.calibration is not None:
             rig = read_rig(self.calibration, up="z", unit="m", image_size=size)
@@ -81,15 +88,25 @@ def calibrate(
     seen: LensOptions,
     rate: RateOptions,
     focal: bool = option(
-        _CAMERAS, "Refine focal lengths; prior sigma 2 % from a calibration, 20 % from a field of view.", False
+        _CAMERAS,
+        "Refine focal lengths; prior sigma 2 % from a calibration, 20 % from a field of view.",
+        False,
     ),
-    stature: float | None = option(_CAMERAS, "Median stature of the people, metres; by default 1.70, of adults."),
+    stature: float | None = option(
+        _CAMERAS, "Median stature of the people, metres; by default 1.70, of adults."
+    ),
     distance: list[str] | None = option(
-        _CAMERAS, "Distance between two cameras in metres; it determines the scale.", metavar="CAM,CAM=M"
+        _CAMERAS,
+        "Distance between two cameras in metres; it determines the scale.",
+        metavar="CAM,CAM=M",
     ),
     output: Path = option(RESULT, "Rig file (JSON) for the cameras.", REQUIRED),
     times: Path | None = option(
-        TIME, "File for the times of all frames; estimate the start times of unsynchronised cameras, too."
+        TIME,
+        (
+            "File for the times of all frames; estimate the start times of unsynchronised cameras, "
+            "too."
+        ),
     ),
     most: float = option(TIME, "Largest offset between cameras for --times, seconds.", MOST_S),
     report: Path | None = report_option(),
@@ -113,12 +130,16 @@ def calibrate(
         raise InputError(f"--stature {stature:g}: must be 0.5 to 2.5 metres")
     check_most(most)
     if times is not None and rate.timestamps is not None:
-        raise InputError("--times and --timestamps: times are either estimated or given; give one of them")
+        raise InputError(
+            "--times and --timestamps: times are either estimated or given; give one of them"
+        )
     off = 0.0 if not focal else _FILE_OFF if seen.calibration is not None else _GUESS_OFF
     rig = seen.rig()
     measured = Measured(stature, _distances(distance or [], rig.names))
     with tempfile.TemporaryDirectory(prefix="shapepose-fg-") as folder:
-        part = rate.part(seen.detections, seen.skeleton, rig, Path(folder), own_frames=times is not None)
+        part = rate.part(
+            seen.detections, seen.skeleton, rig, Path(folder), own_frames=times is not None
+        )
         recording, known, span = part
         fps, clocks = rate_of(known.frame_s), None
         try:
@@ -126,7 +147,9 @@ def calibrate(
                 if times is None:
                     found = calibrate(recording, rig, known, span, off, measured, done)
                 else:
-                    found, clocks = calibrate_unsynchronised(recording, rig, fps, span, most, off, measured, done)
+                    found, clocks = calibrate_unsynchronised(
+                        recording, rig, fps, span, most, off, measured, done
+                    )
         except Undetermined as error:
             note(*error.problems)
             raise typer.Exit(1) from None
@@ -145,7 +168,9 @@ def calibrate(
             points=people.points,
             frame=people.frame,
             # Frame sets of an estimated clock start at time 0.
-            time_s=known.frame_s if clocks is None else np.arange(people.frame.max(initial=0) + 1) / fps,
+            time_s=known.frame_s
+            if clocks is None
+            else np.arange(people.frame.max(initial=0) + 1) / fps,
             skeleton=recording.skeleton,
             heads=heads,
             rows=rows,
@@ -156,7 +181,9 @@ def calibrate(
         page.write(report)
         note(f"{report}: cameras and people in 3D, to open in a browser")
     if as_json:
-        told = found.as_dict() | ({} if clocks is None else {"clocks": clocks.as_dict(rig)["cameras"]})
+        told = found.as_dict() | (
+            {} if clocks is None else {"clocks": clocks.as_dict(rig)["cameras"]}
+        )
         print(json.dumps(told, indent=2, allow_nan=False))
     else:
         show(table(("camera", *heads), [(name, *each) for name, each in rows], caption=_CAPTION))
@@ -167,23 +194,34 @@ def calibrate(
             print(f"{times}: times of {len(recording)} frames")
             given = {"--timestamps": times}
         print(f"{output}: rig file")
-        options = {"--calibration": output, "--detections": seen.detections, "--skeleton": seen.skeleton}
+        options = {
+            "--calibration": output,
+            "--detections": seen.detections,
+            "--skeleton": seen.skeleton,
+        }
         print(next_reconstruct(options | given | {"--output": "results"}))
 
 
 _CAPTION = (
-    "±: one sigma, relative to the rig; shared: share of its people seen by another camera, too; halves:"
-    " difference between its poses from the first and the second half of the recording"
+    "±: one sigma, relative to the rig; shared: share of its people seen by another camera, too; "
+    "halves: difference between its poses from the first and the second half of the recording"
 )
 
 
 def _figures(found: "Calibrated", focal: bool) -> tuple[list[str], list[tuple[str, list[str]]]]:
     """The cameras with standard deviations: headings, and the values of each camera."""
-    heads = ["people", "shared", "x y z, m", "rotation ± °", "position ± mm", "halves, °"] + ["focal, px"] * focal
+    heads = ["people", "shared", "x y z, m", "rotation ± °", "position ± mm", "halves, °"] + [
+        "focal, px"
+    ] * focal
     rows = []
     for each in found.as_dict()["cameras"]:
         place = " ".join(f"{value:.2f}" for value in each["centre_m"])
-        figures = [str(each["people"]), f"{each['shared']:.0%}", place, f"{each['sigma_turn_deg']:.2f}"]
+        figures = [
+            str(each["people"]),
+            f"{each['shared']:.0%}",
+            place,
+            f"{each['sigma_turn_deg']:.2f}",
+        ]
         figures += [f"{each['sigma_move_mm']:.0f}", f"{each['halves_turn_deg']:.2f}"]
         figures += [f"{each['focal_px']:.0f} ± {each['sigma_focal_percent']:.1f} %"] * focal
         rows.append((each["camera"], figures))
@@ -194,17 +232,30 @@ def _world(found: "Calibrated", stature: float | None, distances: list[str]) -> 
     """Scale, up axis and fit, one line each."""
     world = found.world
     if distances:
-        whose = f"{' '.join(distances)}; the median stature of the people is {world.stature_m:.2f} m"
+        whose = (
+            f"{' '.join(distances)}; the median stature of the people is {world.stature_m:.2f} m"
+        )
     else:
-        whose = f"median stature {stature:g} m" if stature is not None else "assumed median stature 1.70 m"
+        whose = (
+            f"median stature {stature:g} m"
+            if stature is not None
+            else "assumed median stature 1.70 m"
+        )
         whose += f", {world.persons} people at once"
     better = "" if distances else "; give --distance for a better one"
-    level = "from feet on the floor" if world.floor is not None else "from bodies, because no level floor was"
+    level = (
+        "from feet on the floor"
+        if world.floor is not None
+        else "from bodies, because no level floor was"
+    )
     " found"
     return [
         f"scale: {whose}: ± {100 * world.sigma_scale:.1f} %, one sigma{better}",
         f"up: z, {level}; the floor is at 0",
-        f"error of a joint against the other cameras, on frames that were not used: {found.held_out_px:.2f} px",
+        (
+            "error of a joint against the other cameras, on frames that were not used: "
+            f"{found.held_out_px:.2f} px"
+        ),
     ]
 
 
@@ -215,7 +266,10 @@ def _distances(given: list[str], names: Sequence[str]) -> tuple[tuple[int, int, 
         pair, _, number = text.rpartition("=")
         cameras = pair.split(",")
         if len(cameras) != 2 or cameras[0] == cameras[1] or not set(cameras) <= set(names):
-            raise InputError(f"--distance {text}: give two cameras and metres, such as {names[0]},{names[1]}=3.42")
+            raise InputError(
+                f"--distance {text}: give two cameras and metres, such as "
+                f"{names[0]},{names[1]}=3.42"
+            )
         try:
             metres = float(number)
         except ValueError:

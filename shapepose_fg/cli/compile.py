@@ -20,7 +20,9 @@ def compile_kernels() -> None:
 
     package = Path(__file__).parents[1]
     if kept_folder() != wanted_folder():
-        raise InputError(f"{wanted_folder()}: cannot be written; set NUMBA_CACHE_DIR to a writable folder")
+        raise InputError(
+            f"{wanted_folder()}: cannot be written; set NUMBA_CACHE_DIR to a writable folder"
+        )
     for path in sorted(package.rglob("*.py")):
         if "\nfrom shapepose_fg.core.compiled import" in path.read_text(encoding="utf-8"):
             import_module(".".join(path.relative_to(package.parent).with_suffix("").parts))
@@ -31,7 +33,13 @@ def compile_kernels() -> None:
             each.load()
     if lost := sum(not each.is_kept for each in KERNELS.values()):
         raise InputError(
-            f"{wanted_folder()}: {lost} compiled functions could not be stored; check the free disk space"
+            f"{wanted_folder()}: {lost} compiled functions could not be stored; check the free "
+            "disk space"
         )
-    took = f"compiled in {time.perf_counter() - start:.0f} s" if missing else "were already compiled"
-    show(f"{len(missing or KERNELS)} functions {took}; {len(KERNELS)} are stored in {wanted_folder()}")
+    took = (
+        f"compiled in {time.perf_counter() - start:.0f} s" if missing else "were already compiled"
+    )
+    show(
+        f"{len(missing or KERNELS)} functions {took}; {len(KERNELS)} are stored in "
+        f"{wanted_folder()}"
+    )

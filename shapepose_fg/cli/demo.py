@@ -11,7 +11,12 @@ from rich.table import Table
 
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.reconstruction import Reconstruction
-from shapepose_fg.evaluation.metrics import CORRECT_M, covariance_calibration, joint_metrics, match_people
+from shapepose_fg.evaluation.metrics import (
+    CORRECT_M,
+    covariance_calibration,
+    joint_metrics,
+    match_people,
+)
 from shapepose_fg.io.solved_setup import CAMERAS
 from shapepose_fg.pipeline.execution import Execution
 from shapepose_fg.pipeline.pipeline import reconstruct
@@ -31,18 +36,33 @@ class Demo:
     def tables(self) -> RenderableType:
         """The comparison with the truth, as tables for a terminal."""
         people, truth = self.people, self.scene.keypoints
-        metrics, matches = joint_metrics(people, truth), match_people(people.frame, people.joints, truth)
+        metrics, matches = (
+            joint_metrics(people, truth),
+            match_people(people.frame, people.joints, truth),
+        )
         error_m = people.joints[matches.row] - truth[matches.frame, matches.person]
         distance_mm = 1e3 * np.linalg.norm(error_m, axis=-1)
         median_mm = float(np.nanmedian(distance_mm)) if distance_mm.size else float("nan")
         accuracy = {
-            "people found": (f"{metrics.people_found} of {metrics.people_true}", "in all frames together"),
+            "people found": (
+                f"{metrics.people_found} of {metrics.people_true}",
+                "in all frames together",
+            ),
             "duplicates": (str(metrics.people_duplicated), ""),
             "false positives": (str(metrics.people_invented), ""),
-            "precision": (_percent(metrics.precision), f"estimated joints within {CORRECT_M} m of the truth"),
-            "recall": (_percent(metrics.recall), f"true joints with an estimate within {CORRECT_M} m"),
+            "precision": (
+                _percent(metrics.precision),
+                f"estimated joints within {CORRECT_M} m of the truth",
+            ),
+            "recall": (
+                _percent(metrics.recall),
+                f"true joints with an estimate within {CORRECT_M} m",
+            ),
             "F1": (_percent(metrics.f1), ""),
-            "MPJPE": (f"{metrics.mpjpe_mm:.1f} mm", "mean distance between estimated and true joints"),
+            "MPJPE": (
+                f"{metrics.mpjpe_mm:.1f} mm",
+                "mean distance between estimated and true joints",
+            ),
             "median": (f"{median_mm:.1f} mm", "median of the same distance"),
         }
         calibration = covariance_calibration(error_m, people.covariance[matches.row])
@@ -60,13 +80,18 @@ class Demo:
         frames = max(len(self.scene), 1)
         spent = {stage: s for stage, s in people.run["seconds"].items() if stage != "load"}
         time = {stage: (f"{1e3 * each / frames:.1f}", "") for stage, each in spent.items()}
-        time["all"] = (f"{1e3 * sum(spent.values()) / frames:.1f}", "bodies are cheaper in longer recordings")
+        time["all"] = (
+            f"{1e3 * sum(spent.values()) / frames:.1f}",
+            "bodies are cheaper in longer recordings",
+        )
         tables = {
             "Comparison with the truth": accuracy,
             "Calibration of the covariances": covariances,
             "Time per frame, ms": time,
         }
-        return Group(*(Padding(_table(title, rows), (1, 0, 0, 2)) for title, rows in tables.items()))
+        return Group(
+            *(Padding(_table(title, rows), (1, 0, 0, 2)) for title, rows in tables.items())
+        )
 
     def save(self, folder: Path, *, report: bool = True) -> list[str]:
         """Write all files of the result, and the report; returns notes for the user."""
@@ -78,7 +103,9 @@ class Demo:
             f"{folder / CAMERAS}  the cameras",
         ]
         if report:
-            told.append(f"{write_report(folder, self.people, self.scene.rig)}  open it in a browser")
+            told.append(
+                f"{write_report(folder, self.people, self.scene.rig)}  open it in a browser"
+            )
         else:
             (folder / REPORT).unlink(missing_ok=True)
         return told
@@ -95,7 +122,9 @@ def run_demo(progress: Callable[[int, int], None] | None = None) -> Demo:
 
 def _table(title: str, rows: dict[str, tuple[str, str]]) -> Table:
     """A table of names, values, and their meanings."""
-    table = Table(title=title, title_justify="left", title_style="bold", box=None, padding=(0, 2, 0, 0))
+    table = Table(
+        title=title, title_justify="left", title_style="bold", box=None, padding=(0, 2, 0, 0)
+    )
     table.show_header = False
     table.add_column()
     table.add_column(justify="right")

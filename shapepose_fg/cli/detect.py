@@ -40,22 +40,32 @@ class NetworkOptions:
     """Options: the detection network, and how it is executed."""
 
     network: str | None = option(
-        _NETWORK, "ONNX file, TOML file of a network, or name of a downloaded network.", metavar="FILE|NAME"
+        _NETWORK,
+        "ONNX file, TOML file of a network, or name of a downloaded network.",
+        metavar="FILE|NAME",
     )
     download: str | None = option(
-        _NETWORK, "Download a network by name, once: rtmpose-s, rtmpose-m or rtmpose-x.", metavar="NAME"
+        _NETWORK,
+        "Download a network by name, once: rtmpose-s, rtmpose-m or rtmpose-x.",
+        metavar="NAME",
     )
-    boxes: str | None = option(_NETWORK, "Person detector for RTMPose: a YOLOX network.", metavar="FILE|NAME")
+    boxes: str | None = option(
+        _NETWORK, "Person detector for RTMPose: a YOLOX network.", metavar="FILE|NAME"
+    )
     layout: str | None = option(
         _NETWORK,
         "Keypoint layout of an OpenPose network: tf-pose, openpose-coco, openpose-body25.",
         metavar="NAME",
     )
-    long_side: int | None = option(_NETWORK, "Longer side of the input of an OpenPose network, pixels (656).")
+    long_side: int | None = option(
+        _NETWORK, "Longer side of the input of an OpenPose network, pixels (656)."
+    )
     backend: str | None = option(
         RUN, "Backend of an OpenPose network: opencv (default) or onnxruntime.", metavar="NAME"
     )
-    device: str = option(RUN, "Device of onnxruntime: cpu, cuda, cuda:1, rocm, coreml.", "cpu", metavar="NAME")
+    device: str = option(
+        RUN, "Device of onnxruntime: cpu, cuda, cuda:1, rocm, coreml.", "cpu", metavar="NAME"
+    )
 
     def load(self) -> "Network":
         """The network, downloaded if requested; InputError if options contradict each other."""
@@ -64,16 +74,20 @@ class NetworkOptions:
 
         if self.network is None and self.download is None:
             raise InputError(
-                "--network, --download: missing; give --download rtmpose-m the first time, or --network FILE"
+                "--network, --download: missing; give --download rtmpose-m the first time, or "
+                "--network FILE"
             )
         if self.network is not None and self.download not in (None, self.network, self.boxes):
             raise InputError(
-                f"--download {self.download}: this is neither the name of --network nor of --boxes; leave it out"
+                f"--download {self.download}: this is neither the name of --network nor of "
+                "--boxes; leave it out"
             )
         if self.backend not in (None, "opencv", "onnxruntime"):
             raise InputError(f"--backend {self.backend}: must be opencv or onnxruntime")
         if self.backend == "opencv" and self.device != "cpu":
-            raise InputError(f"--device {self.device}: opencv runs on the CPU only; leave out --backend")
+            raise InputError(
+                f"--device {self.device}: opencv runs on the CPU only; leave out --backend"
+            )
         if self.long_side is not None and not 128 <= self.long_side <= 4096:
             raise InputError(f"--long-side {self.long_side}: must be 128 to 4096 pixels")
         openpose = {"layout": self.layout, "long_side": self.long_side, "backend": self.backend}
@@ -90,7 +104,9 @@ class ClockOptions:
     fps: list[str] | None = option(
         TIME, "Frame rate, Hz, if the files do not contain it.", metavar="RATE|CAMERA=RATE"
     )
-    start: list[str] | None = option(TIME, "Time of a camera's first frame: 0.2s, or 12f.", metavar="CAMERA=TIME")
+    start: list[str] | None = option(
+        TIME, "Time of a camera's first frame: 0.2s, or 12f.", metavar="CAMERA=TIME"
+    )
     frames: str | None = frames_option()
 
 
@@ -105,7 +121,8 @@ def detect(
     ),
     output: Path | None = option(RESULT, "Folder for the detections; created if missing."),
 ) -> None:
-    """Detect people's joints in videos or pictures, for `reconstruct`: by RTMPose, or another network in ONNX.
+    """Detect people's joints in videos or pictures, for `reconstruct`: by RTMPose, or another
+    network in ONNX.
 
     With a calibration, pictures of rolled cameras are rotated upright first. Without one, cameras
     are named after their videos, for `calibrate`. An interrupted run continues when the same
@@ -116,10 +133,15 @@ def detect(
 
         calibration, videos, pose = footage_of(project)
         cameras = replace(cameras, calibration=cameras.calibration or calibration)
-        pictures, output = replace(pictures, videos=pictures.videos or [str(videos)]), output or pose
+        pictures, output = (
+            replace(pictures, videos=pictures.videos or [str(videos)]),
+            output or pose,
+        )
     if pictures.videos is None or output is None:
         missing = "--videos" if pictures.videos is None else "--output"
-        raise InputError(f"{missing}: missing; give it, or --project with the folder of a Pose2Sim project")
+        raise InputError(
+            f"{missing}: missing; give it, or --project with the folder of a Pose2Sim project"
+        )
     from shapepose_fg.core.frame_sets import align, own_frames
     from shapepose_fg.detection2d.recording import CameraDetector, DetectionRun, run_detection
     from shapepose_fg.io.footage.clocks import clocks_of
@@ -155,18 +177,25 @@ def detect(
             raise Stopped(stop.number, "run the same command again to continue") from None
     for name, failed in zip(rig.names, unreadable, strict=True):
         if failed > 0:
-            note(f"camera {name}: {failed} of {len(moments)} pictures cannot be read; they have no detections")
+            note(
+                f"camera {name}: {failed} of {len(moments)} pictures cannot be read; they have "
+                "no detections"
+            )
     show(_summary(run, joints, unreadable, time.perf_counter() - begin))
     print(_next_command(run, cameras, project, loaded))
 
 
-def _summary(run: "DetectionRun", joints: list[int], unreadable: list[int], seconds: float) -> "RenderableType":
+def _summary(
+    run: "DetectionRun", joints: list[int], unreadable: list[int], seconds: float
+) -> "RenderableType":
     """Number of detections in each camera's pictures, and the time taken."""
     rows = []
     for view, each in enumerate(run.cameras):
         pictures = int((run.moments.picture[:, view] >= 0).sum()) - unreadable[view]
         turned = f"{each.view.turn_deg:.0f}°" if abs(each.view.turn_deg) > 0.5 else "-"
-        size, shown = (f"{width} x {height}" for width, height in (each.footage.size, each.view.size))
+        size, shown = (
+            f"{width} x {height}" for width, height in (each.footage.size, each.view.size)
+        )
         found = f"{joints[view] / max(pictures, 1):.1f}"
         rows.append((each.camera.name, str(pictures), size, turned, shown, found))
     frames, views = run.moments.picture.shape
@@ -175,17 +204,31 @@ def _summary(run: "DetectionRun", joints: list[int], unreadable: list[int], seco
     return table("camera pictures size rotated input joints".split(), rows, caption=caption)
 
 
-def _next_command(run: "DetectionRun", cameras: CameraOptions, project: Path | None, network: "Network") -> str:
+def _next_command(
+    run: "DetectionRun", cameras: CameraOptions, project: Path | None, network: "Network"
+) -> str:
     """The next command, as a line that can be copied into any shell."""
     output = run.output
     if cameras.calibration is None:
-        folder, sizes = output.resolve(), {each.camera.name: each.footage.size for each in run.cameras}
+        folder, sizes = (
+            output.resolve(),
+            {each.camera.name: each.footage.size for each in run.cameras},
+        )
         # A phone has a field of view of 65 degrees along the longer side of a video.
         wide = {name: "65" if width >= height else "40" for name, (width, height) in sizes.items()}
-        fields = list(wide.values())[:1] if len(set(wide.values())) == 1 else [f"{n}={d}" for n, d in wide.items()]
+        fields = (
+            list(wide.values())[:1]
+            if len(set(wide.values())) == 1
+            else [f"{n}={d}" for n, d in wide.items()]
+        )
         words = ["shapepose-fg", "calibrate", "--detections", folder, "--focal"]
         words += [word for field in fields for word in ("--field-of-view", field)]
-        words += ["--times", folder.parent / "times.csv", "--output", folder.parent / "calibration.json"]
+        words += [
+            "--times",
+            folder.parent / "times.csv",
+            "--output",
+            folder.parent / "calibration.json",
+        ]
         return f"next: {shlex.join(map(str, words))}"
     results = output.resolve().parent / "results"
     files = {"--calibration": cameras.calibration, "--detections": output, "--output": results}

@@ -17,7 +17,9 @@ if TYPE_CHECKING:
 @grouped
 def explain(
     results: Path = argument("RESULTS", "Folder of a reconstruction."),
-    person: int = argument("PERSON", "Number of the person: `shapepose-fg tracks RESULTS` lists them."),
+    person: int = argument(
+        "PERSON", "Number of the person: `shapepose-fg tracks RESULTS` lists them."
+    ),
     joint: str = argument("JOINT", "Name of the joint, such as RWrist."),
     frame: int | None = option(TIME, "Frame number."),
     time: float | None = option(TIME, "Time, seconds; the nearest frame of the person is used."),
@@ -25,7 +27,9 @@ def explain(
         INPUT, "Folder of detections that was reconstructed: lists rejected detections, too."
     ),
     skeleton: str | None = option(
-        INPUT, "Keypoint layout of the detector, as in the reconstruction: a name or a TOML file.", metavar="NAME"
+        INPUT,
+        "Keypoint layout of the detector, as in the reconstruction: a name or a TOML file.",
+        metavar="NAME",
     ),
     as_json: bool = json_option(),
 ) -> None:
@@ -43,7 +47,9 @@ def explain(
     folder = results_folder(results)
     rig, people = cameras_of(folder), Reconstruction.load(folder)
     seen = None if detections is None else read_detections(detections, rig, skeleton)
-    found = explain(people, rig, person=person, joint=joint, frame=frame, time_s=time, detections=seen)
+    found = explain(
+        people, rig, person=person, joint=joint, frame=frame, time_s=time, detections=seen
+    )
     if as_json:
         print(json.dumps(found.as_dict(), indent=2, allow_nan=False))
     else:
@@ -59,8 +65,14 @@ def _screen(found: "Explanation") -> "RenderableType":
     rows = [
         (
             view.camera,
-            "-" if view.detection_px is None else f"{view.detection_px[0]:.0f} {view.detection_px[1]:.0f}",
-            *(("-", "-") if view.detection_px is None else (f"{view.score:.2f}", f"{view.probability:.2f}")),
+            "-"
+            if view.detection_px is None
+            else f"{view.detection_px[0]:.0f} {view.detection_px[1]:.0f}",
+            *(
+                ("-", "-")
+                if view.detection_px is None
+                else (f"{view.score:.2f}", f"{view.probability:.2f}")
+            ),
             "-" if view.off_px is None else f"{view.off_px:.0f} px",
             "-" if view.off_sigma is None else f"{view.off_sigma:.1f}",
             f"{view.share:.0%}",
@@ -69,7 +81,7 @@ def _screen(found: "Explanation") -> "RenderableType":
         for view in found.views
     ]
     caption = (
-        "probability: of belonging to this person; off: distance from where all other measurements place the"
-        " joint; weight: share of the joint's information"
+        "probability: of belonging to this person; off: distance from where all other "
+        "measurements place the joint; weight: share of the joint's information"
     )
     return Group(*map(Text, found.words), Text(), table(heads, rows, caption=caption))

@@ -12,7 +12,9 @@ from shapepose_fg.core.storage.files import inside
 @grouped
 def export(
     take: TakeOptions,
-    formats: list[str] = argument("FORMAT...", "Formats: amass trc c3d bvh glb csv parquet mcap rrd, or all."),
+    formats: list[str] = argument(
+        "FORMAT...", "Formats: amass trc c3d bvh glb csv parquet mcap rrd, or all."
+    ),
     output: Path | None = option(RESULT, "Folder for the files; by default RESULTS/export."),
     markers: str = option(
         RESULT,

@@ -45,13 +45,17 @@ def found_clocks(
     from shapepose_fg.io.recording import own_times, read_recording
 
     with tempfile.TemporaryDirectory(prefix="shapepose-fg-") as folder:
-        recording, times = read_recording(detections, rig, skeleton, Path(folder), fps, own_frames=True)
+        recording, times = read_recording(
+            detections, rig, skeleton, Path(folder), fps, own_frames=True
+        )
         note(*recording.notes)
         if times is None or len(times) < 2:
             raise InputError("--fps: missing; give the frame rate of the cameras")
         span = frame_range(frames, len(recording), recording.first)
         with progress("comparing", "pairs") as done:
-            found = synchronise(recording, rig, fps or rate_of(times.frame_s), span, most, progress=done)
+            found = synchronise(
+                recording, rig, fps or rate_of(times.frame_s), span, most, progress=done
+            )
         return found, found.of_views(own_times(recording, times, len(rig)))
 
 
@@ -64,9 +68,14 @@ def check_most(most: float) -> None:
 def show_clocks(found: "Synchronised", rig: "Rig") -> None:
     """Print the offsets."""
     rows = []
-    for name, offset, sigma, sure in zip(rig.names, found.offset_s, found.sigma_s, found.sure, strict=True):
+    for name, offset, sigma, sure in zip(
+        rig.names, found.offset_s, found.sigma_s, found.sure, strict=True
+    ):
         known = "-" if sigma == 0 else f"{1e3 * sigma:.1f}" if math.isfinite(sigma) else "unknown"
         rows.append((name, f"{offset:+.4f}", known, f"{sure:.1f}"))
-    caption = "start: time of the camera's frame 0 on the first camera's clock; distinct: how clearly the best"
+    caption = (
+        "start: time of the camera's frame 0 on the first camera's clock; distinct: how clearly "
+        "the best"
+    )
     " offset differs from all others"
     show(table(("camera", "start, s", "± ms", "distinct"), rows, caption=caption))

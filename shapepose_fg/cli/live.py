@@ -3,7 +3,16 @@
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from shapepose_fg.cli.options import INPUT, RESULT, RUN, TIME, CameraOptions, check_workers, grouped, option
+from shapepose_fg.cli.options import (
+    INPUT,
+    RESULT,
+    RUN,
+    TIME,
+    CameraOptions,
+    check_workers,
+    grouped,
+    option,
+)
 from shapepose_fg.cli.terminal import note
 from shapepose_fg.core.errors import InputError, naming
 
@@ -18,7 +27,9 @@ def live(
         INPUT, "File or pipe of JSON lines, tcp://:PORT, or .mcap; by default standard input."
     ),
     skeleton: str | None = option(
-        INPUT, "Keypoint layout of the detector: a name such as COCO_17, or a TOML file.", metavar="NAME"
+        INPUT,
+        "Keypoint layout of the detector: a name such as COCO_17, or a TOML file.",
+        metavar="NAME",
     ),
     lag: float = option(TIME, "Delay of the refined people, seconds.", 0.3),
     output: list[str] | None = option(
@@ -28,7 +39,8 @@ def live(
     ),
     workers: int = option(RUN, "Number of processes, with this one.", 2),
 ) -> None:
-    """Reconstruct people while a detector runs: reads a line per camera and picture, writes lines of people.
+    """Reconstruct people while a detector runs: reads a line per camera and picture, writes lines
+    of people.
 
     Input: OpenPose's JSON of a frame in one line, with "camera" and "time_s" beside "people".
     Output: "now" after each frame, and "settled" when its people have been refined. The command
@@ -79,7 +91,9 @@ def live(
     note(f"{report.frames} frames, {report.late} of them late; {out}")
 
 
-def _say(people: "OnlineReconstructor", last: "Said | None", note: Callable[[str], None]) -> "Said | None":
+def _say(
+    people: "OnlineReconstructor", last: "Said | None", note: Callable[[str], None]
+) -> "Said | None":
     """Print changes of the cameras' statuses since `last`, the last printed ones; returns the
     current ones.
     """
@@ -88,5 +102,7 @@ def _say(people: "OnlineReconstructor", last: "Said | None", note: Callable[[str
         return last
     new = next((n for n, each in enumerate(reversed(events)) if each is last), len(events))
     for each in events[len(events) - new :]:
-        note(f"{each.time_s:.2f} s: camera {each.camera} {each.state.name.lower().replace('_', ' ')}")
+        note(
+            f"{each.time_s:.2f} s: camera {each.camera} {each.state.name.lower().replace('_', ' ')}"
+        )
     return events[-1]

@@ -55,7 +55,16 @@ app = typer.Typer(
 evaluate = typer.Typer(help="Score a reconstruction against an annotation.")
 _RECORDING, _RESULT, _TRY = "Reconstruct a recording", "Use a result", "Try and evaluate"
 for _panel, _commands in {
-    _RECORDING: (detect, calibrate, check_calibration, refine_calibration, synchronise, reconstruct, live, batch),
+    _RECORDING: (
+        detect,
+        calibrate,
+        check_calibration,
+        refine_calibration,
+        synchronise,
+        reconstruct,
+        live,
+        batch,
+    ),
     _RESULT: (report, overlay, view, explain, export),
     _TRY: (train_fitter,),
 }.items():
@@ -65,7 +74,9 @@ app.command("compile", rich_help_panel=_TRY)(compile_kernels)
 app.add_typer(tracks, name="tracks", rich_help_panel=_RESULT)
 app.add_typer(evaluate, name="evaluate", rich_help_panel=_TRY)
 
-_MOVED = {"--people": "give the result first: shapepose-fg evaluate shelf RESULTS --ground-truth FILE"}
+_MOVED = {
+    "--people": "give the result first: shapepose-fg evaluate shelf RESULTS --ground-truth FILE"
+}
 """Removed options, and their replacements."""
 _UsageProblem = cast("type[Exception]", typer.BadParameter.__mro__[2])
 """typer's exception for an invalid command line; its place differs between versions."""
@@ -94,7 +105,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             raise
         is_file = isinstance(error, OSError)
         code = _fail(
-            f"{what}; {'check the path, permissions and free disk space' if is_file else 'start it again'}"
+            f"{what}; "
+            f"{'check the path, permissions and free disk space' if is_file else 'start it again'}"
         )
     except Stopped as stop:
         say("stopped", stop.message or "no incomplete files are left", "bold yellow")
@@ -133,7 +145,9 @@ it saw the people are reconstructed, over time."""
 @grouped
 def demo(
     output: Path = option(RESULT, "Folder for the result.", Path("demo")),
-    report: bool = option(RESULT, "Write report.html, a page for the browser.", True, "--report/--no-report"),
+    report: bool = option(
+        RESULT, "Write report.html, a page for the browser.", True, "--report/--no-report"
+    ),
 ) -> None:
     """Reconstruct a built-in scene of four people and compare it with the truth."""
     prepare_output(output)

@@ -67,13 +67,18 @@ def preset_option(default: Preset | None) -> Any:
     """The option `--preset`."""
     return option(
         RESULT,
-        "Settings: accurate (default); fast (solves about every third frame); paper (the method as published).",
+        (
+            "Settings: accurate (default); fast (solves about every third frame); paper (the "
+            "method as published)."
+        ),
         default,
     )
 
 
 def grouped(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Convert `command` for typer: each field of a parameter that is a dataclass becomes an option."""
+    """Convert `command` for typer: each field of a parameter that is a dataclass becomes an
+    option.
+    """
     hints, parameters = get_type_hints(command), list[inspect.Parameter]()
     taken: dict[str, list[str]] = {}
 
@@ -111,7 +116,9 @@ def frames_option() -> Any:
 
 def workers_option() -> Any:
     """The option for the number of processes."""
-    return option(RUN, "Number of processes; by default as many as are useful. Results do not depend on it.")
+    return option(
+        RUN, "Number of processes; by default as many as are useful. Results do not depend on it."
+    )
 
 
 def json_option() -> Any:
@@ -128,19 +135,22 @@ class RunOptions:
         RUN, "Dask scheduler for the solving (tcp://host:8786), or `local`.", metavar="ADDRESS"
     )
     resume: bool = option(RUN, "Continue the interrupted run in --output.", False, "--resume")
-    restart: bool = option(RUN, "Start again, and delete the interrupted run in --output.", False, "--restart")
+    restart: bool = option(
+        RUN, "Start again, and delete the interrupted run in --output.", False, "--restart"
+    )
 
     def check(self) -> None:
         """InputError if options contradict each other."""
         check_workers(self.workers)
         if self.workers is not None and self.cluster not in (None, "local"):
             raise InputError(
-                f"--workers and --cluster {self.cluster}: processes are either of this machine or of the"
-                " cluster; give one of them"
+                f"--workers and --cluster {self.cluster}: processes are either of this machine "
+                "or of the cluster; give one of them"
             )
         if self.resume and self.restart:
             raise InputError(
-                "--resume and --restart: a run is either continued or started again; give one of them"
+                "--resume and --restart: a run is either continued or started again; give one of "
+                "them"
             )
 
 
@@ -148,8 +158,12 @@ class RunOptions:
 class CameraOptions:
     """The cameras of a recording."""
 
-    calibration: Path | None = option(INPUT, "Calibration of the cameras: a file or folder in a known format.")
-    up: str | None = option(INPUT, "World axis that points up: x, -x, y, -y, z or -z.", metavar="AXIS")
+    calibration: Path | None = option(
+        INPUT, "Calibration of the cameras: a file or folder in a known format."
+    )
+    up: str | None = option(
+        INPUT, "World axis that points up: x, -x, y, -y, z or -z.", metavar="AXIS"
+    )
     unit: str | None = option(INPUT, "Unit of the calibration: m, cm or mm.", metavar="UNIT")
     image_size: str | None = option(
         INPUT, "Size of the calibrated pictures, if the file does not contain it.", metavar="WxH"
@@ -189,7 +203,9 @@ class DetectionOptions(CameraOptions):
 
     detections: Path = option(INPUT, "Folder with the 2D detections of all cameras.", REQUIRED)
     skeleton: str | None = option(
-        INPUT, "Keypoint layout of the detector: a name such as COCO_17, or a TOML file.", metavar="NAME"
+        INPUT,
+        "Keypoint layout of the detector: a name such as COCO_17, or a TOML file.",
+        metavar="NAME",
     )
 
     def rig(self) -> "Rig":
@@ -207,7 +223,9 @@ class DetectionOptions(CameraOptions):
         moving = next((camera.name for camera in found.cameras if camera.carrier), None)
         if moving is not None:
             cure = "leave it out with --without; reconstruct refines trajectories itself"
-            raise InputError(f"{self.calibration}: camera {moving} moves, and {what} needs fixed cameras; {cure}")
+            raise InputError(
+                f"{self.calibration}: camera {moving} moves, and {what} needs fixed cameras; {cure}"
+            )
         return found
 
 
@@ -243,7 +261,9 @@ class ProjectOptions(DetectionOptions):
     """Cameras and their 2D detections, each given or from a Pose2Sim project."""
 
     detections: Path | None = option(INPUT, "Folder with the 2D detections of all cameras.")
-    project: Path | None = option(INPUT, "Pose2Sim project: use its cameras, detections and frame rate.")
+    project: Path | None = option(
+        INPUT, "Pose2Sim project: use its cameras, detections and frame rate."
+    )
 
     def completed(self, tell: Callable[..., None] = note) -> "tuple[Self, Pose2SimProject | None]":
         """The options with the missing paths filled in from the project, and the project; `tell`
@@ -255,7 +275,10 @@ class ProjectOptions(DetectionOptions):
 
         source = read_pose2sim_project(self.project)
         tell(*source.notes)
-        calibration, detections = self.calibration or source.calibration, self.detections or source.detections
+        calibration, detections = (
+            self.calibration or source.calibration,
+            self.detections or source.detections,
+        )
         return replace(self, calibration=calibration, detections=detections), source
 
     def located(self) -> Located:
@@ -272,7 +295,8 @@ class TimeOptions:
 
     fps: float | None = option(TIME, "Frame rate, Hz; by default that of times.csv, else 30.")
     timestamps: Path | None = option(
-        TIME, "File with the time of every frame, seconds; by default times.csv beside the detections."
+        TIME,
+        "File with the time of every frame, seconds; by default times.csv beside the detections.",
     )
 
     def read(
@@ -329,7 +353,9 @@ class ResultOptions:
 
     results: Path = argument("RESULTS", "Folder of a reconstruction.")
     fps: float | None = option(TIME, "Frame rate, Hz, instead of the result's own times.")
-    up: str | None = option(INPUT, "World axis that points up, if cameras.json is missing.", metavar="AXIS")
+    up: str | None = option(
+        INPUT, "World axis that points up, if cameras.json is missing.", metavar="AXIS"
+    )
     body: Path | None = option(INPUT, "Body model of the result, if its file has moved.")
 
     def how(self) -> dict[str, Any]:
@@ -344,7 +370,9 @@ class TakeOptions(ResultOptions):
 
     frames: str | None = frames_option()
     person: list[int] | None = option(RESULT, "Use only this person; may be repeated.")
-    seen_only: bool = option(RESULT, "Leave out joints without a detection in that frame.", False, "--seen-only")
+    seen_only: bool = option(
+        RESULT, "Leave out joints without a detection in that frame.", False, "--seen-only"
+    )
 
     def how(self) -> dict[str, Any]:
         """Keyword arguments of the functions that read it."""
@@ -354,7 +382,9 @@ class TakeOptions(ResultOptions):
 
 def next_reconstruct(options: Mapping[str, object]) -> str:
     """A command line to copy: `reconstruct` with those `options` that have values."""
-    words = [word for name, value in options.items() if value is not None for word in (name, str(value))]
+    words = [
+        word for name, value in options.items() if value is not None for word in (name, str(value))
+    ]
     return f"next: {shlex.join(['shapepose-fg', 'reconstruct', *words])}"
 
 
@@ -362,8 +392,12 @@ def refuse_missing(places: Mapping[str, Path | None]) -> None:
     """InputError if one of the options, by name, has no value from the user or from a project."""
     missing = [name for name, place in places.items() if place is None]
     if missing:
-        listed = " and ".join([", ".join(missing[:-1]), missing[-1]] if len(missing) > 1 else missing)
-        raise InputError(f"{listed}: missing; give them, or --project with the folder of a Pose2Sim project")
+        listed = " and ".join(
+            [", ".join(missing[:-1]), missing[-1]] if len(missing) > 1 else missing
+        )
+        raise InputError(
+            f"{listed}: missing; give them, or --project with the folder of a Pose2Sim project"
+        )
 
 
 def names_of(text: str | None) -> list[str] | None:
@@ -390,7 +424,9 @@ def check_fps(fps: float | None) -> None:
 def check_workers(workers: int | None) -> None:
     """InputError for an invalid number of processes."""
     if workers is not None and not 1 <= workers <= 64:
-        raise InputError(f"--workers {workers}: must be 1 to 64; leave it out to use as many as are useful")
+        raise InputError(
+            f"--workers {workers}: must be 1 to 64; leave it out to use as many as are useful"
+        )
 
 
 def result_frames(text: str | None) -> range | None:
@@ -412,7 +448,8 @@ def frame_range(text: str | None, count: int, first: int = 0) -> range:
     found = range(start, count if stop is None else stop)
     if text is not None and not (found and found.stop <= count):
         raise InputError(
-            f"--frames {text}: not in the recording, which has {count} frames; give A:B with 0 <= A < B <= {count}"
+            f"--frames {text}: not in the recording, which has {count} frames; give A:B with 0 "
+            f"<= A < B <= {count}"
         )
     return found
 

@@ -35,13 +35,20 @@ class Drawn:
 
     cameras: str | None = option(DRAW, "Use only these cameras.", metavar="A,B")
     without: str | None = option(DRAW, "Leave out these cameras.", metavar="A,B")
-    stills: str | None = option(DRAW, "Draw still pictures of these frames instead of a video.", metavar="A,B")
+    stills: str | None = option(
+        DRAW, "Draw still pictures of these frames instead of a video.", metavar="A,B"
+    )
     each: bool = option(
-        DRAW, "Write a file per camera at its own size, or all cameras in one.", False, "--each/--grid"
+        DRAW,
+        "Write a file per camera at its own size, or all cameras in one.",
+        False,
+        "--each/--grid",
     )
     bodies: bool = option(DRAW, "Draw the bodies' surfaces.", False, "--bodies/--no-bodies")
     skeletons: bool = option(DRAW, "Draw joints and bones.", True, "--skeletons/--no-skeletons")
-    points: bool = option(DRAW, "Draw the 2D detections; red crosses were not used.", True, "--points/--no-points")
+    points: bool = option(
+        DRAW, "Draw the 2D detections; red crosses were not used.", True, "--points/--no-points"
+    )
     width: int = option(DRAW, "Width of the grid, pixels.", 1920)
 
 
@@ -54,7 +61,9 @@ def overlay(
         INPUT, "Folder written by `detect`, which contains the paths of the pictures."
     ),
     frames: str | None = frames_option(),
-    output: Path | None = option(RESULT, "Folder for videos and pictures; by default RESULTS/overlay."),
+    output: Path | None = option(
+        RESULT, "Folder for videos and pictures; by default RESULTS/overlay."
+    ),
 ) -> None:
     """Draw a result over the videos or pictures from which it was made: as mp4, or still pictures.
 
@@ -90,13 +99,22 @@ def overlay(
         if drawn.stills is not None:
             chosen, fps = _stills(drawn.stills, length), None
         else:
-            told = [each for span in covered_frames(run) or [range(length)] for each in span if each < length]
+            told = [
+                each
+                for span in covered_frames(run) or [range(length)]
+                for each in span
+                if each < length
+            ]
             chosen, fps = told if frames is None else frame_range(frames, length), _fps(run)
         if len(chosen) == 0:
-            raise InputError(f"{folder}: none of its frames has a picture; give the videos that it was made from")
+            raise InputError(
+                f"{folder}: none of its frames has a picture; give the videos that it was made from"
+            )
         with progress("drawing") as done:
             width = None if drawn.each else drawn.width
-            written = write_overlay(over, chosen, output or inside(folder, "overlay"), width, fps, done)
+            written = write_overlay(
+                over, chosen, output or inside(folder, "overlay"), width, fps, done
+            )
         for path in written:
             print(f"written  {path}")
 
@@ -106,9 +124,13 @@ def _cameras(text: str, rig: "Rig") -> list[str]:
     names = names_of(text) or []
     for name in names:
         if name not in rig.names:
-            raise InputError(f"--cameras {text}: there is no camera {name!r}; there are {' '.join(rig.names)}")
+            raise InputError(
+                f"--cameras {text}: there is no camera {name!r}; there are {' '.join(rig.names)}"
+            )
     if len(names) == 0 or len(set(names)) < len(names):
-        raise InputError(f"--cameras {text}: must be camera names without repetition, such as {rig.names[0]}")
+        raise InputError(
+            f"--cameras {text}: must be camera names without repetition, such as {rig.names[0]}"
+        )
     return names
 
 

@@ -21,7 +21,10 @@ class PictureOptions:
 
     videos: list[str] | None = option(
         INPUT,
-        "Folder with a video, picture or folder of pictures named after each camera; or the path of one camera.",
+        (
+            "Folder with a video, picture or folder of pictures named after each camera; or the "
+            "path of one camera."
+        ),
         None,
         "--videos",
         "--images",
@@ -73,7 +76,15 @@ class PictureOptions:
             detections = folder
         moments = read_moments(folder / MOMENTS) if (folder / MOMENTS).is_file() else {}
         return pictures_of(
-            run, rig, drawn, self.videos, detections, self.image_placement or (), moments, opened, note
+            run,
+            rig,
+            drawn,
+            self.videos,
+            detections,
+            self.image_placement or (),
+            moments,
+            opened,
+            note,
         )
 
 

@@ -35,13 +35,20 @@ class FreedomOptions:
     off_cm: float = option(_CAMERAS, "Prior sigma of positions, centimetres.", 2.0)
     focal: bool = option(_CAMERAS, "Refine focal lengths, too (prior sigma 2 %).", False, "--focal")
     centre: bool = option(
-        _CAMERAS, "Refine principal points, too (prior sigma 10 pixels).", False, "--principal-point"
+        _CAMERAS,
+        "Refine principal points, too (prior sigma 10 pixels).",
+        False,
+        "--principal-point",
     )
-    lens: bool = option(_CAMERAS, "Refine k1 k2 p1 p2, too (prior sigma 0.02).", False, "--distortion")
+    lens: bool = option(
+        _CAMERAS, "Refine k1 k2 p1 p2, too (prior sigma 0.02).", False, "--distortion"
+    )
     reference: str | None = option(
         _CAMERAS, "Camera whose pose stays; by default the rig as a whole stays.", metavar="CAMERA"
     )
-    stature: float | None = option(_CAMERAS, "Mean stature of the people, metres; it then determines the scale.")
+    stature: float | None = option(
+        _CAMERAS, "Mean stature of the people, metres; it then determines the scale."
+    )
 
 
 @grouped
@@ -65,7 +72,9 @@ def refine_calibration(
     from shapepose_fg.io.calibration import check_target, write_like
 
     if not 0 < may.off_degrees <= 20 or not 0 < may.off_cm <= 200:
-        raise InputError("--off-degrees, --off-cm: must be above 0 and at most 20 degrees and 200 cm")
+        raise InputError(
+            "--off-degrees, --off-cm: must be above 0 and at most 20 degrees and 200 cm"
+        )
     if may.stature is not None and not 0.5 <= may.stature <= 2.5:
         raise InputError(f"--stature {may.stature:g}: must be 0.5 to 2.5 metres")
     seen = given.located()
@@ -74,12 +83,18 @@ def refine_calibration(
     check_target(source, output)
     if may.reference is not None and may.reference not in rig.names:
         raise InputError(
-            f"--reference {may.reference}: there is no such camera; give one of {' '.join(rig.names)}"
+            f"--reference {may.reference}: there is no such camera; give one of "
+            f"{' '.join(rig.names)}"
         )
-    bent = [camera.name for camera in rig.cameras if camera.lens == "fisheye" or camera.distortion[4:].any()]
+    bent = [
+        camera.name
+        for camera in rig.cameras
+        if camera.lens == "fisheye" or camera.distortion[4:].any()
+    ]
     if may.lens and bent:
         raise InputError(
-            f"camera {bent[0]}: only distortions of k1 k2 p1 p2 can be refined; leave out --distortion"
+            f"camera {bent[0]}: only distortions of k1 k2 p1 p2 can be refined; leave out "
+            "--distortion"
         )
     freedom = Freedom(
         may.off_degrees,
@@ -125,18 +140,28 @@ def refine_calibration(
         # Our own rig file defines axis, unit and picture sizes itself.
         options = {"--calibration": output} | seen.given()
         options |= {} if form == "rig file" else seen.said()
-        print(next_reconstruct(options | rate.given() | ({} if seen.source else {"--output": "results"})))
+        print(
+            next_reconstruct(
+                options | rate.given() | ({} if seen.source else {"--output": "results"})
+            )
+        )
 
 
-def _figures(found: "Refinement", may: FreedomOptions) -> tuple[list[str], list[tuple[str, list[str]]]]:
+def _figures(
+    found: "Refinement", may: FreedomOptions
+) -> tuple[list[str], list[tuple[str, list[str]]]]:
     """Changes by camera: headings, and the values of each camera."""
     change, sigma = found.change(), found.sigma()
-    parts = {"turn": "rotation, °", "move": "position, mm"} | ({"focal": "focal, %"} if may.focal else {})
+    parts = {"turn": "rotation, °", "move": "position, mm"} | (
+        {"focal": "focal, %"} if may.focal else {}
+    )
     parts |= {"centre": "centre, px"} if may.centre else {}
     rows = []
     for view, name in enumerate(found.given.names):
         digits = {part: 0 if part == "move" else 2 for part in parts}
-        figures = [f"{change[part][view]:.{n}f} ± {sigma[part][view]:.{n}f}" for part, n in digits.items()]
+        figures = [
+            f"{change[part][view]:.{n}f} ± {sigma[part][view]:.{n}f}" for part, n in digits.items()
+        ]
         rows.append((name, [str(found.counts[view]), *figures]))
     return ["people", *parts.values()], rows
 

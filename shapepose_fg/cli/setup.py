@@ -26,7 +26,8 @@ def check_calibration(
     frames: str | None = frames_option(),
     as_json: bool = json_option(),
 ) -> None:
-    """Check whether cameras and detections fit: turned, exchanged or late cameras, wrong units, in words.
+    """Check whether cameras and detections fit: turned, exchanged or late cameras, wrong units, in
+    words.
 
     Exit code 1 if something looks wrong, otherwise 0. Of videos and pictures, only the sizes are
     compared.
@@ -43,7 +44,9 @@ def check_calibration(
         sizes = () if pictures.videos is None else other_sizes(pictures.videos, rig)
         if pictures.videos is None and (used := seen.detections / FOOTAGE).is_file():
             sizes = detected_sizes(used, rig)
-        report = check_setup(recording, rig, frame_range(frames, len(recording), recording.first), sizes)
+        report = check_setup(
+            recording, rig, frame_range(frames, len(recording), recording.first), sizes
+        )
     if as_json:
         print(json.dumps(report.as_dict(), indent=2, allow_nan=False))
     else:

@@ -18,7 +18,10 @@ between cameras."""
 
 def setup_report(report: SetupReport) -> RenderableType:
     """The complete report."""
-    parts: list[RenderableType] = [_sentences(report), *(Text(f"{each}.", style="dim") for each in report.notes)]
+    parts: list[RenderableType] = [
+        _sentences(report),
+        *(Text(f"{each}.", style="dim") for each in report.notes),
+    ]
     parts += [Text(), _cameras(report.cameras)]
     if len(report.cameras) > 2:
         parts += [Text(), _pairs(report.cameras, report.pairs)]
@@ -43,8 +46,8 @@ def use_table(uses: Sequence[CameraUse]) -> RenderableType:
             for each in uses
         ),
         caption=(
-            "error: median / 90 % of all detections assigned to people; used: the same after gating; left out:"
-            " median distance from where the other cameras alone place the joint"
+            "error: median / 90 % of all detections assigned to people; used: the same after "
+            "gating; left out: median distance from where the other cameras alone place the joint"
         ),
     )
 
@@ -80,10 +83,10 @@ def _cameras(cameras: Sequence[CameraFigures]) -> RenderableType:
             for each in cameras
         ),
         caption=(
-            "people: seen in the checked frames; shared: seen by another camera, too; error: median / 90 % of"
-            " the distance from where all cameras place the joints; left out: median distance from where"
-            " the other cameras alone place them; fits: people of the others who match; late: offset in"
-            " frames."
+            "people: seen in the checked frames; shared: seen by another camera, too; error: "
+            "median / 90 % of the distance from where all cameras place the joints; left out: "
+            "median distance from where the other cameras alone place them; fits: people of the "
+            "others who match; late: offset in frames."
         ),
     )
 
@@ -103,14 +106,20 @@ def _pairs(cameras: Sequence[CameraFigures], pairs: Sequence[PairFigures]) -> Re
             )
             for row, first in enumerate(cameras[:-1])
         ),
-        caption="share of the people seen by both cameras that match; distance by which their rays miss, px",
+        caption=(
+            "share of the people seen by both cameras that match; distance by which their rays "
+            "miss, px"
+        ),
     )
 
 
 def _cell(pair: PairFigures) -> Text:
     if pair.matched is None:
         return Text("-", style="dim")
-    return _share(pair.matched, f" {pair.miss_px:.0f}" if pair.miss_px is not None and pair.matched > 0 else "")
+    return _share(
+        pair.matched,
+        f" {pair.miss_px:.0f}" if pair.miss_px is not None and pair.matched > 0 else "",
+    )
 
 
 def _share(part: float, more: str = "") -> Text:

@@ -30,8 +30,12 @@ if TYPE_CHECKING:
 class SceneOptions:
     """Options of the simulated scene."""
 
-    name: str = argument("NAME", "Scene: demo, or an interaction sequence (salsa, crossing or crowd).")
-    split: str = option(INPUT, "Part of a sequence: tune (for choosing settings) or report (for results).", "tune")
+    name: str = argument(
+        "NAME", "Scene: demo, or an interaction sequence (salsa, crossing or crowd)."
+    )
+    split: str = option(
+        INPUT, "Part of a sequence: tune (for choosing settings) or report (for results).", "tune"
+    )
     cameras: int = option(INPUT, "Number of cameras around the room, 2 to 12.", 6)
     people: int | None = option(INPUT, "Number of people in demo, 0 to 12.")
     seed: int = option(INPUT, "Random seed of the detector's errors, and of the people of demo.", 0)
@@ -79,10 +83,14 @@ def simulate(
     workers = suitable_workers(len(span), FRAMES_WORTH_A_WORKER) if workers is None else workers
     start = time.perf_counter()
     with progress_bar("simulating") as progress:
-        detections = run_detector(part, DetectorConfig(), scene.seed, workers=workers, progress=progress)
+        detections = run_detector(
+            part, DetectorConfig(), scene.seed, workers=workers, progress=progress
+        )
     seconds = time.perf_counter() - start
     about = {"name": scene.name, "seed": scene.seed, "first_frame": span.start}
-    about |= {"detector": DetectorConfig().as_dict()} | ({} if scene.name == "demo" else {"split": scene.split})
+    about |= {"detector": DetectorConfig().as_dict()} | (
+        {} if scene.name == "demo" else {"split": scene.split}
+    )
     written = write_simulated(part, detections, output, cast("Format", format), **about)
     print(
         f"{len(span)} frames of {made.people} people, {scene.cameras} cameras,"
@@ -90,8 +98,10 @@ def simulate(
     )
     for what, path in written.items():
         print(f"{what:<12}{path}")
-    timing = f"--fps {part.fps:g}" + (f" --cuts {','.join(map(str, part.cuts))}" if part.cuts else "")
+    timing = f"--fps {part.fps:g}" + (
+        f" --cuts {','.join(map(str, part.cuts))}" if part.cuts else ""
+    )
     print(
-        f"try: shapepose-fg reconstruct --calibration {written['cameras']} --detections {written['detections']}"
-        f" {timing} --output {output / 'results'}"
+        f"try: shapepose-fg reconstruct --calibration {written['cameras']} --detections "
+        f"{written['detections']} {timing} --output {output / 'results'}"
     )

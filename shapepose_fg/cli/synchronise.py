@@ -30,7 +30,8 @@ def synchronise(
     output: Path | None = option(RESULT, "File for the times of all frames, for --timestamps."),
     as_json: bool = json_option(),
 ) -> None:
-    """Estimate start times of cameras with known poses from the people in the recording, to milliseconds.
+    """Estimate start times of cameras with known poses from the people in the recording, to
+    milliseconds.
 
     Exit code 1 if motion does not determine a camera's offset; then nothing is written.
     """
@@ -56,7 +57,9 @@ def synchronise(
         first = found.offset_s.min()
         starts = zip(rig.names, found.offset_s - first, strict=True)
         words = [word for name, start in starts for word in ("--start", f"{name}={start:.4f}s")]
-        print(f"for videos: shapepose-fg detect {shlex.join(words)} and the other options as before")
+        print(
+            f"for videos: shapepose-fg detect {shlex.join(words)} and the other options as before"
+        )
         if output is not None:
             options = seen.given() | seen.said() | {"--timestamps": output}
             calibration = {"--calibration": seen.calibration, "--output": "results"}

@@ -72,7 +72,9 @@ def printable(text: str) -> str:
 
 
 def console(*, stderr: bool = False) -> "Console":
-    """A console on stdout or stderr that strips control characters; text is not parsed as markup."""
+    """A console on stdout or stderr that strips control characters; text is not parsed as
+    markup.
+    """
     from rich.console import Console
     from rich.segment import Segment
 
@@ -152,10 +154,21 @@ def bars(unit: str = "") -> Iterator["Progress"]:
     The bars are removed and the cursor is restored however the block ends.
     """
     global _shown
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+    )
 
     on, left = console(stderr=True), TimeRemainingColumn(compact=True)
-    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TextColumn(unit))
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn(unit),
+    )
     is_shown = _is_terminal(on) and _shown is None
     made = Progress(
         *columns,
@@ -202,4 +215,8 @@ def progress(what: str, unit: str = "frames") -> Iterator[Callable[[int, int], N
 
     with bars(unit) as shown:
         task = shown.add_task(what, total=None)
-        yield line if shown.disable else lambda done, total: shown.update(task, completed=done, total=total)
+        yield (
+            line
+            if shown.disable
+            else lambda done, total: shown.update(task, completed=done, total=total)
+        )

@@ -33,7 +33,8 @@ def people_over_time(
     context: typer.Context,
     results: Annotated[Path, typer.Argument(metavar="RESULTS", help="Folder of a reconstruction.")],
 ) -> None:
-    """List the people of a result over time, or correct identities: shapepose-fg tracks RESULTS merge 3 9.
+    """List the people of a result over time, or correct identities: shapepose-fg tracks RESULTS
+    merge 3 9.
 
     Without a command, all people are listed. The original result stays in RESULTS/uncorrected, and
     `undo` takes corrections back one by one.
@@ -57,7 +58,10 @@ def list_people(
         return
     with Reconstruction.open(context.obj) as opened:
         listed = [asdict(track) for track in list_saved_tracks(opened, _body_of(opened.run))]
-    plain = [{name: None if value != value else value for name, value in track.items()} for track in listed]
+    plain = [
+        {name: None if value != value else value for name, value in track.items()}
+        for track in listed
+    ]
     print(json.dumps(plain, indent=2, allow_nan=False))
 
 
@@ -67,7 +71,9 @@ def merge_people(context: typer.Context, person: Person, other: Other) -> None:
     _correct(context, "merge", person, other=other)
 
 
-New = Annotated[int | None, typer.Option(help="Number of the new person; by default the next free number.")]
+New = Annotated[
+    int | None, typer.Option(help="Number of the new person; by default the next free number.")
+]
 
 
 @tracks.command("split")
@@ -146,7 +152,9 @@ def _tracks_table(results: Path) -> "RenderableType":
     edits = read_corrections(results_folder(results))
     if len(edits) > 0:
         lines.append(f"corrected: {'; '.join(map(str, edits))}")
-    return Group(*([people] if listed else []), Padding("\n".join(lines), (1 if listed else 0, 0, 0, 0)))
+    return Group(
+        *([people] if listed else []), Padding("\n".join(lines), (1 if listed else 0, 0, 0, 0))
+    )
 
 
 def _body_of(run: "Mapping[str, Any]") -> "SmplArrays | None":
@@ -215,7 +223,8 @@ def _solver(folder: Path) -> "Solve | None":
         if functions := opened.run.get("extra_factors"):
             names = ", ".join(map(str, functions))
             note(
-                f"corrected people are solved again without the factors of {names}, which are known in Python only"
+                f"corrected people are solved again without the factors of {names}, which are "
+                "known in Python only"
             )
 
     def solve(rows: "Reconstruction") -> "Reconstruction":

@@ -19,12 +19,15 @@ fitter takes half the time)."""
 def train_fitter(
     body: Path = option(INPUT, "Body model in SMPL's file format.", REQUIRED),
     motions: Path | None = option(
-        INPUT, "Folder of recorded motions in AMASS's format; without it, poses are drawn at random."
+        INPUT,
+        "Folder of recorded motions in AMASS's format; without it, poses are drawn at random.",
     ),
     output: Path | None = option(
         RESULT, "File for the weights (setting body.weights); by default in the user's cache."
     ),
-    iterations: int = option(RUN, "Number of batches; 0 only calibrates the uncertainty of the fits.", 500, min=0),
+    iterations: int = option(
+        RUN, "Number of batches; 0 only calibrates the uncertainty of the fits.", 500, min=0
+    ),
     batch: int = option(RUN, "Number of people in a batch.", 256, min=16),
     seed: int = option(RUN, "Random seed.", 0),
 ) -> None:
@@ -42,7 +45,9 @@ def train_fitter(
 
     model = BodyModel.load(body)
     if output is None and fingerprint(model) == FitterWeights.default().body:
-        raise InputError(f"{body}: this body model has weights in the package; give --output to train others")
+        raise InputError(
+            f"{body}: this body model has weights in the package; give --output to train others"
+        )
     file = adapted_file(model) if output is None else output
     prepare_output(file.parent, [file.name])
     if motions is None:
@@ -51,9 +56,15 @@ def train_fitter(
         learnt, unseen = (load_motions(motions).of(split) for split in ("train", "validation"))
     for split, part in (("train", learnt), ("validation", unseen)):
         if len(part) == 0:
-            raise InputError(f"{motions}: there are no {split} subjects; add motions of more people")
+            raise InputError(
+                f"{motions}: there are no {split} subjects; add motions of more people"
+            )
     config = TrainingConfig(iterations=iterations, batch=batch, seed=seed)
-    card = {"data": "poses drawn from the prior" if motions is None else f"{len(learnt)} frames of {motions.name}"}
+    card = {
+        "data": "poses drawn from the prior"
+        if motions is None
+        else f"{len(learnt)} frames of {motions.name}"
+    }
     start = time.perf_counter()
     torch.set_num_threads(1)
     with progress("training", "batches") as shown:
@@ -64,9 +75,12 @@ def train_fitter(
     show(table(["fitter", "error, mm", "ms per fit"], rows, caption=caption))
     if output is None and scores[TRAINED].joints_mm > _WORSE * scores[PLAIN].joints_mm:
         warn(
-            f"the plain optimiser is more accurate on {body}, so these weights are not stored; give more"
-            " --iterations"
+            f"the plain optimiser is more accurate on {body}, so these weights are not stored; "
+            "give more --iterations"
         )
         return
     weights.save(file)
-    note(f"{file}: {file.stat().st_size / 1e6:.1f} MB" + ("" if output else f", used with --body {body}"))
+    note(
+        f"{file}: {file.stat().st_size / 1e6:.1f} MB"
+        + ("" if output else f", used with --body {body}")
+    )

@@ -18,9 +18,15 @@ if TYPE_CHECKING:
 def view(
     part: TakeOptions,
     pictures: PictureOptions,
-    save: Path | None = option(RESULT, "Write a file (.rrd) for `rerun FILE` instead.", metavar="FILE"),
-    connect: str | None = option(RUN, "Address of a running viewer: rerun+http://HOST:9876/proxy.", metavar="URL"),
-    statistics: bool = option(RUN, "Keep rerun's setting of usage statistics.", False, "--statistics"),
+    save: Path | None = option(
+        RESULT, "Write a file (.rrd) for `rerun FILE` instead.", metavar="FILE"
+    ),
+    connect: str | None = option(
+        RUN, "Address of a running viewer: rerun+http://HOST:9876/proxy.", metavar="URL"
+    ),
+    statistics: bool = option(
+        RUN, "Keep rerun's setting of usage statistics.", False, "--statistics"
+    ),
 ) -> None:
     """Show a result in the rerun viewer: people, cameras, and used and unused detections, on a
     timeline.
@@ -31,14 +37,20 @@ def view(
 
     take = read_take(part.results, identities=False, **part.how())
     if save is not None and connect is not None:
-        raise InputError("--save and --connect: the result is either written or shown; give one of them")
+        raise InputError(
+            "--save and --connect: the result is either written or shown; give one of them"
+        )
     pairs = _pictures(part.results, take, pictures) if pictures.videos else []
     if connect is None and save is None and not statistics:
         note(*rerun_app.quiet_viewer())
     arrays, missing = rerun_app.body_if_there(Job(take, part.results, part.body))
     note(*missing)
     first = rerun_app.layout_of(take)
-    with rerun_app.shown(first, connect) if save is None else rerun_app.written(save, first) as stream:
+    with (
+        rerun_app.shown(first, connect)
+        if save is None
+        else rerun_app.written(save, first) as stream
+    ):
         log_take(stream, take, arrays)
         if len(pairs) > 0:
             with progress("showing pictures", "pictures") as done:
@@ -47,8 +59,12 @@ def view(
         print(f"written  {save}")
 
 
-def _pictures(results: Path, take: "Take", pictures: PictureOptions) -> "list[tuple[CameraFootage, Footage]]":
+def _pictures(
+    results: Path, take: "Take", pictures: PictureOptions
+) -> "list[tuple[CameraFootage, Footage]]":
     """The cameras' videos or pictures: of all cameras, or of those that are given individually."""
     if take.rig is None:
-        raise InputError("--videos: cameras.json is missing beside the result, and pictures need it")
+        raise InputError(
+            "--videos: cameras.json is missing beside the result, and pictures need it"
+        )
     return pictures.of_result(results, take.people.run, take.rig, pictures.named(take.rig))

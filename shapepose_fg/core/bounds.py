@@ -1,4 +1,6 @@
-"""Settings with bounds: declared in the type of a field, and checked whenever settings are created."""
+"""Settings with bounds: declared in the type of a field, and checked whenever settings are
+created.
+"""
 
 from functools import cache
 from typing import Annotated, Any, get_type_hints
@@ -67,4 +69,10 @@ def _problem(interval: Interval, value: Any) -> str | None:
         return "be between 0 and 1"
     if value > high:
         return f"be at most {high}"
-    return "be positive" if interval.gt == 0 else "not be negative" if low == 0 else f"be at least {low}"
+    return (
+        "be positive"
+        if interval.gt == 0
+        else "not be negative"
+        if low == 0
+        else f"be at least {low}"
+    )

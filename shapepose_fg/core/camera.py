@@ -38,13 +38,14 @@ class Camera:
     image_size: tuple[int, int]
     """Width and height of the picture, pixels."""
     distortion: Array = field(default_factory=lambda: np.zeros(5))
-    """Coefficients in OpenCV's order, zero for a camera without distortion. Perspective: (5,) k1 k2 p1 p2 k3,
-    or (8,) with k4 k5 k6 of the rational model, (12,) with s1 to s4, (14,) with a tilt. Fisheye: (4,) k1 to k4."""
+    """Coefficients in OpenCV's order, zero for a camera without distortion. Perspective: (5,) k1 k2
+    p1 p2 k3, or (8,) with k4 k5 k6 of the rational model, (12,) with s1 to s4, (14,) with a tilt.
+    Fisheye: (4,) k1 to k4."""
     lens: Lens = "perspective"
     """Lens model of OpenCV to which the coefficients belong."""
     readout_s: float = 0.0
-    """Time that a rolling shutter takes from the first row of a picture to the last, s; a picture's time is
-    that of its middle row."""
+    """Time that a rolling shutter takes from the first row of a picture to the last, s; a picture's
+    time is that of its middle row."""
     carrier: str = ""
     """The name of the trajectory that carries the camera; empty for a fixed camera."""
     bTc: Array = field(default_factory=lambda: np.eye(4))
@@ -57,7 +58,9 @@ class Camera:
         if self.lens not in COEFFICIENTS:
             raise refuse(f"lens must be perspective or fisheye, got {self.lens!r}")
         lengths = [(count,) for count in COEFFICIENTS[self.lens]]
-        arrays = {"K": ([(3, 3)], _MOST_PIXELS)} | dict.fromkeys(("wTc", "bTc"), ([(4, 4)], MOST_METRES))
+        arrays = {"K": ([(3, 3)], _MOST_PIXELS)} | dict.fromkeys(
+            ("wTc", "bTc"), ([(4, 4)], MOST_METRES)
+        )
         for name, (shapes, most) in (arrays | {"distortion": (lengths, _MOST_DISTORTION)}).items():
             value = np.asarray(getattr(self, name), dtype=np.float64)
             if value.shape not in shapes:
@@ -74,11 +77,18 @@ class Camera:
                 raise refuse(f"the rotation of {name} must be orthonormal with determinant 1")
         width, height = self.image_size
         if not 0 < min(width, height) <= max(width, height) <= _MOST_PIXELS:
-            raise refuse(f"image_size must be positive and at most {_MOST_PIXELS}, got {self.image_size}")
+            raise refuse(
+                f"image_size must be positive and at most {_MOST_PIXELS}, got {self.image_size}"
+            )
         if not 0 <= self.readout_s <= LONGEST_READOUT_S:
-            raise refuse(f"readout_s must be 0 to {LONGEST_READOUT_S:g} seconds, got {self.readout_s}")
+            raise refuse(
+                f"readout_s must be 0 to {LONGEST_READOUT_S:g} seconds, got {self.readout_s}"
+            )
         if not self.name or len(self.name) > _LONGEST_NAME or not self.name.isprintable():
-            raise ValueError(f"camera {self.name[:40]!r}: names must be 1 to {_LONGEST_NAME} letters, in one line")
+            raise ValueError(
+                f"camera {self.name[:40]!r}: names must be 1 to {_LONGEST_NAME} letters, in one "
+                "line"
+            )
         way = PurePath(self.name)
         if way.is_absolute() or len(way.parts) == 0 or ".." in way.parts:
             raise refuse("the name must not contain a path, because files are named after it")
@@ -102,7 +112,9 @@ class Camera:
         cTw = np.asarray(cTw, dtype=np.float64)
         R = np.asarray(cTw[:3, :3])
         if not (np.isfinite(cTw).all() and is_rotation(R)):
-            raise ValueError(f"camera {name}: the rotation must be orthonormal with determinant 1, and finite")
+            raise ValueError(
+                f"camera {name}: the rotation must be orthonormal with determinant 1, and finite"
+            )
         R, coefficients = nearest_rotation(R).T, padded_distortion(distortion, lens)
         wTc = rigid(R, -R @ cTw[:3, 3])
         return cls(name, np.asarray(K, dtype=np.float64), wTc, image_size, coefficients, lens)
@@ -119,7 +131,8 @@ class Camera:
         return self.wTc[:3, 3]
 
     def project(self, points_world: Array) -> tuple[Array, Array]:
-        """Project `points_world` (..., 3) to *undistorted* pixels (..., 2) and depths (...,) in metres.
+        """Project `points_world` (..., 3) to *undistorted* pixels (..., 2) and depths (...,) in
+        metres.
 
         A point that is not in front of the camera (depth <= 0) gets NaN pixels.
         """
@@ -153,9 +166,11 @@ class Rig:
     """Views without a picture in the frame for which the rig was made; no detections are expected
     there."""
     doubted: tuple[int, ...] = ()
-    """Views that contradict each other in the frame for which the rig was made; it is unknown which is wrong."""
+    """Views that contradict each other in the frame for which the rig was made; it is unknown which
+    is wrong."""
     trajectories: tuple[Trajectory, ...] = ()
-    """Trajectories of the carriers of moving cameras; two cameras on one robot share its trajectory."""
+    """Trajectories of the carriers of moving cameras; two cameras on one robot share its
+    trajectory."""
     notes: tuple[str, ...] = field(default=(), compare=False)
     """Notes of the reader, a sentence each, on ignored parts of the calibration file and on
     assumptions."""
@@ -174,7 +189,9 @@ class Rig:
         known = [each.name for each in self.trajectories]
         for camera in self.cameras:
             if camera.carrier and camera.carrier not in known:
-                raise ValueError(f"camera {camera.name}: there is no trajectory {camera.carrier!r}, got {known}")
+                raise ValueError(
+                    f"camera {camera.name}: there is no trajectory {camera.carrier!r}, got {known}"
+                )
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -188,18 +205,26 @@ class Rig:
         views = [view for view, name in enumerate(self.names) if name in names]
         cameras = tuple(self.cameras[view] for view in views)
         dark, doubted = (
-            tuple(views.index(view) for view in given if view in views) for given in (self.dark, self.doubted)
+            tuple(views.index(view) for view in given if view in views)
+            for given in (self.dark, self.doubted)
         )
         carriers = {camera.carrier for camera in cameras}
         trajectories = tuple(each for each in self.trajectories if each.name in carriers)
         unwanted = (*self.unwanted, *(name for name in self.names if name not in names))
         return replace(
-            self, cameras=cameras, dark=dark, doubted=doubted, trajectories=trajectories, unwanted=unwanted
+            self,
+            cameras=cameras,
+            dark=dark,
+            doubted=doubted,
+            trajectories=trajectories,
+            unwanted=unwanted,
         )
 
     def at_poses(self, wTc: Array) -> "Rig":
         """The rig with its cameras at world-from-camera poses (V, 4, 4)."""
-        cameras = (replace(camera, wTc=each) for camera, each in zip(self.cameras, wTc, strict=True))
+        cameras = (
+            replace(camera, wTc=each) for camera, each in zip(self.cameras, wTc, strict=True)
+        )
         return replace(self, cameras=tuple(cameras))
 
     def without(self, names: Iterable[str]) -> "Rig":
@@ -215,17 +240,23 @@ class Rig:
     def carrier(self) -> Index:
         """(V,) index of the trajectory of each view; -1 for a fixed camera."""
         known = [each.name for each in self.trajectories]
-        return np.array([known.index(each.carrier) if each.carrier else -1 for each in self.cameras], np.intp)
+        return np.array(
+            [known.index(each.carrier) if each.carrier else -1 for each in self.cameras], np.intp
+        )
 
     def poses(self, time_s: Array) -> Array:
         """(..., V, 4, 4) world from camera at times (..., V), seconds; outside of a trajectory, its
         nearest pose.
         """
         wTc = np.empty((*time_s.shape, 4, 4))
-        for view, (camera, number) in enumerate(zip(self.cameras, self.carrier.tolist(), strict=True)):
+        for view, (camera, number) in enumerate(
+            zip(self.cameras, self.carrier.tolist(), strict=True)
+        ):
             still = number < 0
             wTc[..., view, :, :] = (
-                camera.wTc if still else self.trajectories[number].at(time_s[..., view]) @ camera.bTc
+                camera.wTc
+                if still
+                else self.trajectories[number].at(time_s[..., view]) @ camera.bTc
             )
         return wTc
 
@@ -284,7 +315,8 @@ class Rig:
         return self.K[:, [0, 1], [0, 1]].mean(axis=1)
 
     def project(self, points_world: Array) -> tuple[Array, Array]:
-        """Project `points_world` (..., 3) into every view: undistorted pixels (V, ..., 2), depths (V, ...).
+        """Project `points_world` (..., 3) into every view: undistorted pixels (V, ..., 2), depths
+        (V, ...).
 
         Pixels are NaN if the depth is not positive.
         """
@@ -295,18 +327,24 @@ class Rig:
         return xy.reshape(len(self), *shape, 2), depth.reshape(len(self), *shape)
 
     def rays(self, view: Index, xy: Array) -> Array:
-        """(D, 3) directions of length one, in the world, of undistorted pixels `xy` (D, 2) in views `view`."""
+        """(D, 3) directions of length one, in the world, of undistorted pixels `xy` (D, 2) in views
+        `view`.
+        """
         camera = np.concatenate([self.normalise(view, xy), np.ones((len(xy), 1))], axis=1)
         world = np.einsum("dji,dj->di", self.cTw[view, :, :3], camera)
         return world / np.linalg.norm(world, axis=1, keepdims=True)
 
     def normalise(self, view: Index, xy: Array) -> Array:
-        """Normalised image coordinates (D, 2) of undistorted pixels `xy` (D, 2) seen in `view` (D,)."""
+        """Normalised image coordinates (D, 2) of undistorted pixels `xy` (D, 2) seen in `view`
+        (D,).
+        """
         K_inverse = np.linalg.inv(self.K)[view]
         return np.einsum("dij,dj->di", K_inverse[:, :2, :2], xy) + K_inverse[:, :2, 2]
 
 
-def choose(known: Sequence[str], only: Sequence[str] | None = None, without: Sequence[str] = ()) -> list[str]:
+def choose(
+    known: Sequence[str], only: Sequence[str] | None = None, without: Sequence[str] = ()
+) -> list[str]:
     """Select names of cameras: those of `known` that are in `only` (None: all) and not in
     `without`.
 
@@ -314,7 +352,9 @@ def choose(known: Sequence[str], only: Sequence[str] | None = None, without: Seq
     """
     for name in [*(only or []), *without]:
         if name not in known:
-            listed = " ".join(known[:12]) + (f" and {len(known) - 12} more" if len(known) > 12 else "")
+            listed = " ".join(known[:12]) + (
+                f" and {len(known) - 12} more" if len(known) > 12 else ""
+            )
             raise ValueError(f"there is no camera {name[:80]!r}; there are {listed}")
     chosen = [name for name in known if (only is None or name in only) and name not in without]
     if len(chosen) == 0 and len(known) > 0:
@@ -340,16 +380,26 @@ class Views:
 
     def __post_init__(self) -> None:
         K, cTw = self.K, self.cTw
-        if K.shape[-2:] != (3, 3) or cTw.shape[-2:] != (3, 4) or K.ndim not in (3, 4) or cTw.ndim not in (3, 4):
-            raise ValueError(f"K must be ([N,] V, 3, 3) and cTw ([N,] V, 3, 4), got {K.shape} and {cTw.shape}")
+        if (
+            K.shape[-2:] != (3, 3)
+            or cTw.shape[-2:] != (3, 4)
+            or K.ndim not in (3, 4)
+            or cTw.ndim not in (3, 4)
+        ):
+            raise ValueError(
+                f"K must be ([N,] V, 3, 3) and cTw ([N,] V, 3, 4), got {K.shape} and {cTw.shape}"
+            )
         if K.shape[-3] != cTw.shape[-3] or (K.ndim == cTw.ndim == 4 and len(K) != len(cTw)):
-            raise ValueError(f"K and cTw must have the same rows and views, got {K.shape} and {cTw.shape}")
+            raise ValueError(
+                f"K and cTw must have the same rows and views, got {K.shape} and {cTw.shape}"
+            )
         if not (np.isfinite(K).all() and np.isfinite(cTw).all()):
             raise ValueError("K or cTw holds a value that is not finite")
 
     @classmethod
     def of(cls, rig: Rig, time_s: Array | None = None) -> "Views":
-        """The cameras of a rig; for moving cameras at `time_s` (N, V), seconds, the times of each row's views.
+        """The cameras of a rig; for moving cameras at `time_s` (N, V), seconds, the times of each
+        row's views.
 
         ValueError if cameras move and no times are given.
         """
@@ -406,7 +456,8 @@ class Views:
         return ends[..., :2] / np.where(depth > 0, depth, np.nan)[..., None], depth
 
     def project(self, points: Array) -> tuple[Array, Array, Array]:
-        """Pixels (N, J, V, 2), depths (N, J, V) and derivatives (N, J, V, 2, 3) of `points` (N, J, 3), metres.
+        """Pixels (N, J, V, 2), depths (N, J, V) and derivatives (N, J, V, 2, 3) of `points` (N, J,
+        3), metres.
 
         Pixels are undistorted. Pixels and derivatives are NaN if the depth is not positive.
         """
@@ -420,9 +471,11 @@ class Views:
         return project_with_jacobian(points, K, cTw)
 
 
-def beside_segment(x: Real, y: Real, first: Sequence[Real], second: Sequence[Real]) -> tuple[Real, Real]:
-    """Squared distances of pixels (...) from segments (...), squared pixels, and depths of the segments' nearest
-    points.
+def beside_segment(
+    x: Real, y: Real, first: Sequence[Real], second: Sequence[Real]
+) -> tuple[Real, Real]:
+    """Squared distances of pixels (...) from segments (...), squared pixels, and depths of the
+    segments' nearest points.
 
     `first` and `second` are x, y and depth of the segments' ends; all shapes broadcast.
     """

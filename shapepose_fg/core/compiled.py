@@ -1,4 +1,5 @@
-"""Functions over rows, joints and frames, compiled by Numba once per machine and cached (`core/kept_kernels.py`).
+"""Functions over rows, joints and frames, compiled by Numba once per machine and cached
+(`core/kept_kernels.py`).
 
 A kernel takes whole arrays of the declared types (C-contiguous; for other types it is compiled
 again) and writes its results into arrays that are passed to it, so that one call from Python
@@ -132,7 +133,9 @@ def signature(kernel: Any) -> tuple[Any, ...]:
 
     def types(kinds: Sequence[str | type]) -> tuple[Any, ...]:
         return tuple(
-            one for each in kinds for one in (map(number, each.split()) if isinstance(each, str) else named(each))
+            one
+            for each in kinds
+            for one in (map(number, each.split()) if isinstance(each, str) else named(each))
         )
 
     def named(of: Any) -> tuple[Any, ...]:

@@ -17,7 +17,8 @@ from shapepose_fg.core.kept_kernels import kept_folder, wanted_folder
 _BYTES_S = 1300
 """Bytes of Python bytecode that an average machine compiles in a second."""
 _WORTH_S = 3.0
-"""Compile time below which kernels are compiled in this process, s: starting a process takes a second."""
+"""Compile time below which kernels are compiled in this process, s: starting a process takes a
+second."""
 _MOST = 8
 """Maximum number of processes: the longest kernel takes an eighth of the total time, so more
 processes give no speed-up."""
@@ -28,7 +29,8 @@ compiled when they are called."""
 
 
 def compile_beside(kernels: Sequence[Any]) -> None:
-    """Compile those of the kernels that are not cached, in as many processes as there are cores; once per process.
+    """Compile those of the kernels that are not cached, in as many processes as there are cores;
+    once per process.
 
     If another process is compiling, waits for it.
     """
@@ -64,11 +66,15 @@ def _share_out(kernels: Sequence[Any], count: int) -> None:
     for each in kernels:
         modules.setdefault(each.py_func.__module__, []).append(each)
     bound = _work(kernels) / (2 * count)
-    groups = [p for m in modules.values() for p in ([m] if _work(m) < bound else [[each] for each in m])]
+    groups = [
+        p for m in modules.values() for p in ([m] if _work(m) < bound else [[each] for each in m])
+    ]
     groups.sort(key=_work, reverse=True)
     words = [",".join(each.name for each in group) for group in groups]
     # The same packages as in this process, whatever is in the working directory.
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(each or str(Path.cwd()) for each in sys.path)}
+    environment = os.environ | {
+        "PYTHONPATH": os.pathsep.join(each or str(Path.cwd()) for each in sys.path)
+    }
     command = [sys.executable, "-P", "-c", f"from {__name__} import main; main()", *words]
     started = list[subprocess.Popen[Any]]()
     numbers, to = os.pipe()  # pipe of group numbers, two bytes each, from which all processes read
@@ -125,7 +131,10 @@ def _alone() -> Iterator[None]:
     place = kept_folder()
     lock = None if place is None else FileLock(place / "compiling.lock")
     waiting = saying("waiting for another process that compiles the functions for this machine")
-    with waiting, suppress(OSError, NotImplementedError):  # some file systems have no locks, or are full
+    with (
+        waiting,
+        suppress(OSError, NotImplementedError),
+    ):  # some file systems have no locks, or are full
         if lock is not None:
             lock.acquire()
     try:
@@ -145,7 +154,9 @@ def _pieces(function: Any) -> set[Any]:
     known, waiting = {function}, [function]
     while waiting:
         one = waiting.pop()
-        called = (getattr(one.__globals__.get(name), "py_func", None) for name in one.__code__.co_names)
+        called = (
+            getattr(one.__globals__.get(name), "py_func", None) for name in one.__code__.co_names
+        )
         waiting += (new := [each for each in called if each is not None and each not in known])
         known.update(new)
     return known

@@ -19,18 +19,24 @@ arrangement."""
 
 def is_rotation(R: Array) -> bool:
     """Whether matrices (..., 3, 3) are rotations, up to `ROTATION_TOLERANCE`."""
-    return bool(np.abs(R @ R.mT - np.eye(3)).max() <= ROTATION_TOLERANCE and (np.linalg.det(R) >= 0).all())
+    return bool(
+        np.abs(R @ R.mT - np.eye(3)).max() <= ROTATION_TOLERANCE and (np.linalg.det(R) >= 0).all()
+    )
 
 
 def rigid(R: Array, t: Array) -> Array:
-    """(..., 4, 4) rigid transformations with rotations R (..., 3, 3) and translations t (..., 3)."""
+    """(..., 4, 4) rigid transformations with rotations R (..., 3, 3) and translations t (...,
+    3).
+    """
     found = np.zeros((*np.shape(t)[:-1], 4, 4))
     found[..., :3, :3], found[..., :3, 3], found[..., 3, 3] = R, t, 1.0
     return found
 
 
 def symmetric_root(matrix: Array) -> Array:
-    """Symmetric square roots (..., n, n) of positive semi-definite matrices; negative rounding counts as zero."""
+    """Symmetric square roots (..., n, n) of positive semi-definite matrices; negative rounding
+    counts as zero.
+    """
     values, vectors = np.linalg.eigh(matrix)
     return np.einsum("...ik,...k,...jk->...ij", vectors, np.sqrt(np.maximum(values, 0.0)), vectors)
 
@@ -42,7 +48,8 @@ def raise_eigenvalues(matrix: Array, least: float) -> Array:
 
 
 def principal_axes(covariance: Array) -> tuple[Array, Array]:
-    """Variances (..., 3) along the principal axes, ascending, and the axes as columns of rotations (..., 3, 3).
+    """Variances (..., 3) along the principal axes, ascending, and the axes as columns of rotations
+    (..., 3, 3).
 
     The second and third axis have a positive component along (√2, √3, √5); the sign of the first
     makes the matrix a rotation. Axes of equal variances are not unique: use them only for results
@@ -62,8 +69,12 @@ def nearest_rotation(matrix: Array) -> Array:
 
 
 def basis_across(axis: Array) -> Array:
-    """(2, 3) orthonormal directions perpendicular to a unit vector `axis` (3,) (Duff et al. 2017)."""
+    """(2, 3) orthonormal directions perpendicular to a unit vector `axis` (3,) (Duff et al.
+    2017).
+    """
     x, y, z = axis
     sign = np.copysign(1.0, z)
     a = -1.0 / (sign + z)
-    return np.array([[1.0 + sign * x * x * a, sign * x * y * a, -sign * x], [x * y * a, sign + y * y * a, -y]])
+    return np.array(
+        [[1.0 + sign * x * x * a, sign * x * y * a, -sign * x], [x * y * a, sign + y * y * a, -y]]
+    )

@@ -56,7 +56,9 @@ class Detections:
     @cached_property
     def columns(self) -> tuple[Index, Index, Array, Index, Array]:
         """View, joint, xy, pairs and affinity in the order that kernels expect."""
-        whole = (np.require(each, np.intp, ["C", "W"]) for each in (self.view, self.joint, self.pairs))
+        whole = (
+            np.require(each, np.intp, ["C", "W"]) for each in (self.view, self.joint, self.pairs)
+        )
         view, joint, pairs = whole
         return (
             view,
@@ -68,7 +70,9 @@ class Detections:
 
     @cached_property
     def rank(self) -> Array:
-        """(D,) rank by content, 0 to 1, which breaks ties independently of the order of the candidates."""
+        """(D,) rank by content, 0 to 1, which breaks ties independently of the order of the
+        candidates.
+        """
         rank = np.empty(len(self))
         rank[np.lexsort((*self.xy.T, self.confidence))] = np.arange(len(self)) / max(len(self), 1)
         return rank
@@ -118,14 +122,18 @@ class Detections:
         names = ("view", "joint", "xy", "confidence", "affinity", "place", "mirrored")
         columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
         starts = np.cumsum([0, *(len(part) for part in parts)])
-        pairs = np.concatenate([part.pairs + start for part, start in zip(parts, starts, strict=False)])
+        pairs = np.concatenate(
+            [part.pairs + start for part, start in zip(parts, starts, strict=False)]
+        )
         return cls(pairs=pairs, **columns)
 
     @classmethod
     def empty(cls) -> "Detections":
         """A frame without detections."""
         none = np.zeros(0, dtype=np.intp)
-        return cls(none, none, np.zeros((0, 2)), np.zeros(0), np.zeros((0, 2), dtype=np.intp), np.zeros(0))
+        return cls(
+            none, none, np.zeros((0, 2)), np.zeros(0), np.zeros((0, 2), dtype=np.intp), np.zeros(0)
+        )
 
 
 def _place_in_view(view: Index) -> Index:
@@ -149,7 +157,8 @@ class Input:
     rig: Rig
     """The cameras at the times of the views."""
     key: bool = True
-    """Whether new people are searched for in the frame. Detections of frames between keyframes are not thinned."""
+    """Whether new people are searched for in the frame. Detections of frames between keyframes are
+    not thinned."""
 
 
 class DetectionSequence(Protocol):

@@ -1,4 +1,6 @@
-"""Shared by all visualisations: a colour per person, bones between joints, and simplified surfaces."""
+"""Shared by all visualisations: a colour per person, bones between joints, and simplified
+surfaces.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +19,9 @@ def colour_of(person: int) -> tuple[float, float, float]:
     """Colour of an identity, the same in all files of a result: red, green and blue, 0 to 1 in
     sRGB.
     """
-    red, green, blue = (int(PALETTE[person % len(PALETTE)][at : at + 2], 16) / 255 for at in (1, 3, 5))
+    red, green, blue = (
+        int(PALETTE[person % len(PALETTE)][at : at + 2], 16) / 255 for at in (1, 3, 5)
+    )
     return red, green, blue
 
 
@@ -26,7 +30,9 @@ def bones_of(joint_names: tuple[str, ...]) -> Index:
     the nearest available joint towards the hip.
     """
     rows = zip(BODY_25.joints, BODY_25.parents, strict=True)
-    parents = {name: BODY_25.joints[parent] for name, parent in rows if parent >= 0} | {"Head": "Neck"}
+    parents = {name: BODY_25.joints[parent] for name, parent in rows if parent >= 0} | {
+        "Head": "Neck"
+    }
     pairs = []
     for place, name in enumerate(joint_names):
         parent = parents.get(name)
@@ -42,7 +48,10 @@ def vertex_normals(vertices: Real, faces: Whole) -> Array:
     a, b, c = (np.asarray(vertices, dtype=np.float64)[faces[:, m]] for m in range(3))
     normal = np.cross(b - a, c - a)
     total = np.stack(
-        [np.bincount(faces.ravel(), np.repeat(normal[:, axis], 3), minlength=len(vertices)) for axis in range(3)],
+        [
+            np.bincount(faces.ravel(), np.repeat(normal[:, axis], 3), minlength=len(vertices))
+            for axis in range(3)
+        ],
         axis=1,
     )
     return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)

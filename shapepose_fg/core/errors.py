@@ -13,7 +13,9 @@ number."""
 
 
 class InputError(ValueError):
-    """An input cannot be used; the message is one sentence, in one line, that names file, place and cure."""
+    """An input cannot be used; the message is one sentence, in one line, that names file, place and
+    cure.
+    """
 
     def __init__(self, message: str):
         line = " ".join(message.splitlines())
@@ -23,12 +25,22 @@ class InputError(ValueError):
 
 
 class NotDetermined(ValueError):
-    """A joint, or a body, cannot be determined; the message names person, frame, joint and what is missing."""
+    """A joint, or a body, cannot be determined; the message names person, frame, joint and what is
+    missing.
+    """
 
     def __init__(self, person: int, joint: str, frame: int, time_s: float, missing: str):
         when = f" ({time_s:.3f} s)" if time_s == time_s else ""
-        super().__init__(f"{joint} of person {person} in frame {frame}{when} is not determined: {missing}")
-        self.person, self.joint, self.frame, self.time_s, self.missing = person, joint, frame, time_s, missing
+        super().__init__(
+            f"{joint} of person {person} in frame {frame}{when} is not determined: {missing}"
+        )
+        self.person, self.joint, self.frame, self.time_s, self.missing = (
+            person,
+            joint,
+            frame,
+            time_s,
+            missing,
+        )
 
 
 class WorkLost(RuntimeError):
@@ -40,8 +52,11 @@ def failure(error: BaseException) -> str | None:
     process; None for other errors.
     """
     if isinstance(error, OSError):
-        return f"{f'{error.filename}: ' if error.filename is not None else ''}{error.strerror or error}"
-    if isinstance(error, MemoryError) or "allocate memory" in str(error):  # some libraries raise a RuntimeError
+        place = f"{error.filename}: " if error.filename is not None else ""
+        return f"{place}{error.strerror or error}"
+    if isinstance(error, MemoryError) or "allocate memory" in str(
+        error
+    ):  # some libraries raise a RuntimeError
         return "there is too little memory; close other programs, or give fewer --workers"
     return str(error) if isinstance(error, WorkLost) else None
 
@@ -65,4 +80,6 @@ def optional(module: str, extra: str) -> ModuleType:
         return import_module(module)
     except ImportError:
         package = module.partition(".")[0]
-        raise InputError(f'{package} is not installed; pip install "shapepose-fg[{extra}]"') from None
+        raise InputError(
+            f'{package} is not installed; pip install "shapepose-fg[{extra}]"'
+        ) from None

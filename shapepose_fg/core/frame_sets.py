@@ -47,7 +47,9 @@ class Moments:
     @property
     def synchronised(self) -> bool:
         """Whether all cameras took the pictures of a set at the same time."""
-        return self.time_s is None or bool(np.ptp(self.time_s, axis=1).max(initial=0.0) <= _MISFIT_S)
+        return self.time_s is None or bool(
+            np.ptp(self.time_s, axis=1).max(initial=0.0) <= _MISFIT_S
+        )
 
 
 def align(clocks: Sequence[CameraClock], has_clock: bool, cure: str = "check --start") -> Moments:
@@ -69,8 +71,8 @@ def align(clocks: Sequence[CameraClock], has_clock: bool, cure: str = "check --s
         late = max(clocks, key=lambda each: each.time[0])
         early, unit = min(clocks, key=lambda each: each.time[-1]), " s" if has_clock else ""
         raise InputError(
-            f"camera {early.name} ends at {early.time[-1]:.6g}{unit} and camera {late.name} starts at"
-            f" {late.time[0]:.6g}{unit}: they have no time in common; {cure}"
+            f"camera {early.name} ends at {early.time[-1]:.6g}{unit} and camera {late.name} "
+            f"starts at {late.time[0]:.6g}{unit}: they have no time in common; {cure}"
         )
     nearest = [_nearest(each, moment) for each in clocks]
     picture = np.column_stack([place for place, _ in nearest])
@@ -82,18 +84,21 @@ def align(clocks: Sequence[CameraClock], has_clock: bool, cure: str = "check --s
             notes.append(f"camera {each.name}: {what}, {left_out}")
         if len(missing) > 0:
             notes.append(
-                f"camera {each.name}: {len(missing)} of {len(moment)} synchronised frames have no picture"
-                f" within half a frame (the first is frame {missing[0]}); they are read as frames without"
-                " people"
+                f"camera {each.name}: {len(missing)} of {len(moment)} synchronised frames have "
+                f"no picture within half a frame (the first is frame {missing[0]}); they are "
+                "read as frames without people"
             )
         if has_clock and misfit.max(initial=0.0) > 1e3 * _MISFIT_S:
             notes.append(
-                f"camera {each.name}: pictures are up to {misfit.max():.1f} ms from the time of their"
-                f" synchronised frame ({misfit.mean():.1f} ms on average)"
+                f"camera {each.name}: pictures are up to {misfit.max():.1f} ms from the time of "
+                f"their synchronised frame ({misfit.mean():.1f} ms on average)"
             )
     time_s = None
     if has_clock:
-        taken = [np.where(picture[:, v] >= 0, each.time[picture[:, v]], moment) for v, each in enumerate(clocks)]
+        taken = [
+            np.where(picture[:, v] >= 0, each.time[picture[:, v]], moment)
+            for v, each in enumerate(clocks)
+        ]
         time_s = np.column_stack(taken)
     return Moments(picture, time_s, tuple(notes))
 
@@ -114,16 +119,21 @@ def own_frames(clocks: Sequence[CameraClock], has_clock: bool) -> Moments:
             place = _nearest(each, grid)[0]
         places.append(place)
     count = max(map(len, places))
-    picture = np.column_stack([np.pad(place, (0, count - len(place)), constant_values=-1) for place in places])
+    picture = np.column_stack(
+        [np.pad(place, (0, count - len(place)), constant_values=-1) for place in places]
+    )
     time_s = None
     if has_clock:
-        taken = [np.where(own >= 0, each.time[own], np.nan) for own, each in zip(picture.T, clocks, strict=True)]
+        taken = [
+            np.where(own >= 0, each.time[own], np.nan)
+            for own, each in zip(picture.T, clocks, strict=True)
+        ]
         time_s = np.column_stack(taken)
     least = min(map(len, places))
     notes = (
-        f"cameras have {least} to {count} frames; all frames are processed, with each camera's own numbers."
-        " Give start times with --start, or estimate them with `calibrate --times`, or with `synchronise`"
-        " if the poses are known",
+        f"cameras have {least} to {count} frames; all frames are processed, with each camera's "
+        "own numbers. Give start times with --start, or estimate them with `calibrate --times`, "
+        "or with `synchronise` if the poses are known",
     )
     return Moments(picture, time_s, notes if least < count else ())
 
@@ -146,8 +156,16 @@ def _nearest(clock: CameraClock, moment: Array) -> tuple[Index, Array]:
 
 
 def _left_out(clock: CameraClock, place: Index, moment: float) -> str:
-    """Text about the frames that a camera took before and after the sets, which are `moment` apart."""
+    """Text about the frames that a camera took before and after the sets, which are `moment`
+    apart.
+    """
     used = place[place >= 0]
-    ends = [(int(used[0]), "start"), (int(len(clock.time) - 1 - used[-1]), "end")] if len(used) > 0 else []
+    ends = (
+        [(int(used[0]), "start"), (int(len(clock.time) - 1 - used[-1]), "end")]
+        if len(used) > 0
+        else []
+    )
     # A faster camera always has frames between the sets.
-    return " and ".join(f"{n} at the {end}" for n, end in ends if n > 0 and n * clock.period >= 0.99 * moment)
+    return " and ".join(
+        f"{n} at the {end}" for n, end in ends if n > 0 and n * clock.period >= 0.99 * moment
+    )

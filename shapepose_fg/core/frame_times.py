@@ -25,7 +25,9 @@ def exact_rate(rate: float, apart: float) -> float:
     whole, ntsc = Fraction(round(rate)), Fraction(1000 * round(1.001 * rate), 1001)
     nearest = min(whole, ntsc, key=lambda each: abs(each - Fraction(rate)))
     usual = (nearest, Fraction(rate).limit_denominator(10))
-    return next((float(each) for each in usual if each > 0 and abs(float(each) - rate) <= apart), rate)
+    return next(
+        (float(each) for each in usual if each > 0 and abs(float(each) - rate) <= apart), rate
+    )
 
 
 def typed_rate(fps: float) -> float:
@@ -53,12 +55,15 @@ def rate_of(time_s: Array) -> float:
 
 
 LEAST_STEP_S = 1e-5
-"""Shortest time between two frames, s: over shorter times the motion model is numerically singular."""
+"""Shortest time between two frames, s: over shorter times the motion model is numerically
+singular."""
 
 
 @dataclass(frozen=True)
 class FrameTimes:
-    """The times of T frames; frames are numbered from 0 in the file, as in `Reconstruction.frame`."""
+    """The times of T frames; frames are numbered from 0 in the file, as in
+    `Reconstruction.frame`.
+    """
 
     time_s: Array
     """(T,) seconds; or (T, V), a column for each camera, if they are not synchronised."""
@@ -80,8 +85,8 @@ class FrameTimes:
         rising = np.append(True, (np.diff(columns, axis=0) > LEAST_STEP_S).all(axis=1))
         if not rising.all():
             raise ValueError(
-                f"time_s must increase by more than {LEAST_STEP_S:g} s from frame to frame, but does not at"
-                f" frame {np.argmin(rising)}"
+                f"time_s must increase by more than {LEAST_STEP_S:g} s from frame to frame, but "
+                f"does not at frame {np.argmin(rising)}"
             )
 
     def __len__(self) -> int:
@@ -109,7 +114,9 @@ class FrameTimes:
 
     def of_views(self, views: int) -> Array:
         """(T, V) the time of each frame in each of `views` cameras."""
-        return self.time_s if self.time_s.ndim == 2 else np.repeat(self.time_s[:, None], views, axis=1)
+        return (
+            self.time_s if self.time_s.ndim == 2 else np.repeat(self.time_s[:, None], views, axis=1)
+        )
 
     def check(self, frames: int, views: int) -> None:
         """ValueError if the shape is not that of a recording of `frames` frames and `views`
@@ -118,7 +125,9 @@ class FrameTimes:
         if len(self) != frames:
             raise ValueError(f"times are needed for each of the {frames} frames, got {len(self)}")
         if self.time_s.ndim == 2 and self.time_s.shape[1] != views:
-            raise ValueError(f"times need a column for each of the {views} cameras, got {self.time_s.shape[1]}")
+            raise ValueError(
+                f"times need a column for each of the {views} cameras, got {self.time_s.shape[1]}"
+            )
 
     def as_dict(self) -> dict[str, Any]:
         """The entry of run.json about times: their source, and the rate."""
@@ -143,7 +152,9 @@ def check_cuts(cuts: Sequence[int], frames: int) -> tuple[int, ...]:
     numbers = np.asarray(cuts)
     whole = numbers.ndim == 1 and (numbers.size == 0 or numbers.dtype.kind in "iu")
     if not whole or (np.diff(numbers) <= 0).any() or ((numbers < 1) | (numbers >= frames)).any():
-        raise ValueError(f"cuts must be increasing frame numbers between 1 and {frames - 1}, got {list(cuts)}")
+        raise ValueError(
+            f"cuts must be increasing frame numbers between 1 and {frames - 1}, got {list(cuts)}"
+        )
     return tuple(int(cut) for cut in numbers)
 
 
@@ -157,5 +168,9 @@ def segments(frames: range, cuts: Sequence[int]) -> list[range]:
 def spans_of(frames: Iterable[int]) -> list[range]:
     """Group frame numbers into ranges of consecutive ones."""
     ordered = sorted(set(frames))
-    edges = [0, *(at for at in range(1, len(ordered)) if ordered[at] != ordered[at - 1] + 1), len(ordered)]
+    edges = [
+        0,
+        *(at for at in range(1, len(ordered)) if ordered[at] != ordered[at - 1] + 1),
+        len(ordered),
+    ]
     return [range(ordered[a], ordered[b - 1] + 1) for a, b in pairwise(edges) if b > a]

@@ -12,7 +12,10 @@ _ALIASES = {
     "COCO_17": "coco coco17 cocokeypoints person body ochuman humanart body17 yolo yolopose",
     "COCO_18": "coco coco18 openposecoco cocoopenpose",
     "COCO_23": "coco23 cocofoot",
-    "COCO_133": "coco133 coco133wrist cocowholebody wholebody wholebodywrist ubody ubody2d ubody3d h3wb halpe",
+    "COCO_133": (
+        "coco133 coco133wrist cocowholebody wholebody wholebodywrist ubody ubody2d ubody3d h3wb "
+        "halpe"
+    ),
     "HALPE_26": "halpe halpe26 bodywithfeet body26",
     "HALPE_68": "halpe halpe68 halpe68noface",
     "HALPE_136": "halpe halpe136",
@@ -27,8 +30,8 @@ _ALIASES = {
     "LSP_14": "lsp lsp14 lspet",
     "BLAZEPOSE_33": "blazepose mediapipe mediapipepose blazepose33",
 }
-"""Names of each layout in other programs, without case and separators. OpenPose's and Pose2Sim's COCO and MPII
-are not COCO's and MMPose's: the number of keypoints distinguishes them."""
+"""Names of each layout in other programs, without case and separators. OpenPose's and Pose2Sim's
+COCO and MPII are not COCO's and MMPose's: the number of keypoints distinguishes them."""
 
 
 def layouts_called(name: str) -> list[Skeleton]:
@@ -79,7 +82,19 @@ _BONES = {
     **dict.fromkeys(("forearm", "lowerarm"), "Elbow"),
 }
 """Joints named after the bone that starts there, as by Apple and Mixamo."""
-_LEFT_OUT = {"mid", "middle", "center", "centre", "joint", "jc", "c", "of", "the", "keypoint", "landmark"}
+_LEFT_OUT = {
+    "mid",
+    "middle",
+    "center",
+    "centre",
+    "joint",
+    "jc",
+    "c",
+    "of",
+    "the",
+    "keypoint",
+    "landmark",
+}
 """Words that are ignored in names; a joint without a side is on the midline."""
 _SIDES = {"l": "L", "left": "L", "r": "R", "right": "R"}
 
@@ -96,10 +111,15 @@ def _side_and_part(words: Sequence[str]) -> tuple[str, str]:
     words = [word for word in words if word not in _LEFT_OUT]
     sides = [word for word in words if word in _SIDES]
     if len(sides) == 1:
-        return _SIDES[sides[0]], "".join(word for word in words if word not in _SIDES and word != "1")
+        return _SIDES[sides[0]], "".join(
+            word for word in words if word not in _SIDES and word != "1"
+        )
     plain = "".join(words)
     for side in ("left", "right", "l", "r"):  # as in lshoulder, shoulderleft
-        for rest in (plain.removeprefix(side), plain.removesuffix(side) if len(side) > 1 else plain):
+        for rest in (
+            plain.removeprefix(side),
+            plain.removesuffix(side) if len(side) > 1 else plain,
+        ):
             if rest != plain and rest in _PART_OF_SIDE:
                 return _SIDES[side], rest
     return "", plain
@@ -117,11 +137,17 @@ def body_points(names: Sequence[str]) -> list[str]:
     while len(every) > 1 and min(map(len, every)) > 1 and len({words[0] for words in every}) == 1:
         if every[0][0] in _SIDES:
             break
-        every = [words[1:] for words in every]  # a prefix of all names is the name of the person or model
+        every = [
+            words[1:] for words in every
+        ]  # a prefix of all names is the name of the person or model
     split = [_side_and_part(words) for words in every]
     parts = {part for _, part in split}
     middle = {word: part for part, words in _MIDDLE.items() for word in words.split()}
-    if parts & {"thorax", "sternum", "spineshoulder"}:  # in Human3.6M and MPII, "neck" is its upper end
+    if parts & {
+        "thorax",
+        "sternum",
+        "spineshoulder",
+    }:  # in Human3.6M and MPII, "neck" is its upper end
         middle |= {"neckbase": "head", "neck": "neck"}
     else:
         middle |= {"neckbase": "Neck"}
@@ -131,7 +157,9 @@ def body_points(names: Sequence[str]) -> list[str]:
     sided |= {} if parts & {"ankle", "ank"} else {"foot": "Ankle"}
     sided |= {} if parts & {"wrist", "wri"} else {"hand": "Wrist"}
     sided |= _BONES if parts & {"upleg", "thigh", "upperleg"} else {}
-    sided |= {"shoulder": "collar"} if parts & {"upleg", "thigh"} and parts & {"arm", "upperarm"} else {}
+    sided |= (
+        {"shoulder": "collar"} if parts & {"upleg", "thigh"} and parts & {"arm", "upperarm"} else {}
+    )
     found, used = list[str](), set[str]()
     own = {"Head", "head"} <= set(names)  # our own names "Head" and "head" differ only in case
     for name, (side, part) in zip(names, split, strict=True):

@@ -37,7 +37,8 @@ processes."""
 _SPACE = 50_000_000
 """Minimum free space on the disk, bytes: ten times the size of all kernels."""
 _VERSIONS = 16
-"""Maximum number of cached folders per module: for several checkouts, Python versions, processors."""
+"""Maximum number of cached folders per module: for several checkouts, Python versions,
+processors."""
 
 
 def wanted_folder() -> Path:
@@ -60,7 +61,9 @@ def kept_folder() -> Path | None:
         return wanted
     try:
         temporary, owner = Path(tempfile.mkdtemp(prefix="shapepose-fg-kernels-")), os.getpid()
-        atexit.register(lambda: os.getpid() != owner or shutil.rmtree(temporary, ignore_errors=True))
+        atexit.register(
+            lambda: os.getpid() != owner or shutil.rmtree(temporary, ignore_errors=True)
+        )
         if _can_keep(temporary):
             os.environ[_GIVEN] = str(temporary)
             return temporary
@@ -80,7 +83,9 @@ def _can_keep(place: Path) -> bool:
 
 @cache
 def module_folder(module: str) -> Path | None:
-    """The folder of a module's kernels, with a copy of its source; None if nothing can be written."""
+    """The folder of a module's kernels, with a copy of its source; None if nothing can be
+    written.
+    """
     place, source = kept_folder(), Path(sys.modules[module].__file__ or "")
     if place is None:
         return None
@@ -94,7 +99,9 @@ def module_folder(module: str) -> Path | None:
         else:
             fresh.mkdir()
             (fresh / source.name).write_bytes(source.read_bytes())
-            os.utime(fresh / source.name, (0, 0))  # older versions of Numba check the time, not the content
+            os.utime(
+                fresh / source.name, (0, 0)
+            )  # older versions of Numba check the time, not the content
         if not folder.exists():
             fresh.rename(folder)
         _remove_old(place, module)
@@ -115,7 +122,9 @@ def kept_in(folder: Path, function: Any, njit: Callable[[Any], Any]) -> Any:
     """Apply `njit` to a copy of `function` from the source file in `folder`, next to which Numba's
     cache then is.
     """
-    code = function.__code__.replace(co_filename=str(folder / Path(function.__code__.co_filename).name))
+    code = function.__code__.replace(
+        co_filename=str(folder / Path(function.__code__.co_filename).name)
+    )
     copy = FunctionType(code, function.__globals__, function.__name__, function.__defaults__)
     copy.__qualname__ = function.__qualname__
     given, NUMBA.CACHE_DIR = NUMBA.CACHE_DIR, ""
@@ -132,7 +141,10 @@ def _digest(module: str) -> str:
     """
     given = NUMBA.CPU_FEATURES
     features = get_host_cpu_features().flatten() if given is None else given
-    options = sorted(f"{name}={sorted(each) if isinstance(each, set) else each}" for name, each in OPTIONS.items())
+    options = sorted(
+        f"{name}={sorted(each) if isinstance(each, set) else each}"
+        for name, each in OPTIONS.items()
+    )
     host = (
         options,
         numba.__version__,

@@ -44,7 +44,10 @@ def add_view(camera, u, v, depth, to_u, to_v, weight, information, gradient):
     (u, v) by the point, and r = (to_u, to_v).
     """
     for a in range(3):
-        ua, va = (camera[0, a] - u * camera[2, a]) / depth, (camera[1, a] - v * camera[2, a]) / depth
+        ua, va = (
+            (camera[0, a] - u * camera[2, a]) / depth,
+            (camera[1, a] - v * camera[2, a]) / depth,
+        )
         gradient[a] += weight * (ua * to_u + va * to_v)
         for b in range(3):
             ub, vb = camera[0, b] - u * camera[2, b], camera[1, b] - v * camera[2, b]
@@ -79,7 +82,9 @@ def triangulated(cameras, focal, uv, sure, scale_m, reach_m, least_depth, weight
         for v in range(len(sure)):
             if sure[v] > 0:
                 u_, v_, depth = project(cameras[v], x)
-                off_m = math.sqrt((u_ - uv[v, 0]) ** 2 + (v_ - uv[v, 1]) ** 2) * abs(depth) / focal[v]
+                off_m = (
+                    math.sqrt((u_ - uv[v, 0]) ** 2 + (v_ - uv[v, 1]) ** 2) * abs(depth) / focal[v]
+                )
                 weight[v] = sure[v] / (1.0 + (off_m / scale_m) ** 2) / max(depth, least_depth) ** 2
                 if off_m < reach_m and depth > least_depth:
                     agree += 1

@@ -9,7 +9,8 @@ import numpy as np
 from shapepose_fg.core.arrays import Array
 
 Lens = Literal["perspective", "fisheye"]
-"""OpenCV's two families of lenses: Brown's model with its rational extension, and the equidistant fisheye."""
+"""OpenCV's two families of lenses: Brown's model with its rational extension, and the equidistant
+fisheye."""
 COEFFICIENTS: dict[str, tuple[int, ...]] = {"perspective": (5, 8, 12, 14), "fisheye": (4,)}
 """Numbers of coefficients that OpenCV's functions accept, for each kind of lens."""
 _UNDONE_PX = 0.5

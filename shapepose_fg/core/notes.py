@@ -1,4 +1,6 @@
-"""Notes of a run for run.json, window by window: times, evidence, dropped people, unsolved joints."""
+"""Notes of a run for run.json, window by window: times, evidence, dropped people, unsolved
+joints.
+"""
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -88,7 +90,9 @@ class Notes:
             return TypeAdapter(cls).validate_python(values)
         except ValidationError as error:
             problem = error.errors(include_url=False)[0]
-            raise ValueError(f"notes: {'.'.join(map(str, problem['loc']))}: {problem['msg']}") from None
+            raise ValueError(
+                f"notes: {'.'.join(map(str, problem['loc']))}: {problem['msg']}"
+            ) from None
 
 
 class Notebook:
@@ -110,7 +114,9 @@ class Notebook:
         """Note that some detections, points or candidates of a frame were left out because there
         were too many.
         """
-        frame = next((each for each in (frame, self._frame, self._searched) if each is not None), None)
+        frame = next(
+            (each for each in (frame, self._frame, self._searched) if each is not None), None
+        )
         if is_thinned and frame is not None:
             noted = self._notes.thinned_frames.setdefault(what, [])
             noted += [frame] if frame not in noted[-1:] else []

@@ -40,7 +40,9 @@ class Gate(IntEnum):
 
 @dataclass(frozen=True)
 class ObservationTable(Table):
-    """The detections of N rows (person and frame), J joints and V views; row i is row i of people.npz."""
+    """The detections of N rows (person and frame), J joints and V views; row i is row i of
+    people.npz.
+    """
 
     frame: Annotated[Whole, Column("N", np.int64)]
     """(N,) frame of each row."""
@@ -65,9 +67,12 @@ class ObservationTable(Table):
     """(N, J, V) probability that the detection belongs to this person; 0 if there is none, 1 in
     files without this column."""
     lead_s: Annotated[NDArray[np.float32], Column("N V", np.float32, "s", missing=0.0)] = None  # type: ignore[assignment]
-    """(N, V) time at which each view was exposed minus the row's time, seconds; 0 in older files."""
+    """(N, V) time at which each view was exposed minus the row's time, seconds; 0 in older
+    files."""
 
-    ROWS: ClassVar = "frame person candidate xy confidence residual_px gate probability lead_s".split()
+    ROWS: ClassVar = (
+        "frame person candidate xy confidence residual_px gate probability lead_s".split()
+    )
 
     def __post_init__(self) -> None:
         """Check shapes, types and ranges of values, and that the columns agree on which detections
@@ -151,9 +156,13 @@ class ObservationTable(Table):
         )
 
     @classmethod
-    def empty(cls, joint_names: Sequence[str] = BODY_25.joints, view_names: Sequence[str] = ()) -> Self:
+    def empty(
+        cls, joint_names: Sequence[str] = BODY_25.joints, view_names: Sequence[str] = ()
+    ) -> Self:
         """The table of a result without rows."""
-        return cls.without_rows(joint_names=np.array(joint_names, str), view_names=np.array(view_names, str))
+        return cls.without_rows(
+            joint_names=np.array(joint_names, str), view_names=np.array(view_names, str)
+        )
 
     @classmethod
     def concatenate(cls, parts: Sequence[Self]) -> Self:
@@ -180,9 +189,12 @@ class ObservationTable(Table):
 
     def unseen(self, frame: Whole) -> "ObservationTable":
         """Rows of the same people, without detections, in other frames: `frame` (N,)."""
-        nothing = {name: np.full_like(getattr(self, name), np.nan) for name in ("xy", "residual_px")}
+        nothing = {
+            name: np.full_like(getattr(self, name), np.nan) for name in ("xy", "residual_px")
+        }
         nothing |= {
-            name: np.zeros_like(getattr(self, name)) for name in "confidence gate probability lead_s".split()
+            name: np.zeros_like(getattr(self, name))
+            for name in "confidence gate probability lead_s".split()
         }
         return replace(self, **nothing, frame=frame, candidate=np.full_like(self.candidate, -1))
 

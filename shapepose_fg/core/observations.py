@@ -1,4 +1,6 @@
-"""Detections assigned to people: the output of stage I and of the tracker, and the input of stage II."""
+"""Detections assigned to people: the output of stage I and of the tracker, and the input of stage
+II.
+"""
 
 from dataclasses import dataclass
 from typing import Annotated, Any
@@ -39,8 +41,8 @@ class Observations(Table):
     """(N, J, V) probability that the observation belongs to the other side of the body; 0 by
     default."""
     evidence: Annotated[Array, Column("N", missing=np.nan)] = _LATER
-    """(N,) evidence for the existence of the person: `own_evidence` of `tracking/track_selection.py`, or a
-    probability for frame-by-frame results; NaN by default."""
+    """(N,) evidence for the existence of the person: `own_evidence` of
+    `tracking/track_selection.py`, or a probability for frame-by-frame results; NaN by default."""
 
     def __post_init__(self) -> None:
         if self.track is None:
@@ -48,13 +50,22 @@ class Observations(Table):
         super().__post_init__()
 
     @classmethod
-    def of(cls, candidate: Index, detections: Detections, initial: Array, **others: Any) -> "Observations":
+    def of(
+        cls, candidate: Index, detections: Detections, initial: Array, **others: Any
+    ) -> "Observations":
         """Make observations from the detections `candidate` (N, J, V) of one frame, -1 for none;
         `others` are further columns.
         """
         seen = candidate >= 0
-        xy, confidence, mirrored = np.zeros((*seen.shape, 2)), np.zeros(seen.shape), np.zeros(seen.shape)
-        xy[seen], confidence[seen] = detections.xy[candidate[seen]], detections.confidence[candidate[seen]]
+        xy, confidence, mirrored = (
+            np.zeros((*seen.shape, 2)),
+            np.zeros(seen.shape),
+            np.zeros(seen.shape),
+        )
+        xy[seen], confidence[seen] = (
+            detections.xy[candidate[seen]],
+            detections.confidence[candidate[seen]],
+        )
         mirrored[seen] = detections.mirrored[candidate[seen]]
         return cls(xy, confidence, initial, candidate=candidate, mirrored=mirrored, **others)
 

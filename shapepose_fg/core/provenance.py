@@ -66,7 +66,9 @@ class ReadInputs:
         found = checksums(inputs)
         for file, state in _states(inputs):
             if self._before.get(file) != state:
-                raise InputError(f"{file}: this file changed while it was read; start again when it is complete")
+                raise InputError(
+                    f"{file}: this file changed while it was read; start again when it is complete"
+                )
         return found
 
 
@@ -95,7 +97,9 @@ def _digest(path: Path, endings: tuple[str, ...]) -> str:
         if path.is_dir():
             whole = hashlib.sha256()
             for file in sorted(files_below(path, endings)):
-                whole.update(f"{file.relative_to(path).as_posix()} {_digest(file, endings)}\n".encode())
+                whole.update(
+                    f"{file.relative_to(path).as_posix()} {_digest(file, endings)}\n".encode()
+                )
             return whole.hexdigest()
         with open_regular(path) as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -15,7 +15,15 @@ from shapepose_fg.core.arrays import Array, Mask, Whole
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.observation_table import ObservationTable
-from shapepose_fg.core.result_files import OBSERVATIONS, PEOPLE, RUN, RUN_ID, SavedTable, check_id, write_result
+from shapepose_fg.core.result_files import (
+    OBSERVATIONS,
+    PEOPLE,
+    RUN,
+    RUN_ID,
+    SavedTable,
+    check_id,
+    write_result,
+)
 from shapepose_fg.core.rig_file import CAMERAS, is_replaceable, write_rig
 from shapepose_fg.core.run_summary import check_run, merged_run
 from shapepose_fg.core.shapes import SubjectShapes
@@ -53,7 +61,8 @@ class Known(IntEnum):
     BODY = 2
     """Without a detection in this frame: inferred from the body, which other joints determine."""
     MOTION = 3
-    """Without a detection and without a body: interpolated by the motion model from other frames."""
+    """Without a detection and without a body: interpolated by the motion model from other
+    frames."""
     WEAK = 4
     """Fewer than two such views: a joint that only one view detected, or detections with a low
     probability. Body and motion model contribute considerably to its position."""
@@ -104,16 +113,22 @@ class Reconstruction(Table):
     """(N,) time of the row's frame, seconds; NaN if unknown (the default)."""
     velocity: Annotated[Array, Column("N J 3", unit="m/s", most=1e9, missing=np.nan)] = _LATER
     """(N, J, 3) velocity of each joint in the world, m/s; NaN if unknown (the default)."""
-    velocity_covariance: Annotated[Array, Column("N J 3 3", unit="(m/s)²", most=1e18, missing=np.nan)] = _LATER
+    velocity_covariance: Annotated[
+        Array, Column("N J 3 3", unit="(m/s)²", most=1e18, missing=np.nan)
+    ] = _LATER
     """(N, J, 3, 3) covariance of each joint's velocity, (m/s)²; NaN if unknown (the default)."""
-    known: Annotated[NDArray[np.uint8], Column("N J", np.uint8, missing=Known.UNKNOWN, codes=Known)] = _LATER
+    known: Annotated[
+        NDArray[np.uint8], Column("N J", np.uint8, missing=Known.UNKNOWN, codes=Known)
+    ] = _LATER
     """(N, J) how each joint is known: codes of `Known`; `UNKNOWN` by default."""
     run: dict[str, Any] = field(default_factory=dict)
     """Origin of the result: configuration, versions, checksums, times (stored in run.json)."""
     observations: ObservationTable | None = None
-    """Detections that each row was solved from (stored in observations.npz); None if not recorded."""
+    """Detections that each row was solved from (stored in observations.npz); None if not
+    recorded."""
     shapes: SubjectShapes | None = None
-    """Body shape and covariance of each identity, named by its number; `save` does not write them."""
+    """Body shape and covariance of each identity, named by its number; `save` does not write
+    them."""
     rig: Rig | None = None
     """The cameras with which it was solved, set by `reconstruct`; None if unknown. `load` does not
     read them (`read_rig(folder / "cameras.json")`)."""
@@ -132,7 +147,9 @@ class Reconstruction(Table):
             raise ValueError(f"status must be one of {[*map(str, Status)]}, got {sorted(unknown)}")
         for name in ("frame", "person", "joint_names") if self.observations is not None else ():
             if not np.array_equal(getattr(self.observations, name), getattr(self, name)):
-                raise ValueError(f"observations must have the same {name} as the people (see `relabelled`)")
+                raise ValueError(
+                    f"observations must have the same {name} as the people (see `relabelled`)"
+                )
 
     @classmethod
     def empty(cls, joint_names: Sequence[str] = BODY_25.joints) -> Self:
@@ -155,7 +172,9 @@ class Reconstruction(Table):
         # A part without rows and without a run does not affect the merged run.
         runs = [part.run for part in parts if len(part) > 0 or len(part.run) > 0]
         rig = parts[0].rig if all(part.rig is parts[0].rig for part in parts) else None
-        return super().concatenate(parts, observations=together, shapes=None, rig=rig, run=merged_run(runs))
+        return super().concatenate(
+            parts, observations=together, shapes=None, rig=rig, run=merged_run(runs)
+        )
 
     def rows(self, index: NDArray) -> "Reconstruction":
         """The rows selected by `index`: a mask (N,) or row numbers."""
@@ -177,7 +196,8 @@ class Reconstruction(Table):
         ):
             if wrong.any():
                 raise ValueError(
-                    f"{name} must be numbers where joints are known, but are not in row {wrong.argmax()}"
+                    f"{name} must be numbers where joints are known, but are not in row "
+                    f"{wrong.argmax()}"
                 )
 
     def at(self, frame: int) -> "Reconstruction":
@@ -214,12 +234,15 @@ class Reconstruction(Table):
         if rig is not None and self.observations is not None:
             names = tuple(self.observations.view_names.tolist())
             if names != rig.names:
-                raise ValueError(f"rig must have the cameras of the observations, {names}, got {rig.names}")
+                raise ValueError(
+                    f"rig must have the cameras of the observations, {names}, got {rig.names}"
+                )
         observations = None if self.observations is None else self.observations.columns()
         cameras = Path(folder) / CAMERAS
         if rig is not None and not is_replaceable(cameras):
             raise InputError(
-                f"{cameras}: this is not the rig file of a result and would be overwritten; give another folder"
+                f"{cameras}: this is not the rig file of a result and would be overwritten; give "
+                "another folder"
             )
         write_result(Path(folder), self.columns(), observations, self.run, check_files)
         if rig is not None:
@@ -265,7 +288,9 @@ class OpenedReconstruction(ExitStack):
             self.run = _read_run(file.with_name(RUN), self._people.run_id)
             """Content of run.json."""
             if table.is_file():
-                self._observed = self.enter_context(ObservationTable.open(table, self._people.run_id))
+                self._observed = self.enter_context(
+                    ObservationTable.open(table, self._people.run_id)
+                )
         except InputError:
             self.close()
             raise
@@ -291,7 +316,9 @@ class OpenedReconstruction(ExitStack):
 
     def people(self, numbers: Iterable[int], *, observations: bool = True) -> Reconstruction:
         """All rows of the people with these `numbers`; see `rows`."""
-        return self.rows(np.flatnonzero(np.isin(self.person, list(numbers))), observations=observations)
+        return self.rows(
+            np.flatnonzero(np.isin(self.person, list(numbers))), observations=observations
+        )
 
     def thinned(self, most_rows: int) -> tuple[Reconstruction, int]:
         """Every n-th frame, with n so large that there are at most `most_rows` rows; and n."""
@@ -350,7 +377,9 @@ def _read_run(file: Path, people_id: object) -> dict[str, Any]:
 
 def with_body(*columns: Array) -> Mask:
     """(N,) which rows have a body: all values of the `BODY` columns, each (N, ...), are known."""
-    return np.logical_and.reduce([np.isfinite(each).all(axis=tuple(range(1, each.ndim))) for each in columns])
+    return np.logical_and.reduce(
+        [np.isfinite(each).all(axis=tuple(range(1, each.ndim))) for each in columns]
+    )
 
 
 _BLOCK = 128

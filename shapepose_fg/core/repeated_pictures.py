@@ -11,7 +11,8 @@ from shapepose_fg.core.detections import DerivedFrames, Detections
 from shapepose_fg.core.trust import Trust, trust_in
 
 _LEAST = 4
-"""Minimum number of equal detections of two pictures: a few may be of something that does not move."""
+"""Minimum number of equal detections of two pictures: a few may be of something that does not
+move."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +27,9 @@ class WithoutRepeats(DerivedFrames):
 
     views: int
     """V, the number of cameras."""
-    _read: dict[int, tuple[Detections, Mask]] = field(default_factory=dict, init=False, repr=False, compare=False)
+    _read: dict[int, tuple[Detections, Mask]] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
     """The most recently read frames, by number: all detections, and which views (V,) repeat their
     picture."""
 
@@ -68,6 +71,10 @@ def repeated_views(before: Detections, now: Detections, views: int) -> Mask:
         return alike
     one, other = (each.only(alike[each.view]) for each in (before, now))
     one, other = (each.rows(np.argsort(each.view, kind="stable")) for each in (one, other))
-    same = (one.joint == other.joint) & (one.xy == other.xy).all(axis=1) & (one.confidence == other.confidence)
+    same = (
+        (one.joint == other.joint)
+        & (one.xy == other.xy).all(axis=1)
+        & (one.confidence == other.confidence)
+    )
     alike[other.view[~same]] = False
     return alike & bool((there[~alike] > 0).any())

@@ -49,7 +49,9 @@ def set_aside(folder: Path) -> list[str]:
     told = []
     for made in (folder / name for name in ("export", "overlay")):
         if made.is_dir():
-            names = (made.with_name(f"{made.name}-older{number}") for number in chain([""], count(2)))
+            names = (
+                made.with_name(f"{made.name}-older{number}") for number in chain([""], count(2))
+            )
             made.rename(free := next(path for path in names if not path.exists()))
             told.append(f"{made} belongs to the previous result; it was renamed to {free.name}")
     return told
@@ -77,12 +79,16 @@ def write_result(
         return digest.hexdigest()[:_DIGITS]
 
     def run_text() -> str:
-        return json.dumps({RUN_ID: id_text(), **run}, indent=2, allow_nan=False, default=plain) + "\n"
+        return (
+            json.dumps({RUN_ID: id_text(), **run}, indent=2, allow_nan=False, default=plain) + "\n"
+        )
 
     def write_people(stream: BinaryIO) -> None:
         # The id is read after all columns before it have been written.
         last = {RUN_ID: Pieces(np.dtype(f"U{_DIGITS}"), (), lambda: (np.array(id_text()),))}
-        write_npz(stream, {name: _told(name, each, digest.update) for name, each in people.items()} | last)
+        write_npz(
+            stream, {name: _told(name, each, digest.update) for name, each in people.items()} | last
+        )
 
     def write_observations(stream: BinaryIO) -> None:
         write_npz(stream, {**(observations or {}), RUN_ID: np.array(id_text())})
@@ -102,7 +108,9 @@ def write_result(
                 message = message.replace(str(temporary), str(path))
             raise InputError(message) from None
 
-    write_together({**files, folder / RUN: lambda stream: stream.write(run_text().encode())}, checked)
+    write_together(
+        {**files, folder / RUN: lambda stream: stream.write(run_text().encode())}, checked
+    )
     if observations is None:
         (folder / OBSERVATIONS).unlink(missing_ok=True)
 
@@ -116,9 +124,9 @@ def check_id(people_id: object, other_id: object, file: Path) -> None:
     if people_id is None or other_id is None or str(people_id) == str(other_id):
         return
     raise InputError(
-        f"{file}: this file is of another run than the {PEOPLE} beside it, perhaps because a run was killed"
-        " while it wrote its results; start that run again with --resume, or put the files of one run"
-        " together"
+        f"{file}: this file is of another run than the {PEOPLE} beside it, perhaps because a run "
+        "was killed while it wrote its results; start that run again with --resume, or put the "
+        "files of one run together"
     )
 
 
@@ -171,8 +179,8 @@ class SavedTable(ExitStack, Generic[T]):
             for name in self._rows:
                 if self._npz.shape(name)[:1] != (self.count,):
                     raise InputError(
-                        f"{file}: {name} must have an entry for each row, as many as {self._rows[0]}, got the"
-                        f" shape {self._npz.shape(name)}; {cure}"
+                        f"{file}: {name} must have an entry for each row, as many as "
+                        f"{self._rows[0]}, got the shape {self._npz.shape(name)}; {cure}"
                     )
             self._shared = {name: self._npz.array(name) for name in kind.shared()}
         except InputError:
@@ -181,7 +189,9 @@ class SavedTable(ExitStack, Generic[T]):
 
     def column(self, name: str) -> NDArray[Any]:
         """A whole column, checked. Rows are selected by it before other columns are read."""
-        if name not in self._rows:  # a column shared by all rows, or one missing in files of earlier versions
+        if (
+            name not in self._rows
+        ):  # a column shared by all rows, or one missing in files of earlier versions
             return self._shared[name] if name in self._shared else getattr(self.read(None), name)
         with naming(self.file, self.cure):
             column = self._columns[name].checked(name, self._npz.array(name), {"N": self.count})
@@ -194,7 +204,9 @@ class SavedTable(ExitStack, Generic[T]):
         """
         count = self.count if index is None else len(index)
         needed = 2 * count * sum(map(self._npz.row_bytes, self._rows))  # twice, for working copies
-        check_memory(f"{self.file}: {count} rows", needed, "--frames, --person, or Reconstruction.open")
+        check_memory(
+            f"{self.file}: {count} rows", needed, "--frames, --person, or Reconstruction.open"
+        )
         read = self._npz.array if index is None else lambda name: self._npz.rows(name, index)
         with naming(self.file, self.cure):
             table = self.kind(**{name: read(name) for name in self._rows}, **self._shared)

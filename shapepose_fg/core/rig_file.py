@@ -60,7 +60,8 @@ def write_rig(rig: Rig, path: str | Path) -> None:
     content = {"format": RIG_FORMAT, "unit": "m", "up": rig.up, "cameras": cameras}
     if rig.moves:
         content["trajectories"] = {
-            files[each.name]: {"drift": each.drift, "refined": each.refined} for each in rig.trajectories
+            files[each.name]: {"drift": each.drift, "refined": each.refined}
+            for each in rig.trajectories
         }
         (Path(path).parent / "trajectories").mkdir(parents=True, exist_ok=True)
         for each in rig.trajectories:
@@ -84,6 +85,9 @@ def write_trajectory(trajectory: Trajectory, path: Path) -> None:
     header = list(POSE)
     if trajectory.covariance is not None:
         row, column = np.triu_indices(6)
-        numbers, header = np.column_stack([numbers, trajectory.covariance[:, row, column]]), [*POSE, *COVARIANCE]
+        numbers, header = (
+            np.column_stack([numbers, trajectory.covariance[:, row, column]]),
+            [*POSE, *COVARIANCE],
+        )
     text = "".join(",".join(map(repr, row)) + "\n" for row in numbers.tolist())
     write_content(path, ",".join(header) + "\n" + text)

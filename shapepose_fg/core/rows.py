@@ -36,7 +36,9 @@ class Rows:
 
     def with_rows(self, index: Any, other: Self) -> Self:
         """Return a copy in which the rows `index` (R,) are those of `other`."""
-        changed = replace(cast(Any, self), **{name: value.copy() for name, value in self._columns().items()})
+        changed = replace(
+            cast(Any, self), **{name: value.copy() for name, value in self._columns().items()}
+        )
         changed.put(index, other)
         return changed
 

@@ -33,13 +33,15 @@ def merged_run(runs: Sequence[Run]) -> Run:
         found = difference(settings[0], other)
         if found is not None:
             raise ValueError(
-                f"parts must have the same configuration, but {found[0]} differs; reconstruct them with the"
-                " same configuration"
+                f"parts must have the same configuration, but {found[0]} differs; reconstruct "
+                "them with the same configuration"
             )
     inputs: Run = {}
     for file, digest in (pair for run in runs for pair in run.get("inputs", {}).items()):
         if inputs.setdefault(file, digest) != digest:
-            raise ValueError(f"parts must be made from the same inputs, but {file} changed between two of them")
+            raise ValueError(
+                f"parts must be made from the same inputs, but {file} changed between two of them"
+            )
     together: Run = {"inputs": inputs} if inputs else {}
     if settings:
         together["configuration"] = settings[0]
@@ -47,9 +49,14 @@ def merged_run(runs: Sequence[Run]) -> Run:
     if all(each is not None for each in spans):
         together["frames"] = _joined([span for each in spans for span in each or []])
     for key in dict.fromkeys(key for run in runs for key in run):
-        if key not in (*together, "frames") and all(_same(run.get(key), runs[0].get(key)) for run in runs):
+        if key not in (*together, "frames") and all(
+            _same(run.get(key), runs[0].get(key)) for run in runs
+        ):
             together[key] = runs[0][key]
-    own = [{key: value for key, value in run.items() if key not in together or key == "frames"} for run in runs]
+    own = [
+        {key: value for key, value in run.items() if key not in together or key == "frames"}
+        for run in runs
+    ]
     return together | ({"parts": own} if any(each.keys() - {"frames"} for each in own) else {})
 
 
@@ -65,7 +72,13 @@ def _joined(spans: Sequence[range]) -> list[Any]:
             found[-1][1] = span.stop
         else:
             found.append([span.start, span.stop])
-    return [spans[0].start, spans[0].stop] if len(found) == 0 else found[0] if len(found) == 1 else found
+    return (
+        [spans[0].start, spans[0].stop]
+        if len(found) == 0
+        else found[0]
+        if len(found) == 1
+        else found
+    )
 
 
 def difference(one: Any, other: Any, name: str = "") -> tuple[str, Any, Any] | None:
@@ -82,7 +95,9 @@ def difference(one: Any, other: Any, name: str = "") -> tuple[str, Any, Any] | N
 
 
 def _same(one: Any, other: Any) -> bool:
-    return json.dumps(one, sort_keys=True, default=plain) == json.dumps(other, sort_keys=True, default=plain)
+    return json.dumps(one, sort_keys=True, default=plain) == json.dumps(
+        other, sort_keys=True, default=plain
+    )
 
 
 def plain(value: object) -> object:
@@ -104,9 +119,14 @@ def covered_frames(run: Mapping[str, Any]) -> list[range] | None:
     if frames is None:
         return None
     try:
-        return [range(int(start), int(stop)) for start, stop in (frames if np.ndim(frames) == 2 else [frames])]
+        return [
+            range(int(start), int(stop))
+            for start, stop in (frames if np.ndim(frames) == 2 else [frames])
+        ]
     except (TypeError, ValueError, OverflowError):
-        raise ValueError(f'"frames" must be [start, stop] or a list of those, got {frames!r}') from None
+        raise ValueError(
+            f'"frames" must be [start, stop] or a list of those, got {frames!r}'
+        ) from None
 
 
 def check_run(run: Mapping[str, Any]) -> None:
@@ -116,7 +136,9 @@ def check_run(run: Mapping[str, Any]) -> None:
 
     def refuse(name: str, wanted: str, value: object) -> ValueError:
         text = repr(value)
-        return ValueError(f'"{name}" must be {wanted}, got {text if len(text) <= 40 else text[:40] + "..."}')
+        return ValueError(
+            f'"{name}" must be {wanted}, got {text if len(text) <= 40 else text[:40] + "..."}'
+        )
 
     for key in ("configuration", "versions", "inputs", "seconds", "people", "time"):
         if not isinstance(run.get(key, {}), dict):
@@ -138,13 +160,21 @@ def check_run(run: Mapping[str, Any]) -> None:
     if any(span.start < 0 or span.stop < span.start for span in spans) or count > MOST_FRAMES:
         raise refuse("frames", f"[start, stop] of at most {MOST_FRAMES} frames", run["frames"])
     for way, value in _leaves(run):
-        if isinstance(value, float) and not math.isfinite(value):  # 1e999, which JSON cannot store again
+        if isinstance(value, float) and not math.isfinite(
+            value
+        ):  # 1e999, which JSON cannot store again
             raise ValueError(f'"{way[:80]}" must be a finite number, got {value}')
 
 
 def _leaves(value: object, way: str = "") -> Iterator[tuple[str, object]]:
     """All values in nested lists and objects, each with its dotted path of keys and indices."""
-    items = value.items() if isinstance(value, Mapping) else enumerate(value) if isinstance(value, list) else None
+    items = (
+        value.items()
+        if isinstance(value, Mapping)
+        else enumerate(value)
+        if isinstance(value, list)
+        else None
+    )
     if items is None:
         yield way, value
     for key, child in items or ():

@@ -31,7 +31,8 @@ class SubjectShapes(Table):
     information: Annotated[Array, Column("N 10 10")]
     """(G, 10, 10) inverse covariance of the shape, including the prior over adults."""
     body: str
-    """Fingerprint of the body model to which the betas belong (`body.fitting.weights.fingerprint`)."""
+    """Fingerprint of the body model to which the betas belong
+    (`body.fitting.weights.fingerprint`)."""
 
     def __post_init__(self) -> None:
         """Check shapes and types, that names are unique, betas finite, and information matrices
@@ -42,14 +43,24 @@ class SubjectShapes(Table):
         for name in names:
             if names.count(name) > 1:
                 raise ValueError(f"names must differ, but {name!r} occurs twice")
-        finite = np.isfinite(self.betas).all(axis=1) & np.isfinite(self.information).all(axis=(1, 2))
+        finite = np.isfinite(self.betas).all(axis=1) & np.isfinite(self.information).all(
+            axis=(1, 2)
+        )
         if not finite.all():
             whose = names[np.argmin(finite)]
-            raise ValueError(f"betas and information must be finite, but those of {whose!r} are not")
+            raise ValueError(
+                f"betas and information must be finite, but those of {whose!r} are not"
+            )
         largest = float(np.abs(self.information).max(initial=0.0))
-        symmetric = np.allclose(self.information, self.information.mT, rtol=0.0, atol=1e-5 * largest)
-        if not symmetric or (len(self) > 0 and (np.linalg.eigvalsh(self.information) < _LEAST).any()):
-            raise ValueError("information must be symmetric and positive definite, for each of the people")
+        symmetric = np.allclose(
+            self.information, self.information.mT, rtol=0.0, atol=1e-5 * largest
+        )
+        if not symmetric or (
+            len(self) > 0 and (np.linalg.eigvalsh(self.information) < _LEAST).any()
+        ):
+            raise ValueError(
+                "information must be symmetric and positive definite, for each of the people"
+            )
         if max(largest, np.abs(self.betas).max(initial=0.0)) > _MOST:
             raise ValueError(f"betas and information must be at most {_MOST:g}")
 
@@ -98,8 +109,8 @@ class SubjectShapes(Table):
         whose = columns["body"]
         if whose.shape != () or whose.dtype.kind != "U" or str(whose) != body:
             raise InputError(
-                f"{file}: these are shapes of another body model, and betas of one model do not fit another;"
-                " give their model with --body, or another file"
+                f"{file}: these are shapes of another body model, and betas of one model do not "
+                "fit another; give their model with --body, or another file"
             )
         with naming(file, _CURE):
             return cls(columns["names"], columns["betas"], columns["information"], body)

@@ -20,8 +20,8 @@ def check_joint_names(names: Iterable[str]) -> None:
     for name in names:
         if not (0 < len(name) <= LONGEST_NAME and name.isprintable() and name[0] not in "=+-@"):
             raise ValueError(
-                f"joint_names must be 1 to {LONGEST_NAME} letters in one line, the first none of = + - @, got"
-                f" {name[:LONGEST_NAME]!r}"
+                f"joint_names must be 1 to {LONGEST_NAME} letters in one line, the first none of "
+                f"= + - @, got {name[:LONGEST_NAME]!r}"
             )
 
 
@@ -91,11 +91,14 @@ class Skeleton:
         for joint, ends in middles.items():
             for late in set(ends) - made:
                 raise ValueError(
-                    f"{name}: the midpoint {joint} uses {late}, which must be a keypoint or an earlier midpoint"
+                    f"{name}: the midpoint {joint} uses {late}, which must be a keypoint or an "
+                    "earlier midpoint"
                 )
             made.add(joint)
         if len(core) == 0:
-            raise ValueError(f"{name}: core must have at least one joint, by which a person is found; name one")
+            raise ValueError(
+                f"{name}: core must have at least one joint, by which a person is found; name one"
+            )
         other = {place[a]: place[b] for a, b in (*mirror, *((b, a) for a, b in mirror))}
         edges = tuple((place[a], place[b]) for a, b in limbs)
         grown = _grown(place[anchor], edges, len(joints))
@@ -103,7 +106,9 @@ class Skeleton:
             grown = [place.get(parents.get(joint, ""), -1) for joint in joints]
         lost = [joints[j] for j, parent in enumerate(grown) if parent < 0 and joints[j] != anchor]
         if lost:
-            raise ValueError(f"{name}: no limbs connect the anchor {anchor} with {' '.join(lost)}; add limbs")
+            raise ValueError(
+                f"{name}: no limbs connect the anchor {anchor} with {' '.join(lost)}; add limbs"
+            )
         skeleton = cls(
             name=name,
             joints=joints,
@@ -112,13 +117,18 @@ class Skeleton:
             mirror=tuple(other.get(index, index) for index in range(len(joints))),
             core=tuple(place[joint] for joint in core),
             middles=tuple((place[joint], place[a], place[b]) for joint, (a, b) in middles.items()),
-            keypoints=(*(place[joint] if joint else -1 for joint in keypoints), *[-1] * passed_over),
+            keypoints=(
+                *(place[joint] if joint else -1 for joint in keypoints),
+                *[-1] * passed_over,
+            ),
         )
-        beside = [j for j in range(len(joints)) if grown[j] == place[anchor] and skeleton.mirror[j] != j]
+        beside = [
+            j for j in range(len(joints)) if grown[j] == place[anchor] and skeleton.mirror[j] != j
+        ]
         if len(beside) < 2:
             raise ValueError(
-                f"{name}: two joints next to the anchor {anchor} must be left and right, such as hips; choose"
-                " another anchor"
+                f"{name}: two joints next to the anchor {anchor} must be left and right, such as "
+                "hips; choose another anchor"
             )
         return skeleton
 
@@ -141,7 +151,10 @@ class Skeleton:
         """Joints that determine the position of a person: the root joint; if it is a computed
         midpoint, its two joints.
         """
-        return next(((first, second) for joint, first, second in self.middles if joint == self.root), (self.root,))
+        return next(
+            ((first, second) for joint, first, second in self.middles if joint == self.root),
+            (self.root,),
+        )
 
     @property
     def keypoint_count(self) -> int:
@@ -151,7 +164,9 @@ class Skeleton:
     @property
     def hips(self) -> tuple[int, int]:
         """The two mirrored joints next to the root."""
-        beside = [j for j in range(len(self)) if self.parents[j] == self.root and self.mirror[j] != j]
+        beside = [
+            j for j in range(len(self)) if self.parents[j] == self.root and self.mirror[j] != j
+        ]
         return beside[0], beside[1]
 
     @cached_property
@@ -176,7 +191,10 @@ class Skeleton:
     def tree_neighbours(self) -> Index:
         """(J, N) parent and children of each joint in the tree, padded with -1."""
         parents = np.array(self.parents)
-        lists = [[*parents[[j]][parents[[j]] >= 0], *np.flatnonzero(parents == j)] for j in range(len(self))]
+        lists = [
+            [*parents[[j]][parents[[j]] >= 0], *np.flatnonzero(parents == j)]
+            for j in range(len(self))
+        ]
         most = max(map(len, lists))
         return np.array([row + [-1] * (most - len(row)) for row in lists], dtype=np.intp)
 
@@ -207,22 +225,49 @@ MID_HIP = "MidHip"
 BODY_25 = Skeleton(
     name="BODY_25",
     joints=tuple(
-        "Nose Neck RShoulder RElbow RWrist LShoulder LElbow LWrist MidHip RHip RKnee RAnkle LHip LKnee "
-        "LAnkle REye LEye REar LEar LBigToe LSmallToe LHeel RBigToe RSmallToe RHeel".split()
+        "Nose Neck RShoulder RElbow RWrist LShoulder LElbow LWrist MidHip RHip RKnee RAnkle LHip "
+        "LKnee LAnkle REye LEye REar LEar LBigToe LSmallToe LHeel RBigToe RSmallToe RHeel".split()
     ),
     limbs=_limbs(
-        "1-8 9-10 10-11 8-9 8-12 12-13 13-14 1-2 2-3 3-4 2-17 1-5 5-6 6-7 5-18 1-0 0-15 0-16 15-17 16-18 "
-        "14-19 19-20 14-21 11-22 22-23 11-24"
+        "1-8 9-10 10-11 8-9 8-12 12-13 13-14 1-2 2-3 3-4 2-17 1-5 5-6 6-7 5-18 1-0 0-15 0-16 "
+        "15-17 16-18 14-19 19-20 14-21 11-22 22-23 11-24"
     ),
     parents=(1, 8, 1, 2, 3, 1, 5, 6, -1, 8, 9, 10, 8, 12, 13, 0, 0, 15, 16, 14, 19, 14, 11, 22, 11),
-    mirror=(0, 1, 5, 6, 7, 2, 3, 4, 8, 12, 13, 14, 9, 10, 11, 16, 15, 18, 17, 22, 23, 24, 19, 20, 21),
+    mirror=(
+        0,
+        1,
+        5,
+        6,
+        7,
+        2,
+        3,
+        4,
+        8,
+        12,
+        13,
+        14,
+        9,
+        10,
+        11,
+        16,
+        15,
+        18,
+        17,
+        22,
+        23,
+        24,
+        19,
+        20,
+        21,
+    ),
     core=tuple(range(15)),
 )
 """OpenPose's BODY_25, the reference skeleton of this package."""
 
 _MIDDLES = {"Neck": ("RShoulder", "LShoulder"), MID_HIP: ("RHip", "LHip")}
 """BODY_25's joints on the midline, as midpoints of two others, for skeletons without them."""
-_GROWN_FROM = dict(zip(BODY_25.joints, (BODY_25.joints[parent] for parent in BODY_25.parents), strict=True)) | {
+_GROWN_FROM = dict(zip(BODY_25.joints, (BODY_25.joints[parent] for parent in BODY_25.parents),
+                       strict=True)) | {
     "Head": "Neck", "head": "Neck", "neck": "Neck", "left_collar": "Neck", "right_collar": "Neck",
     "spine1": MID_HIP, "spine2": MID_HIP, "spine3": MID_HIP,
     "left_hand": "LWrist", "right_hand": "RWrist", "left_foot": "LAnkle", "right_foot": "RAnkle",
@@ -240,7 +285,9 @@ def body_skeleton(name: str, keypoints: Sequence[str], passed_over: int = 0) -> 
     given = [point for point in keypoints if point]
     lacking = [each for ends in _MIDDLES.values() for each in ends if each not in given]
     if lacking:
-        problem = f"there is no {' and no '.join(lacking)}, but both shoulders and both hips are needed"
+        problem = (
+            f"there is no {' and no '.join(lacking)}, but both shoulders and both hips are needed"
+        )
         raise ValueError(f"{name}: {problem}")
     middles = {joint: ends for joint, ends in _MIDDLES.items() if joint not in given}
     joints, names = (*given, *middles), BODY_25.joints
@@ -251,7 +298,9 @@ def body_skeleton(name: str, keypoints: Sequence[str], passed_over: int = 0) -> 
             parent = _GROWN_FROM[parent]
         if joint != MID_HIP:
             parents[joint] = parent
-    limbs = [(names[a], names[b]) for a, b in BODY_25.limbs if names[a] in joints and names[b] in joints]
+    limbs = [
+        (names[a], names[b]) for a, b in BODY_25.limbs if names[a] in joints and names[b] in joints
+    ]
     limbs += [
         (parent, joint)
         for joint, parent in parents.items()
@@ -273,11 +322,14 @@ def body_skeleton(name: str, keypoints: Sequence[str], passed_over: int = 0) -> 
 
 def _layout(name: str, keypoints: str, passed_over: int = 0) -> Skeleton:
     """A skeleton from a text of its keypoints; - is a keypoint that is ignored."""
-    return body_skeleton(name, ["" if point == "-" else point for point in keypoints.split()], passed_over)
+    return body_skeleton(
+        name, ["" if point == "-" else point for point in keypoints.split()], passed_over
+    )
 
 
 _COCO = (
-    "Nose LEye REye LEar REar LShoulder RShoulder LElbow RElbow LWrist RWrist LHip RHip LKnee RKnee LAnkle RAnkle"
+    "Nose LEye REye LEar REar LShoulder RShoulder LElbow RElbow LWrist RWrist LHip RHip LKnee "
+    "RKnee LAnkle RAnkle"
 )
 _HALPE = f"{_COCO} Head Neck MidHip LBigToe RBigToe LSmallToe RSmallToe LHeel RHeel"
 _FEET = "LBigToe LSmallToe LHeel RBigToe RSmallToe RHeel"
@@ -311,29 +363,38 @@ SKELETONS = {
         _layout("HALPE_68", _HALPE, passed_over=42),
         _layout(
             "H36M_17",
-            "MidHip RHip RKnee RAnkle LHip LKnee LAnkle spine2 Neck head Head LShoulder LElbow LWrist"
-            " RShoulder RElbow RWrist",
+            "MidHip RHip RKnee RAnkle LHip LKnee LAnkle spine2 Neck head Head LShoulder LElbow "
+            "LWrist RShoulder RElbow RWrist",
         ),
         _layout("POSETRACK_17", f"Nose head Head {_COCO.split(maxsplit=3)[3]}"),
         _layout("MPI_INF_3DHP_17", f"Head Neck {_ARMS} {_LEGS} MidHip spine2 head"),
         _layout(
             "MPII_16",
-            "RAnkle RKnee RHip LHip LKnee LAnkle MidHip Neck head Head RWrist RElbow RShoulder LShoulder LElbow"
-            " LWrist",
+            "RAnkle RKnee RHip LHip LKnee LAnkle MidHip Neck head Head RWrist RElbow RShoulder "
+            "LShoulder LElbow LWrist",
         ),
         _layout("MPI_15", f"Head Neck {_ARMS} {_LEGS} spine3"),
         _layout(
             "JHMDB_15",
-            "Neck spine1 - RShoulder LShoulder RHip LHip RElbow LElbow RKnee LKnee RWrist LWrist RAnkle LAnkle",
+            (
+                "Neck spine1 - RShoulder LShoulder RHip LHip RElbow LElbow RKnee LKnee RWrist "
+                "LWrist RAnkle LAnkle"
+            ),
         ),
         _layout(
             "CROWDPOSE_14",
-            "LShoulder RShoulder LElbow RElbow LWrist RWrist LHip RHip LKnee RKnee LAnkle RAnkle Head Neck",
+            (
+                "LShoulder RShoulder LElbow RElbow LWrist RWrist LHip RHip LKnee RKnee LAnkle "
+                "RAnkle Head Neck"
+            ),
         ),
         _layout("AIC_14", f"{_ARMS} {_LEGS} Head Neck"),
         _layout(
             "LSP_14",
-            "RAnkle RKnee RHip LHip LKnee LAnkle RWrist RElbow RShoulder LShoulder LElbow LWrist Neck Head",
+            (
+                "RAnkle RKnee RHip LHip LKnee LAnkle RWrist RElbow RShoulder LShoulder LElbow "
+                "LWrist Neck Head"
+            ),
         ),
         _layout(
             "BLAZEPOSE_33",
@@ -346,8 +407,8 @@ SKELETONS = {
 common comes first."""
 
 SMPL_24 = tuple(
-    "pelvis left_hip right_hip spine1 left_knee right_knee spine2 left_ankle right_ankle spine3 left_foot "
-    "right_foot neck left_collar right_collar head left_shoulder right_shoulder left_elbow right_elbow "
-    "left_wrist right_wrist left_hand right_hand".split()
+    "pelvis left_hip right_hip spine1 left_knee right_knee spine2 left_ankle right_ankle spine3 "
+    "left_foot right_foot neck left_collar right_collar head left_shoulder right_shoulder "
+    "left_elbow right_elbow left_wrist right_wrist left_hand right_hand".split()
 )
 """The 24 joints of SMPL's kinematic tree, in SMPL's order."""

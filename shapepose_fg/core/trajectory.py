@@ -22,7 +22,8 @@ MOST_METRES = 1e6
 UNIT_LENGTH = 0.01
 """Largest deviation of the length of a quaternion from 1: files have two or more digits."""
 _START_M, _START_RAD = 0.05, 0.02
-"""Standard deviation per axis of an odometry's start in the world of the fixed cameras: metres, rad."""
+"""Standard deviation per axis of an odometry's start in the world of the fixed cameras: metres,
+rad."""
 _M_A_RAD, _M_A_S = 0.5, 0.05
 """Path length, m, to which a rotation by one radian, and a second at rest, are equivalent in the
 drift model."""
@@ -30,7 +31,8 @@ _RAD_A_M = 0.5
 """Error of rotation, rad, per metre of translational error of an odometry; both have the same
 effect after a straight path of 10 m."""
 MOST_VARIANCE = 1e18
-"""Largest entry of a pose's covariance, rad² or m²: a larger one is equivalent to an unknown pose."""
+"""Largest entry of a pose's covariance, rad² or m²: a larger one is equivalent to an unknown
+pose."""
 
 
 @dataclass(frozen=True)
@@ -57,17 +59,24 @@ class Trajectory:
         def refuse(problem: str) -> ValueError:
             return ValueError(f"trajectory {self.name}: {problem}")
 
-        time_s, wTb = np.asarray(self.time_s, dtype=np.float64), np.asarray(self.wTb, dtype=np.float64)
+        time_s, wTb = (
+            np.asarray(self.time_s, dtype=np.float64),
+            np.asarray(self.wTb, dtype=np.float64),
+        )
         if len(time_s) < 2 or time_s.ndim != 1 or wTb.shape != (len(time_s), 4, 4):
             raise refuse(
-                f"time_s must be (F,) and wTb (F, 4, 4), F at least 2, got {time_s.shape} and {wTb.shape}"
+                f"time_s must be (F,) and wTb (F, 4, 4), F at least 2, got {time_s.shape} and "
+                f"{wTb.shape}"
             )
         if not (np.isfinite(time_s).all() and np.isfinite(wTb).all()):
             raise refuse("times and poses must be finite")
         if (most := float(np.abs(wTb[:, :3, 3]).max())) > MOST_METRES:
             raise refuse(f"poses must be at most {MOST_METRES:g} m away, got {most:.3g}")
         if (np.diff(time_s) <= 0).any():
-            raise refuse(f"times must increase, but do not at pose {int(np.argmax(np.diff(time_s) <= 0)) + 1}")
+            raise refuse(
+                "times must increase, but do not at pose "
+                f"{int(np.argmax(np.diff(time_s) <= 0)) + 1}"
+            )
         R = wTb[:, :3, :3]
         if not is_rotation(R):
             raise refuse("rotations must be orthonormal with determinant 1")
@@ -76,9 +85,14 @@ class Trajectory:
         if self.covariance is not None:
             covariance = np.asarray(self.covariance, dtype=np.float64)
             if covariance.shape != (len(time_s), 6, 6) or not np.isfinite(covariance).all():
-                raise refuse(f"covariance must be finite and {(len(time_s), 6, 6)}, got {covariance.shape}")
+                raise refuse(
+                    f"covariance must be finite and {(len(time_s), 6, 6)}, got {covariance.shape}"
+                )
             if np.abs(covariance).max(initial=0.0) > MOST_VARIANCE:
-                raise refuse(f"covariance must be at most {MOST_VARIANCE:g}, got {np.abs(covariance).max():.3g}")
+                raise refuse(
+                    f"covariance must be at most {MOST_VARIANCE:g}, got "
+                    f"{np.abs(covariance).max():.3g}"
+                )
             if np.linalg.eigvalsh(covariance)[:, 0].min() < -1e-9:
                 raise refuse("covariances must have no negative eigenvalue")
             object.__setattr__(self, "covariance", covariance)
@@ -104,7 +118,9 @@ class Trajectory:
         before, part = self._place(flat)
         R, last = self.wTb[before, :3, :3], self.wTb[before + 1, :3, :3]
         turn = part[:, None] * Rotation.from_matrix(R.mT @ last).as_rotvec()
-        pose = rigid(R @ Rotation.from_rotvec(turn).as_matrix(), self._between(self.wTb[:, :3, 3], flat))
+        pose = rigid(
+            R @ Rotation.from_rotvec(turn).as_matrix(), self._between(self.wTb[:, :3, 3], flat)
+        )
         return pose.reshape(*np.shape(time_s), 4, 4)
 
     def covariance_at(self, time_s: Array) -> Array:
@@ -120,16 +136,22 @@ class Trajectory:
         return np.diag([_START_RAD**2] * 3 + [_START_M**2] * 3)
 
     def drifted(self, poses: Array, time_s: Array) -> Array:
-        """(T - 1, 6, 6) covariances of the steps between `poses` (T, 4, 4) of this odometry at `time_s` (T,)."""
+        """(T - 1, 6, 6) covariances of the steps between `poses` (T, 4, 4) of this odometry at
+        `time_s` (T,).
+        """
         steps = np.linalg.inv(poses[:-1]) @ poses[1:]
         cosine = np.clip((np.trace(steps[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1.0, 1.0)
-        way = np.linalg.norm(steps[:, :3, 3], axis=1) + _M_A_RAD * np.arccos(cosine) + _M_A_S * np.diff(time_s)
+        way = (
+            np.linalg.norm(steps[:, :3, 3], axis=1)
+            + _M_A_RAD * np.arccos(cosine)
+            + _M_A_S * np.diff(time_s)
+        )
         sigmas = np.array([_RAD_A_M] * 3 + [1.0] * 3) * self.drift
         return way[:, None, None] * np.diag(sigmas**2)
 
     def _between(self, values: Array, time_s: Array) -> Array:
-        """(M, ...) values (F, ...) interpolated linearly at times (M,), and constant before the first and after
-        the last.
+        """(M, ...) values (F, ...) interpolated linearly at times (M,), and constant before the
+        first and after the last.
         """
         before, part = self._place(time_s)
         part = part.reshape(-1, *[1] * (values.ndim - 1))

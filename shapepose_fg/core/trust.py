@@ -76,7 +76,8 @@ def with_poses(detections: DetectionSequence, rig: Rig, times: FrameTimes) -> De
             path = rig.trajectories[int(rig.carrier[view])]
             runs = f"{path.name} runs from {path.time_s[0]:.10g} to {path.time_s[-1]:.10g} s"
             raise ValueError(
-                f"camera {rig.names[view]} has no pose at the time of any picture: {runs}; give times of its clock"
+                f"camera {rig.names[view]} has no pose at the time of any picture: {runs}; give "
+                "times of its clock"
             )
     if len(spells) == 0:
         return detections

@@ -62,8 +62,12 @@ class BoxNetwork:
         scale = float((size / picture.shape[1::-1]).min())
         width, height = (max(int(side * scale), 1) for side in picture.shape[1::-1])
         shown = np.full((size[1], size[0], 3), _GREY, dtype=np.uint8)
-        shown[:height, :width] = cv2.resize(picture, (width, height), interpolation=cv2.INTER_LINEAR)
-        outputs = self.network.run(np.ascontiguousarray(shown.transpose(2, 0, 1)[None], dtype=np.float32))
+        shown[:height, :width] = cv2.resize(
+            picture, (width, height), interpolation=cv2.INTER_LINEAR
+        )
+        outputs = self.network.run(
+            np.ascontiguousarray(shown.transpose(2, 0, 1)[None], dtype=np.float32)
+        )
         boxes, score, least = self._proposed(outputs)
         # Written so that NaN counts as below the minimum.
         sound = (np.abs(boxes) < _FARTHEST).all(axis=1) & (boxes[:, 2:] > boxes[:, :2]).all(axis=1)
@@ -78,21 +82,35 @@ class BoxNetwork:
         return boxes[:_MOST_PEOPLE]
 
     def _proposed(self, outputs: Sequence[Blob]) -> tuple[Blob, Blob, float]:
-        """(N, 4) boxes in pixels of the input, (N,) their scores for people, and the minimum score."""
+        """(N, 4) boxes in pixels of the input, (N,) their scores for people, and the minimum
+        score.
+        """
         # Column and row of all cells of the grids, grid by grid.
-        grids = [np.indices((self.form.size[1] // step, self.form.size[0] // step))[::-1] for step in _STRIDES]
+        grids = [
+            np.indices((self.form.size[1] // step, self.form.size[0] // step))[::-1]
+            for step in _STRIDES
+        ]
         cells = np.concatenate([grid.reshape(2, -1).T for grid in grids])
         stride = np.repeat(_STRIDES, [grid[0].size for grid in grids])[:, None]
         shape = outputs[0].shape
-        if shape[:1] != (1,) or len(shape) != 3 or shape[2] < 5 or (shape[2] > 5 and shape[1] != len(cells)):
+        if (
+            shape[:1] != (1,)
+            or len(shape) != 3
+            or shape[2] < 5
+            or (shape[2] > 5 and shape[1] != len(cells))
+        ):
             raise InputError(
-                f"{self.network.file}: for pictures of {words(self.form.size)}, YOLOX has an output of 1 x"
-                f" {len(cells)} x 6 or more, or of 1 x N x 5 with suppression inside, but this network has"
-                f" {words(shape)}; give another --boxes"
+                f"{self.network.file}: for pictures of {words(self.form.size)}, YOLOX has an "
+                f"output of 1 x {len(cells)} x 6 or more, or of 1 x N x 5 with suppression "
+                f"inside, but this network has {words(shape)}; give another --boxes"
             )
         found = outputs[0][0]
         if shape[2] == 5:
-            labels = outputs[1].reshape(-1) if len(outputs) > 1 and outputs[1].size == len(found) else None
+            labels = (
+                outputs[1].reshape(-1)
+                if len(outputs) > 1 and outputs[1].size == len(found)
+                else None
+            )
             score = found[:, 4] if labels is None else np.where(labels == _PERSON, found[:, 4], 0.0)
             return found[:, :4], score, _LEAST_SUPPRESSED
         # In single precision, as in the network: the crops of equal boxes then have equal pixels.

@@ -1,6 +1,7 @@
 """Converts a network's heat maps and part affinity fields to joint candidates with affinities.
 
-Cao et al., "OpenPose: Realtime Multi-Person 2D Pose Estimation using Part Affinity Fields", PAMI 2021, section 3.
+Cao et al., "OpenPose: Realtime Multi-Person 2D Pose Estimation using Part Affinity Fields", PAMI
+2021, section 3.
 """
 
 from dataclasses import dataclass
@@ -44,7 +45,9 @@ class Candidates:
         return len(self.joint)
 
     def moved(self, xy: Array, inside: Mask) -> "Candidates":
-        """Return the candidates at other positions; those that are not `inside` (D,) are left out."""
+        """Return the candidates at other positions; those that are not `inside` (D,) are left
+        out.
+        """
         place = np.cumsum(inside) - 1
         both = inside[self.pairs].all(axis=1)
         joint, score, pairs = self.joint[inside], self.score[inside], place[self.pairs[both]]
@@ -62,16 +65,23 @@ def decode(output: NDArray[np.float32], skeleton: TextSkeleton) -> Candidates:
     joint, xy, score = peaks(output[: len(skeleton.joints)])
     of = [np.flatnonzero(joint == each) for each in range(len(skeleton.joints))]
     joined = [
-        np.stack(np.meshgrid(of[a], of[b], indexing="ij"), axis=-1).reshape(-1, 2) for a, b in skeleton.limbs
+        np.stack(np.meshgrid(of[a], of[b], indexing="ij"), axis=-1).reshape(-1, 2)
+        for a, b in skeleton.limbs
     ]
-    pairs, limb = np.concatenate(joined), np.repeat(np.arange(len(joined)), [len(each) for each in joined])
-    affinity = line_integrals(output[len(skeleton.joints) + 1 :], xy[pairs[:, 0]], xy[pairs[:, 1]], limb)
+    pairs, limb = (
+        np.concatenate(joined),
+        np.repeat(np.arange(len(joined)), [len(each) for each in joined]),
+    )
+    affinity = line_integrals(
+        output[len(skeleton.joints) + 1 :], xy[pairs[:, 0]], xy[pairs[:, 1]], limb
+    )
     there = affinity > 0
     return Candidates(joint, xy, score, pairs[there], limb[there], affinity[there])
 
 
 def peaks(heat: NDArray[np.float32], min_score: float = _MIN_SCORE) -> tuple[Index, Array, Array]:
-    """Joint (D,), position (D, 2) in cells, and height (D,) of the local maxima of heat maps (J, H, W).
+    """Joint (D,), position (D, 2) in cells, and height (D,) of the local maxima of heat maps (J, H,
+    W).
 
     A local maximum is at least as high as its eight neighbours. Its position and height between
     cells are those of a Gaussian through it and its neighbours, along each axis.
@@ -103,7 +113,9 @@ def _vertex(before: Real, centre: Array, after: Real) -> tuple[Array, Array]:
     and the increase of the logarithm there. Both are 0 at the edge of the map.
     """
     floor = 1e-3  # logarithms of values near 0 or below would distort the fit
-    low, mid, high = (np.log(np.maximum(each.astype(np.float64), floor)) for each in (before, centre, after))
+    low, mid, high = (
+        np.log(np.maximum(each.astype(np.float64), floor)) for each in (before, centre, after)
+    )
     bend = low - 2 * mid + high
     safe = np.where(bend < -1e-9, bend, -np.inf)
     shift = np.clip(0.5 * (low - high) / safe, -0.5, 0.5)
@@ -112,7 +124,8 @@ def _vertex(before: Real, centre: Array, after: Real) -> tuple[Array, Array]:
 
 
 def line_integrals(fields: NDArray[np.float32], start: Array, end: Array, limb: Index) -> Array:
-    """(E,) mean component of the affinity `fields` (2 L, H, W) along the lines from `start` to `end` (E, 2).
+    """(E,) mean component of the affinity `fields` (2 L, H, W) along the lines from `start` to
+    `end` (E, 2).
 
     `limb` (E,) is the field of each line. 0 if too few points along the line support the limb.
     """

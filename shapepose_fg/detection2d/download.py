@@ -49,8 +49,13 @@ def named_networks() -> dict[str, NamedNetwork]:
     """Downloadable networks by name: RTMPose (HALPE-26), with the YOLOX that rtmlib pairs with
     each.
     """
-    table = json.loads((files("shapepose_fg.detection2d") / "data" / "networks.json").read_text(encoding="utf-8"))
-    return {name: NamedNetwork(**(entry | {"size": tuple(entry["size"])})) for name, entry in table.items()}
+    table = json.loads(
+        (files("shapepose_fg.detection2d") / "data" / "networks.json").read_text(encoding="utf-8")
+    )
+    return {
+        name: NamedNetwork(**(entry | {"size": tuple(entry["size"])}))
+        for name, entry in table.items()
+    }
 
 
 def named_file(
@@ -69,9 +74,12 @@ def named_file(
     there = kept.is_file()
     if not there and not fetch:
         raise InputError(
-            f"{name}: this network has not been downloaded yet; give --download {name}, or the path of a file"
+            f"{name}: this network has not been downloaded yet; give --download {name}, or the "
+            "path of a file"
         )
-    content = read_bytes(kept, MOST_BYTES) if there else _fetched(named_networks()[name].file, progress)
+    content = (
+        read_bytes(kept, MOST_BYTES) if there else _fetched(named_networks()[name].file, progress)
+    )
     digest = hashlib.sha256(content).hexdigest()
     if not pin.is_file():
         write_content(pin, digest)
@@ -79,8 +87,9 @@ def named_file(
     pinned = read_text(pin, most=SMALL).strip()
     if digest != pinned:
         raise InputError(
-            f"{kept}: the sha256 of {'the file' if there else 'the download'} is {digest}, but {pinned[:64]}"
-            f" was pinned at first use; if the change is intended, delete the file and {pin.name} beside it"
+            f"{kept}: the sha256 of {'the file' if there else 'the download'} is {digest}, but "
+            f"{pinned[:64]} was pinned at first use; if the change is intended, delete the file "
+            f"and {pin.name} beside it"
         )
     if not there:
         write_content(kept, content)
@@ -90,7 +99,9 @@ def named_file(
 class _OnlyHttps(urllib.request.HTTPRedirectHandler):
     """Follows no redirection to unencrypted addresses, where content could be changed."""
 
-    def redirect_request(self, req: Any, fp: Any, code: int, msg: str, headers: Any, newurl: str) -> Any:
+    def redirect_request(
+        self, req: Any, fp: Any, code: int, msg: str, headers: Any, newurl: str
+    ) -> Any:
         if not newurl.startswith("https://"):
             raise urllib.error.URLError(f"it redirects to {newurl[:200]}, which is not https")
         return super().redirect_request(req, fp, code, msg, headers, newurl)
@@ -101,7 +112,10 @@ def _fetched(file: str, progress: Callable[[int, int], object]) -> bytes:
     problems, opener = list[str](), urllib.request.build_opener(_OnlyHttps)
     for base in BASES:
         try:
-            with opener.open(f"{base}/{file}", timeout=_TIMEOUT_S) as answer, tempfile.TemporaryFile() as archive:
+            with (
+                opener.open(f"{base}/{file}", timeout=_TIMEOUT_S) as answer,
+                tempfile.TemporaryFile() as archive,
+            ):
                 total, done = int(answer.headers.get("Content-Length") or 0), 0
                 # The number of bytes read is bounded, so that an endless response cannot fill the
                 # disk.
@@ -116,12 +130,23 @@ def _fetched(file: str, progress: Callable[[int, int], object]) -> bytes:
                         else "the download is too long"
                     )
                 return _inside(archive)
-        except (OSError, ValueError, EOFError, RuntimeError, http.client.HTTPException, *_BROKEN) as error:
-            told = error if isinstance(error, urllib.error.HTTPError) else getattr(error, "reason", error)
+        except (
+            OSError,
+            ValueError,
+            EOFError,
+            RuntimeError,
+            http.client.HTTPException,
+            *_BROKEN,
+        ) as error:
+            told = (
+                error
+                if isinstance(error, urllib.error.HTTPError)
+                else getattr(error, "reason", error)
+            )
             problems.append(f"{base}/{file} ({told})")
     raise InputError(
-        f"the network cannot be downloaded from {' or '.join(problems)}; download it by hand and give the path"
-        f" of the {_INSIDE} in it"
+        f"the network cannot be downloaded from {' or '.join(problems)}; download it by hand and "
+        f"give the path of the {_INSIDE} in it"
     )
 
 

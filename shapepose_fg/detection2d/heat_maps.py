@@ -36,7 +36,8 @@ class NetworkLayout:
     text: TextSkeleton
     """The joints and limbs, in order."""
     scale: float
-    """Scale of the input, which is `scale` * colour + `offset`, with colours (blue, green, red) from 0 to 255."""
+    """Scale of the input, which is `scale` * colour + `offset`, with colours (blue, green, red)
+    from 0 to 255."""
     offset: float
     """Offset of the input; see `scale`."""
     sha256: str = ""
@@ -51,9 +52,12 @@ class NetworkLayout:
 @lru_cache(maxsize=1)
 def layouts() -> dict[str, NetworkLayout]:
     """All layouts by name."""
-    table = json.loads((files("shapepose_fg.detection2d") / "data" / "layouts.json").read_text(encoding="utf-8"))
+    table = json.loads(
+        (files("shapepose_fg.detection2d") / "data" / "layouts.json").read_text(encoding="utf-8")
+    )
     return {
-        name: NetworkLayout(name, text=TEXT_SKELETONS[entry.pop("text")], **entry) for name, entry in table.items()
+        name: NetworkLayout(name, text=TEXT_SKELETONS[entry.pop("text")], **entry)
+        for name, entry in table.items()
     }
 
 
@@ -80,8 +84,8 @@ class HeatMapNetwork:
         device: str = "cpu",
         long_side: int | None = None,
     ) -> "HeatMapNetwork":
-        """Load the network in the ONNX `file`. `layout` names one of `layouts()`; without it the file must
-        identify it.
+        """Load the network in the ONNX `file`. `layout` names one of `layouts()`; without it the
+        file must identify it.
 
         OpenCV runs it on the CPU, at any size, unless `backend` is another. InputError if the file
         is missing, is no ONNX network, or does not fit the layout.
@@ -89,7 +93,9 @@ class HeatMapNetwork:
         every = layouts()
         if layout not in (None, *every):
             raise InputError(f"--layout {layout}: must be one of {' '.join(every)}")
-        network = OnnxNetwork.open(file, backend or ("opencv" if device == "cpu" else "onnxruntime"), device)
+        network = OnnxNetwork.open(
+            file, backend or ("opencv" if device == "cpu" else "onnxruntime"), device
+        )
         width, height = network.size or _TRIAL
         shape = network.run(np.zeros((1, 3, height, width), dtype=np.float32))[0].shape
         fitting = [each for each in every.values() if layout in (None, each.name)]
@@ -97,11 +103,18 @@ class HeatMapNetwork:
         fitting = [each for each in fitting if shape == (1, each.channels, *cells)]
         fitting = [each for each in fitting if each.sha256 == network.sha256] or fitting
         if len(fitting) != 1:
-            which = "no known layout fits; give another network, or --boxes with networks such as RTMPose"
+            which = (
+                "no known layout fits; give another network, or --boxes with networks such as "
+                "RTMPose"
+            )
             if len(fitting) > 1:
-                which = f"several layouts fit; give --layout {' or '.join(each.name for each in fitting)}"
+                which = (
+                    "several layouts fit; give --layout "
+                    f"{' or '.join(each.name for each in fitting)}"
+                )
             raise InputError(
-                f"{file}: its output for pictures of {width} x {height} pixels is {words(shape)}: {which}"
+                f"{file}: its output for pictures of {width} x {height} pixels is "
+                f"{words(shape)}: {which}"
             )
         return cls(network, fitting[0], long_side or _LONG_SIDE)
 
@@ -132,7 +145,9 @@ class HeatMapNetwork:
         return UprightView.of(region, roll_deg, self.long_side, _MULTIPLE, self.network.size)
 
     def run(self, picture: NDArray[np.uint8]) -> Blob:
-        """The output (C, H / 8, W / 8) of a `picture` (H, W, 3), blue green red; its sides are multiples of 16."""
+        """The output (C, H / 8, W / 8) of a `picture` (H, W, 3), blue green red; its sides are
+        multiples of 16.
+        """
         blob = np.ascontiguousarray(picture.transpose(2, 0, 1)[None], dtype=np.float32)
         if (self.layout.scale, self.layout.offset) != (1.0, 0.0):
             blob = blob * np.float32(self.layout.scale) + np.float32(self.layout.offset)

@@ -15,7 +15,8 @@ MOST_BYTES = 2**29
 _MOST_DEPTH = 100
 """Maximum depth of nested messages; protobuf's own limit."""
 _MOST_FIELDS = 2**20
-"""Maximum number of fields of the visited messages; networks have ten thousand to a hundred thousand."""
+"""Maximum number of fields of the visited messages; networks have ten thousand to a hundred
+thousand."""
 _LONGEST = 2**31
 """Size of a field, bytes, exclusive; protobuf's own limit."""
 _FIXED_BYTES = {1: 8, 5: 4}
@@ -25,7 +26,14 @@ _MESSAGES: dict[str, dict[int, str]] = {
     "model": {7: "graph", 20: "training", 25: "function"},
     "graph": {1: "node", 5: "tensor", 15: "sparse tensor"},
     "node": {5: "attribute"},
-    "attribute": {5: "tensor", 6: "graph", 10: "tensor", 11: "graph", 22: "sparse tensor", 23: "sparse tensor"},
+    "attribute": {
+        5: "tensor",
+        6: "graph",
+        10: "tensor",
+        11: "graph",
+        22: "sparse tensor",
+        23: "sparse tensor",
+    },
     "sparse tensor": {1: "tensor", 2: "tensor"},
     "training": {1: "graph", 2: "graph"},
     "function": {7: "node", 11: "attribute"},
@@ -41,7 +49,8 @@ class _Broken(Exception):
 
 
 def read_onnx(file: Path) -> bytes:
-    """Content of the ONNX file at `file`, at most `MOST_BYTES`, in which no tensor names another file.
+    """Content of the ONNX file at `file`, at most `MOST_BYTES`, in which no tensor names another
+    file.
 
     InputError if the file cannot be read, is no ONNX network, or has weights in other files.
     Encodings that two parsers may read differently (tags of more bytes than needed, groups) are
@@ -56,8 +65,8 @@ def read_onnx(file: Path) -> bytes:
         ) from None
     if not whole:
         raise InputError(
-            f"{file}: its weights are in another file; give a network that contains them, as written by"
-            " onnx.save_model(onnx.load(FILE), NEW)"
+            f"{file}: its weights are in another file; give a network that contains them, as "
+            "written by onnx.save_model(onnx.load(FILE), NEW)"
         )
     return content
 
@@ -94,7 +103,9 @@ def _is_whole(content: memoryview) -> bool:
                 raise _Broken(f"byte {start} begins a group")
             if at > end:
                 raise _Broken(f"the field at byte {start} ends beyond its message")
-            if message == "tensor" and (field == _EXTERNAL_DATA or (field == _DATA_LOCATION and value != 0)):
+            if message == "tensor" and (
+                field == _EXTERNAL_DATA or (field == _DATA_LOCATION and value != 0)
+            ):
                 return False
     return True
 

@@ -53,7 +53,9 @@ class OnnxNetwork:
     """Maximum number of pictures in a batch."""
 
     @classmethod
-    def open(cls, file: str | Path, backend: Backend = "onnxruntime", device: str = "cpu") -> "OnnxNetwork":
+    def open(
+        cls, file: str | Path, backend: Backend = "onnxruntime", device: str = "cpu"
+    ) -> "OnnxNetwork":
         """The network in `file`; `device` is one of `PROVIDERS`, "cuda:1" its second.
 
         InputError if the file is missing, no network or too large, if the device is not available,
@@ -90,7 +92,9 @@ def _with_opencv(file: Path, content: bytes, device: str) -> tuple[Any, ...]:
             f"{file}: cannot be read as an ONNX network by OpenCV ({error.err.strip()[:160]})"
         ) from None
     if empty:
-        raise InputError(f"{file}: cannot be read as an ONNX network; give the ONNX file of a network")
+        raise InputError(
+            f"{file}: cannot be read as an ONNX network; give the ONNX file of a network"
+        )
 
     def forward(pictures: Blob) -> list[Blob]:
         net.setInput(pictures)
@@ -105,7 +109,12 @@ def _try_elsewhere(file: Path, content: bytes) -> None:
     """
     if not sys.executable:
         return
-    command = [sys.executable, "-P", "-c", _TRY]  # -P: nothing is imported from the working directory
+    command = [
+        sys.executable,
+        "-P",
+        "-c",
+        _TRY,
+    ]  # -P: nothing is imported from the working directory
     try:
         done = subprocess.run(
             command,
@@ -119,7 +128,9 @@ def _try_elsewhere(file: Path, content: bytes) -> None:
     except subprocess.TimeoutExpired:
         what = f"OpenCV needs more than {_LOADS_S} s"
     if what:
-        raise InputError(f"{file}: cannot be read as an ONNX network by OpenCV ({what}); give another copy of it")
+        raise InputError(
+            f"{file}: cannot be read as an ONNX network by OpenCV ({what}); give another copy of it"
+        )
 
 
 def _with_onnxruntime(file: Path, content: bytes, device: str) -> tuple[Any, ...]:
@@ -129,19 +140,28 @@ def _with_onnxruntime(file: Path, content: bytes, device: str) -> tuple[Any, ...
     try:
         onnxruntime: Any = import_module("onnxruntime")
     except ImportError:
-        raise InputError(f'{file}: onnxruntime is not installed; pip install "shapepose-fg[detect]"') from None
-    kind, _, number = device.partition(":")
-    provider, there = f"{PROVIDERS.get(kind)}ExecutionProvider", onnxruntime.get_available_providers()
-    if provider not in there or not (number or "0").isdecimal():
-        known = " ".join(name for name, each in PROVIDERS.items() if f"{each}ExecutionProvider" in there)
         raise InputError(
-            f"--device {device}: the installed onnxruntime supports {known}; install the onnxruntime package"
-            " for this device"
+            f'{file}: onnxruntime is not installed; pip install "shapepose-fg[detect]"'
+        ) from None
+    kind, _, number = device.partition(":")
+    provider, there = (
+        f"{PROVIDERS.get(kind)}ExecutionProvider",
+        onnxruntime.get_available_providers(),
+    )
+    if provider not in there or not (number or "0").isdecimal():
+        known = " ".join(
+            name for name, each in PROVIDERS.items() if f"{each}ExecutionProvider" in there
+        )
+        raise InputError(
+            f"--device {device}: the installed onnxruntime supports {known}; install the "
+            "onnxruntime package for this device"
         )
     options: Any = onnxruntime.SessionOptions()
     options.intra_op_num_threads = min(cv2.getNumThreads(), os.cpu_count() or 1)
     options.log_severity_level = 4
-    options.add_session_config_entry("session.load_model_format", "ONNX")  # as checked by `read_onnx`
+    options.add_session_config_entry(
+        "session.load_model_format", "ONNX"
+    )  # as checked by `read_onnx`
     try:
         providers = [(provider, {"device_id": number} if number else {})]
         session: Any = onnxruntime.InferenceSession(
@@ -152,17 +172,24 @@ def _with_onnxruntime(file: Path, content: bytes, device: str) -> tuple[Any, ...
             f"{file}: cannot be read as an ONNX network by onnxruntime ({_first_line(error)})"
         ) from None
     if provider not in session.get_providers():  # it fell back to the CPU
-        raise InputError(f"--device {device}: this device cannot be used; check its driver, or leave out --device")
+        raise InputError(
+            f"--device {device}: this device cannot be used; check its driver, or leave out "
+            "--device"
+        )
     takes = session.get_inputs()
     if len(takes) != 1:
         raise InputError(
-            f"{file}: the network has {len(takes)} inputs; give one that has pictures as its only input"
+            f"{file}: the network has {len(takes)} inputs; give one that has pictures as its "
+            "only input"
         )
     shape = [side if type(side) is int else None for side in takes[0].shape]
     batch, _, height, width = shape if len(shape) == 4 else (1, 3, None, None)
 
     def forward(pictures: Blob) -> list[Blob]:
-        return [np.asarray(each, dtype=np.float32) for each in session.run(None, {takes[0].name: pictures})]
+        return [
+            np.asarray(each, dtype=np.float32)
+            for each in session.run(None, {takes[0].name: pictures})
+        ]
 
     size = None if height is None or width is None else (width, height)
     names = [tuple(each.name for each in ends) for ends in (takes, session.get_outputs())]

@@ -24,7 +24,11 @@ Network = HeatMapNetwork | TopDownNetwork
 
 
 def open_network(
-    network: str, boxes: str | None, named_file: Callable[[str], Path], device: str = "cpu", **openpose: Any
+    network: str,
+    boxes: str | None,
+    named_file: Callable[[str], Path],
+    device: str = "cpu",
+    **openpose: Any,
 ) -> Network:
     """Open the network of an ONNX file, of a network's TOML file, or of a name that `named_file`
     resolves to a file.
@@ -42,25 +46,40 @@ def open_network(
         form = KeypointForm(network=network)
     elif named.boxes is None:
         raise InputError(
-            f"--network {network}: this network detects people, not their joints; give it with --boxes"
+            f"--network {network}: this network detects people, not their joints; give it with "
+            "--boxes"
         )
     else:
-        form, boxes = KeypointForm(network=str(named_file(network)), size=named.size), boxes or named.boxes
+        form, boxes = (
+            KeypointForm(network=str(named_file(network)), size=named.size),
+            boxes or named.boxes,
+        )
     for name in (name for name, value in openpose.items() if value is not None):
-        raise InputError(f"--{name.replace('_', '-')} is for networks such as OpenPose; leave it out")
+        raise InputError(
+            f"--{name.replace('_', '-')} is for networks such as OpenPose; leave it out"
+        )
     people = form.boxes
     if boxes is not None:
         named = _named("--boxes", boxes)
-        people = BoxForm(network=str(named_file(boxes)), size=named.size) if named else BoxForm(network=boxes)
+        people = (
+            BoxForm(network=str(named_file(boxes)), size=named.size)
+            if named
+            else BoxForm(network=boxes)
+        )
     opened = None
     if people is not None:
         opened = OnnxNetwork.open(people.network, device=device)
         opened = BoxNetwork(opened, people.model_copy(update={"size": opened.size or people.size}))
         opened.find(np.zeros((64, 64, 3), dtype=np.uint8))
     keypoints = OnnxNetwork.open(form.network, device=device)
-    for name, there in (form.input, keypoints.inputs), *((each, keypoints.outputs) for each in form.outputs or ()):
+    for name, there in (
+        (form.input, keypoints.inputs),
+        *((each, keypoints.outputs) for each in form.outputs or ()),
+    ):
         if name is not None and name not in there:
-            raise InputError(f"{network}: the network has no {name!r}, but {' '.join(there)}; name one of these")
+            raise InputError(
+                f"{network}: the network has no {name!r}, but {' '.join(there)}; name one of these"
+            )
     form = form.model_copy(update={"size": keypoints.size or form.size})
     return TopDownNetwork.of(keypoints, form, find_skeleton(form.skeleton), opened)
 
@@ -73,7 +92,8 @@ def _named(option: str, name: str) -> NamedNetwork | None:
     if name not in named:
         names = " ".join(named)
         raise InputError(
-            f"{option} {name}: there is no such file, and no network of this name; known names are {names}"
+            f"{option} {name}: there is no such file, and no network of this name; known names "
+            f"are {names}"
         )
     return named[name]
 

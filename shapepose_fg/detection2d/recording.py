@@ -47,7 +47,9 @@ class CameraDetector:
     """The network's input."""
 
     @classmethod
-    def of(cls, camera: Camera, up: Array, footage: Footage, placement: Placement, network: Network) -> Self:
+    def of(
+        cls, camera: Camera, up: Array, footage: Footage, placement: Placement, network: Network
+    ) -> Self:
         """The detector for `camera` in a world where `up` (3,) points up."""
         view = network.view(placement.region, roll_of(camera, up))
         return cls(camera, footage, placement, network, view)
@@ -90,8 +92,11 @@ class DetectionRun:
         return {**self.cameras[0].network.settings, "cameras": cameras}
 
 
-def run_detection(run: DetectionRun, progress: Progress = lambda done, total: None) -> tuple[list[int], list[int]]:
-    """Detect in all pictures, and write <camera>.txt or <camera>.json, times.csv and footage.json into the output.
+def run_detection(
+    run: DetectionRun, progress: Progress = lambda done, total: None
+) -> tuple[list[int], list[int]]:
+    """Detect in all pictures, and write <camera>.txt or <camera>.json, times.csv and footage.json
+    into the output.
 
     Returns (V,) the number of joints in each camera's pictures, and (V,) the number of unreadable
     pictures. Blocks of an interrupted run with the same settings are reused, with the same
@@ -122,7 +127,9 @@ def run_detection(run: DetectionRun, progress: Progress = lambda done, total: No
         file = run.output / f"{each.camera.name}{network.suffix}"
         write_atomically(file, lambda stream, view=view: stream.writelines(text_of(view)))
         places = run.moments.picture[:, view]
-        used.append(CameraFootage(each.camera.name, each.footage.path.resolve(), each.placement, places))
+        used.append(
+            CameraFootage(each.camera.name, each.footage.path.resolve(), each.placement, places)
+        )
     _write_times(run)
     write_used_footage(run.output / FOOTAGE, used, network.settings)
     shutil.rmtree(unfinished)
@@ -188,21 +195,30 @@ def _refuse_others(run: DetectionRun, unfinished: Path) -> None:
     if (unfinished / _SETTINGS).is_file():
         before, now = read_json(unfinished / _SETTINGS), run.settings
         if before != now:
-            differ = [key for key in now if not isinstance(before, dict) or before.get(key) != now[key]]
+            differ = [
+                key for key in now if not isinstance(before, dict) or before.get(key) != now[key]
+            ]
             raise InputError(
-                f"{unfinished}: there is an interrupted run with different {' and '.join(differ)}; start it with"
-                " the same options to continue, or delete this folder"
+                f"{unfinished}: there is an interrupted run with different "
+                f"{' and '.join(differ)}; start it with the same options to continue, or delete "
+                "this folder"
             )
     elif unfinished.exists() and any(unfinished.iterdir()):
         raise InputError(
-            f"{unfinished}: this is not a run of this program; delete the folder, or give another --output"
+            f"{unfinished}: this is not a run of this program; delete the folder, or give "
+            "another --output"
         )
     elif there := [place for place in places if place.exists()]:
-        raise InputError(f"{there[0]}: there are detections already; delete them, or give another --output")
+        raise InputError(
+            f"{there[0]}: there are detections already; delete them, or give another --output"
+        )
 
 
 def _state(path: Path) -> list[int]:
     """Size and modification time of a video, or of a folder's pictures, for detecting changes."""
     files = [path] if path.is_file() else sorted(each for each in path.iterdir() if each.is_file())
     states = [each.stat() for each in files]
-    return [sum(each.st_size for each in states), max((each.st_mtime_ns for each in states), default=0)]
+    return [
+        sum(each.st_size for each in states),
+        max((each.st_mtime_ns for each in states), default=0),
+    ]

@@ -35,7 +35,8 @@ class KeypointForm(BaseModel, extra="forbid"):
     skeleton: str | None = None
     """One of `SKELETONS`, or a skeleton's TOML file; None if the number of joints determines it."""
     joints: list[str] | None = None
-    """Name of each joint of the network in the skeleton, "" for none; None for its keypoints in order."""
+    """Name of each joint of the network in the skeleton, "" for none; None for its keypoints in
+    order."""
     decoding: Literal["simcc", "heat map", "coordinates"] = "simcc"
     """Output of the network: for each joint two 1D distributions along x and y (SimCC), a heat map,
     or x, y and score."""
@@ -53,7 +54,8 @@ class KeypointForm(BaseModel, extra="forbid"):
     std: tuple[_Above0, _Above0, _Above0] = (58.395, 57.12, 57.375)
     """Standard deviation by which the colours are divided after that."""
     cells: Literal["corners", "edges"] = "corners"
-    """Whether the outer cells of a heat map have their centres on the input's outer pixels, or fill the input."""
+    """Whether the outer cells of a heat map have their centres on the input's outer pixels, or fill
+    the input."""
     scale: tuple[FiniteFloat, FiniteFloat] = (1.0, 1.0)
     """Pixels of the input per unit of coordinates, x and y."""
     padding: Annotated[FiniteFloat, Field(ge=1, le=4)] = 1.25
@@ -75,7 +77,9 @@ class People:
         return int((self.score > 0).sum())
 
     def moved(self, xy: Array, inside: Mask) -> "People":
-        """Return the people at other positions; joints that are not `inside` (P, K) get the score 0."""
+        """Return the people at other positions; joints that are not `inside` (P, K) get the score
+        0.
+        """
         return replace(self, xy=xy, score=np.where(inside, self.score, 0.0))
 
 
@@ -99,25 +103,35 @@ class TopDownNetwork:
 
     @classmethod
     def of(
-        cls, network: OnnxNetwork, form: KeypointForm, skeleton: Skeleton | None, boxes: BoxNetwork | None
+        cls,
+        network: OnnxNetwork,
+        form: KeypointForm,
+        skeleton: Skeleton | None,
+        boxes: BoxNetwork | None,
     ) -> "TopDownNetwork":
         """Load the network and run it on an empty picture: InputError if it does not fit its
         description.
         """
-        count = _decoded(network, form, np.zeros((1, 3, *form.size[::-1]), dtype=np.float32))[1].shape[1]
-        skeleton = skeleton or next((each for each in SKELETONS.values() if each.keypoint_count == count), None)
+        count = _decoded(network, form, np.zeros((1, 3, *form.size[::-1]), dtype=np.float32))[
+            1
+        ].shape[1]
+        skeleton = skeleton or next(
+            (each for each in SKELETONS.values() if each.keypoint_count == count), None
+        )
         if skeleton is None:
             raise InputError(
-                f"{network.file}: no known skeleton has {count} joints; describe it in a TOML file of the network"
+                f"{network.file}: no known skeleton has {count} joints; describe it in a TOML "
+                "file of the network"
             )
         keypoints = range(len(skeleton)) if skeleton.keypoints is None else skeleton.keypoints
         names = ["" if joint < 0 else skeleton.joints[joint] for joint in keypoints]
         listed = names if form.joints is None else form.joints
-        if wrong := [name for name in listed if name and (name not in names or listed.count(name) > 1)]:
+        if wrong := [
+            name for name in listed if name and (name not in names or listed.count(name) > 1)
+        ]:
             raise InputError(
-                f"{network.file}: joints has {wrong[0]!r}, which must be a keypoint of {skeleton.name} without"
-                " repetition"
-                f' ({" ".join(filter(None, names))}), or ""'
+                f"{network.file}: joints has {wrong[0]!r}, which must be a keypoint of {skeleton.name}"
+                f' without repetition ({" ".join(filter(None, names))}), or ""'
             )
         if len(listed) != count:
             raise InputError(
@@ -132,7 +146,10 @@ class TopDownNetwork:
         """All settings that affect the detections."""
         said = [
             part
-            and {"sha256": part.network.sha256, **part.form.model_dump(mode="json", exclude={"network", "boxes"})}
+            and {
+                "sha256": part.network.sha256,
+                **part.form.model_dump(mode="json", exclude={"network", "boxes"}),
+            }
             for part in (self, self.boxes)
         ]
         return {"network": said[0], "detection": {"boxes": said[1]}}
@@ -141,7 +158,11 @@ class TopDownNetwork:
         """The beginning of MMPose's JSON of a video, with the layout of the joints unless it was
         guessed.
         """
-        alike = [each for each in SKELETONS.values() if each.keypoint_count == self.skeleton.keypoint_count]
+        alike = [
+            each
+            for each in SKELETONS.values()
+            if each.keypoint_count == self.skeleton.keypoint_count
+        ]
         named = self.form.skeleton in SKELETONS or alike == [self.skeleton]
         meta = {"dataset_name": self.skeleton.name} if named else {}
         return f'{{"meta_info": {json.dumps(meta)}, "instance_info": ['
@@ -153,9 +174,13 @@ class TopDownNetwork:
         people = []
         for xy, score in zip(found.xy, found.score, strict=True) if found else ():
             if (seen := score > 0).any():
-                xy, score = np.where(seen[:, None], xy, 0.0).round(3), np.where(seen, score, 0.0).round(6)
+                xy, score = (
+                    np.where(seen[:, None], xy, 0.0).round(3),
+                    np.where(seen, score, 0.0).round(6),
+                )
                 people.append({"keypoints": xy.tolist(), "keypoint_scores": score.tolist()})
-        return f"{',' if number else ''}\n{json.dumps({'frame_id': number, 'instances': people}, allow_nan=False)}"
+        frame = json.dumps({"frame_id": number, "instances": people}, allow_nan=False)
+        return f"{',' if number else ''}\n{frame}"
 
     def view(self, region: tuple[float, float, float, float], roll_deg: float) -> UprightView:
         """The input for pictures with the given region and roll, at full resolution."""
@@ -177,7 +202,9 @@ class TopDownNetwork:
             crops = [_crop(picture, *each, size) for each in zip(middle, sides, strict=True)]
             xy, score = self._joints(np.stack(crops))
             # A network that gets whole pictures may find several people in each.
-            middle, sides = (np.repeat(each, len(xy) // len(crops), axis=0)[:, None] for each in (middle, sides))
+            middle, sides = (
+                np.repeat(each, len(xy) // len(crops), axis=0)[:, None] for each in (middle, sides)
+            )
             positions.append((xy / size - 0.5) * sides + middle)
             scores.append(score)
         return People(np.concatenate(positions), np.concatenate(scores))
@@ -189,7 +216,9 @@ class TopDownNetwork:
         values that are not finite, have a score of 0.
         """
         ordered = crops if self.form.colours == "bgr" else crops[..., ::-1]
-        blob = ((ordered - np.array(self.form.mean)) / np.array(self.form.std)).transpose(0, 3, 1, 2)
+        blob = ((ordered - np.array(self.form.mean)) / np.array(self.form.std)).transpose(
+            0, 3, 1, 2
+        )
         xy, score = _decoded(self.network, self.form, np.ascontiguousarray(blob, dtype=np.float32))
         found = np.zeros((len(xy), self.skeleton.keypoint_count, 3))
         known = np.flatnonzero(self.place >= 0)
@@ -198,7 +227,9 @@ class TopDownNetwork:
         return found[..., :2], found[..., 2]
 
 
-def _crop(picture: NDArray[np.uint8], centre: Array, extent: Array, size: Array) -> NDArray[np.uint8]:
+def _crop(
+    picture: NDArray[np.uint8], centre: Array, extent: Array, size: Array
+) -> NDArray[np.uint8]:
     """Cut the part of a picture around `centre` (2,) with the sides `extent` (2,), resized to the
     network's input `size` (2,). Outside of the picture it is black.
     """
@@ -207,7 +238,9 @@ def _crop(picture: NDArray[np.uint8], centre: Array, extent: Array, size: Array)
     points = np.array([[centre, centre], [size / 2, size / 2]])
     points[:, 1, 1] -= extent[0] / 2, size[0] / 2
     points = points.astype(np.float32)
-    beside = points[:, 1] + (points[:, 1] - points[:, 0])[:, ::-1] * np.array([1, -1], dtype=np.float32)
+    beside = points[:, 1] + (points[:, 1] - points[:, 0])[:, ::-1] * np.array(
+        [1, -1], dtype=np.float32
+    )
     matrix = cv2.getAffineTransform(*np.concatenate([points, beside[:, None]], axis=1))
     crop = cv2.warpAffine(picture, matrix, (int(size[0]), int(size[1])), flags=cv2.INTER_LINEAR)
     return np.asarray(crop, dtype=np.uint8)
@@ -230,9 +263,9 @@ def _decoded(network: OnnxNetwork, form: KeypointForm, blob: Blob) -> tuple[Arra
         or (form.decoding == "coordinates" and shapes[0][2] not in (2, 3))
     ):
         raise InputError(
-            f"{network.file}: the output of the network is"
-            f" {' and '.join(words(each.shape) for each in outputs)}, which is not a {form.decoding};"
-            " describe the network in a TOML file (docs/detection.md)"
+            f"{network.file}: the output of the network is "
+            f"{' and '.join(words(each.shape) for each in outputs)}, which is not a "
+            f"{form.decoding}; describe the network in a TOML file (docs/detection.md)"
         )
     size = np.array(blob.shape[:1:-1])
     if form.decoding == "simcc":
@@ -242,7 +275,9 @@ def _decoded(network: OnnxNetwork, form: KeypointForm, blob: Blob) -> tuple[Arra
     if form.decoding == "heat map":
         return _peaks(read[0], size, form.cells == "corners")
     (found,) = read
-    return found[..., :2] * form.scale, found[..., 2] if shapes[0][2] == 3 else np.ones(shapes[0][:2])
+    return found[..., :2] * form.scale, found[..., 2] if shapes[0][2] == 3 else np.ones(
+        shapes[0][:2]
+    )
 
 
 def _peaks(maps: Array, size: Index, corners: bool) -> tuple[Array, Array]:
@@ -255,5 +290,9 @@ def _peaks(maps: Array, size: Index, corners: bool) -> tuple[Array, Array]:
     padded = np.pad(flat, ((0, 0), (1, 1), (1, 1)), constant_values=-np.inf)
     cell, height = between_cells(padded, np.arange(len(flat)), row + 1, column + 1)
     cell -= 1
-    pixel = cell * (size - 1) / np.maximum(shape - 1, 1) if corners else (cell + 0.5) * size / shape - 0.5
+    pixel = (
+        cell * (size - 1) / np.maximum(shape - 1, 1)
+        if corners
+        else (cell + 0.5) * size / shape - 0.5
+    )
     return pixel.reshape(*maps.shape[:2], 2), height.reshape(maps.shape[:2])

@@ -45,7 +45,8 @@ class UprightView:
     input_from_picture: Array
     """(2, 3) affine map of the picture's pixels to those of the input."""
     region: tuple[float, float, float, float]
-    """Left, top, right, bottom edge of the region, pixels of the picture; the centre of the first pixel is 0."""
+    """Left, top, right, bottom edge of the region, pixels of the picture; the centre of the first
+    pixel is 0."""
     turn_deg: float
     """Rotation of the picture, degrees clockwise."""
 
@@ -63,7 +64,8 @@ class UprightView:
         multiple: int = 1,
         only_size: tuple[int, int] | None = None,
     ) -> "UprightView":
-        """The view of a `region` rotated clockwise by `roll_deg`, about `long_side` pixels along its longer side.
+        """The view of a `region` rotated clockwise by `roll_deg`, about `long_side` pixels along
+        its longer side.
 
         Without `long_side` the scale is 1. Rolls under `LEVEL_DEG` from a multiple of 90 degrees
         are rotated by that multiple. Both sides are the nearest multiples of `multiple`, so that
@@ -90,23 +92,34 @@ class UprightView:
         return cls((int(size[0]), int(size[1])), matrix, region, roll_deg)
 
     def input_of(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The network's input (height, width, 3) of a `picture`; outside the region it has the mean colour."""
+        """The network's input (height, width, 3) of a `picture`; outside the region it has the mean
+        colour.
+        """
         left, top, right, bottom = (round(edge + 0.5) for edge in self.region)
         part = picture[max(top, 0) : bottom, max(left, 0) : right]
         matrix = self.input_from_picture.copy()
         matrix[:, 2] += matrix[:, :2] @ (max(left, 0), max(top, 0))
         # First reduced by area averaging: direct sampling of a much larger picture would skip most
         # of its pixels.
-        size = np.maximum(np.round(np.array(part.shape[1::-1]) * min(self.scale, 1.0)), 1).astype(int)
-        small, ratio = cv2.resize(part, size.tolist(), interpolation=cv2.INTER_AREA), part.shape[1::-1] / size
+        size = np.maximum(np.round(np.array(part.shape[1::-1]) * min(self.scale, 1.0)), 1).astype(
+            int
+        )
+        small, ratio = (
+            cv2.resize(part, size.tolist(), interpolation=cv2.INTER_AREA),
+            part.shape[1::-1] / size,
+        )
         matrix[:, 2] += matrix[:, :2] @ (0.5 * ratio - 0.5)
         matrix[:, :2] = matrix[:, :2] * ratio
-        turned = cv2.warpAffine(small, matrix, self.size, flags=cv2.INTER_LINEAR, borderValue=cv2.mean(small)[:3])
+        turned = cv2.warpAffine(
+            small, matrix, self.size, flags=cv2.INTER_LINEAR, borderValue=cv2.mean(small)[:3]
+        )
         return np.asarray(turned, dtype=np.uint8)
 
     def picture_from_input(self, xy: Array) -> Array:
         """Pixels (..., 2) of the picture for pixels of the input."""
-        return (xy - self.input_from_picture[:, 2]) @ np.linalg.inv(self.input_from_picture[:, :2]).T
+        return (xy - self.input_from_picture[:, 2]) @ np.linalg.inv(
+            self.input_from_picture[:, :2]
+        ).T
 
     def inside(self, xy: Array) -> Mask:
         """(...,) which pixels (..., 2) of the picture lie in the region."""

@@ -35,7 +35,9 @@ def limbs_to_exchange(joints: Sequence[str]) -> Index:
 
     A foot goes with its ankle.
     """
-    named = [(far, near, far) for near, far in ARMS_AND_LEGS] + [(foot, "Knee", "Ankle") for foot in _FEET]
+    named = [(far, near, far) for near, far in ARMS_AND_LEGS] + [
+        (foot, "Knee", "Ankle") for foot in _FEET
+    ]
     return np.array(on_both_sides(named, joints), dtype=np.intp).reshape(-1, 3)
 
 
@@ -58,7 +60,9 @@ def exchange_spread(joints: Array, bodies: Array, frame: Whole, limbs: Index) ->
         misfit = across - length[rows][:, None]
         fits = np.exp(-0.5 * (misfit**2 + misfit.swapaxes(0, 1) ** 2) / FITS_M**2)
         fits = np.where(np.linalg.norm(away, axis=-1) < REACH_M, np.nan_to_num(fits), 0.0)
-        spread[rows[:, None], far] = np.einsum("pql,pqli,pqlk->plik", fits, *(np.nan_to_num(away),) * 2)
+        spread[rows[:, None], far] = np.einsum(
+            "pql,pqli,pqlk->plik", fits, *(np.nan_to_num(away),) * 2
+        )
     return spread
 
 
@@ -68,7 +72,10 @@ def mirrored_spread(joints: Array, mirrored: Array, names: Sequence[str]) -> Arr
 
     Weighted by the probability of exchanged sides, `mirrored` (N, J, V) of the row's observations.
     """
-    other = [names.index(mirror_of(name)) if mirror_of(name) in names else n for n, name in enumerate(names)]
+    other = [
+        names.index(mirror_of(name)) if mirror_of(name) in names else n
+        for n, name in enumerate(names)
+    ]
     doubt = mirrored.max(axis=2, initial=0.0)
     doubt = np.maximum(doubt, doubt[:, other])
     away = np.nan_to_num(joints[:, other] - joints) * np.sqrt(doubt)[..., None]
@@ -99,14 +106,21 @@ def association_spread(
     if len(row) == 0:
         return spread
     _, _, jacobian = views.rows(row).project(joints[row, joint][:, None])
-    jacobian, residual = jacobian[np.arange(len(row)), 0, view], evidence.residual_px[row, joint, view]
+    jacobian, residual = (
+        jacobian[np.arange(len(row)), 0, view],
+        evidence.residual_px[row, joint, view],
+    )
     sigma, p = sigmas[row, joint, view], probability[row, joint, view]
-    weight = kernel_weight(config.robust_kernel, np.linalg.norm(residual, axis=-1) / sigma) / sigma**2
+    weight = (
+        kernel_weight(config.robust_kernel, np.linalg.norm(residual, axis=-1) / sigma) / sigma**2
+    )
     information = weight[:, None, None] * jacobian.mT @ jacobian
     gradient = weight[:, None] * np.einsum("nik,ni->nk", jacobian, residual)
     pull = np.einsum("...ij,...j->...i", body.information, joints - np.nan_to_num(body.xyz))
     all_of_it = (evidence.gradient + pull)[row, joint] - gradient
-    rest = (evidence.information + body.information)[row, joint] - information + np.eye(3) / FREE_M**2
+    rest = (
+        (evidence.information + body.information)[row, joint] - information + np.eye(3) / FREE_M**2
+    )
     without = np.linalg.solve(rest, all_of_it[..., None])
     certain = np.linalg.solve(
         rest + information / p[:, None, None], (all_of_it + gradient / p[:, None])[..., None]

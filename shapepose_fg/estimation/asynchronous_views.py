@@ -47,7 +47,9 @@ def velocities_of(observations: Observations, points: Array) -> Array:
     return np.nan_to_num(velocity)
 
 
-def carried_to_frames(observations: Observations, points: Array, velocity: Array, views: Views) -> Observations:
+def carried_to_frames(
+    observations: Observations, points: Array, velocity: Array, views: Views
+) -> Observations:
     """The observations shifted to their frames' time, for joints at `points` (N, J, 3), metres,
     with `velocity` (N, J, 3), m/s.
     """

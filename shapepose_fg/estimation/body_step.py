@@ -39,16 +39,21 @@ class BodyStep:
         information = known[..., None, None] * np.eye(3) / JOINT_SIGMA_M**2
         return JointTargets(np.nan_to_num(evidence.points), information)
 
-    def fit_changed(self, targets: JointTargets, last: BodyFit, told: JointTargets) -> tuple[BodyFit, Index]:
+    def fit_changed(
+        self, targets: JointTargets, last: BodyFit, told: JointTargets
+    ) -> tuple[BodyFit, Index]:
         """Fit bodies (R) again where targets differ from `told`, those of the `last` fit; also
         returns these rows.
         """
         near_m = _SAME * self.config.refine.settled_m
-        over_time = np.concatenate([np.full(len(person), person.temporal) for person in self.people])
+        over_time = np.concatenate(
+            [np.full(len(person), person.temporal) for person in self.people]
+        )
         rows = np.arange(len(targets))
         if near_m > 0:
             rows = np.union1d(
-                changed_targets(told, targets, near_m, _AS_MUCH), np.flatnonzero(over_time | ~last.ok)
+                changed_targets(told, targets, near_m, _AS_MUCH),
+                np.flatnonzero(over_time | ~last.ok),
             )
         return last.with_rows(rows, self.fit(targets, last, rows)) if len(rows) > 0 else last, rows
 
@@ -60,14 +65,24 @@ class BodyStep:
         of their own.
         """
         lengths = [len(person) for person in self.people]
-        groups = np.repeat(np.arange(len(lengths)), lengths) if max(lengths, default=1) > 1 else None
+        groups = (
+            np.repeat(np.arange(len(lengths)), lengths) if max(lengths, default=1) > 1 else None
+        )
         if rows is not None:
             targets = targets.rows(rows)
             last, groups = last.rows(rows), None if groups is None else groups[rows]
         if self.config.refine.body_from_views:
             return self.fitter.fit(targets, last, groups)
-        fit = self.fitter.fit_whole(targets, last) if groups is None else self.fitter.fit(targets, last, groups)
-        return replace(fit, prior_xyz=fit.joints, prior_covariance=fit.covariance + MODEL_SIGMA_M**2 * np.eye(3))
+        fit = (
+            self.fitter.fit_whole(targets, last)
+            if groups is None
+            else self.fitter.fit(targets, last, groups)
+        )
+        return replace(
+            fit,
+            prior_xyz=fit.joints,
+            prior_covariance=fit.covariance + MODEL_SIGMA_M**2 * np.eye(3),
+        )
 
     def message(self, body: BodyFit, targets: JointTargets, pulled: Mask) -> JointTargets:
         """The bodies' constraints on the joints `pulled` (R, J): E_shape of Eq. 3."""
@@ -83,12 +98,17 @@ class BodyStep:
             information[:, columns] = 0.0
             alone = self.fit(JointTargets(targets.xyz, information), body, rows)
             here = np.ix_(rows, columns)
-            xyz[here], covariance[here] = alone.prior_xyz[:, columns], alone.prior_covariance[:, columns]
+            xyz[here], covariance[here] = (
+                alone.prior_xyz[:, columns],
+                alone.prior_covariance[:, columns],
+            )
             ok[here] = alone.ok[:, None]
         pulled = pulled & ok
         information = np.zeros_like(covariance)
         sigma_m = self.config.graph.shape_sigma_m
-        information[pulled] = np.eye(3) / sigma_m**2 if sigma_m > 0 else np.linalg.inv(covariance[pulled])
+        information[pulled] = (
+            np.eye(3) / sigma_m**2 if sigma_m > 0 else np.linalg.inv(covariance[pulled])
+        )
         return JointTargets(np.where(pulled[..., None], xyz, np.nan), information)
 
 

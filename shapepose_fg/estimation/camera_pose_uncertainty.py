@@ -25,7 +25,11 @@ POSES_LAST_S = 3.0
 
 
 def carried_covariance(
-    evidence: ViewEvidence, body: JointTargets, sigmas: Array, views: Views, config: ObservationConfig
+    evidence: ViewEvidence,
+    body: JointTargets,
+    sigmas: Array,
+    views: Views,
+    config: ObservationConfig,
 ) -> Array:
     """(N, J, 3, 3) covariance of joints from uncertain camera poses, m²; zero for
     static cameras.
@@ -44,11 +48,17 @@ def reported_with_poses(
     """
     sigmas = observation_sigmas(rows, joints, views, config, names)
     nothing = JointTargets(joints, np.zeros((*joints.shape, 3)))
-    return goes_with_poses(linearise(rows, sigmas, joints, views, config), nothing, sigmas, views, config)
+    return goes_with_poses(
+        linearise(rows, sigmas, joints, views, config), nothing, sigmas, views, config
+    )
 
 
 def goes_with_poses(
-    evidence: ViewEvidence, body: JointTargets, sigmas: Array, views: Views, config: ObservationConfig
+    evidence: ViewEvidence,
+    body: JointTargets,
+    sigmas: Array,
+    views: Views,
+    config: ObservationConfig,
 ) -> Array:
     """(N, J, B, 3, 6) derivatives of joints by the poses of the B carriers of cameras, at least
     one.
@@ -75,6 +85,8 @@ def goes_with_poses(
         R, t = carried.wTb[:, number, :3, :3], carried.wTb[:, number, :3, 3]
         arm = points - t[:, None]
         # A rotation w and a translation v along the carrier's axes move a point by R w x arm + R v.
-        goes = np.concatenate([-hat(arm) @ R[:, None], np.broadcast_to(R[:, None], (*arm.shape, 3))], axis=-1)
+        goes = np.concatenate(
+            [-hat(arm) @ R[:, None], np.broadcast_to(R[:, None], (*arm.shape, 3))], axis=-1
+        )
         found[:, :, number] = gain @ goes
     return found

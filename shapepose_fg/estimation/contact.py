@@ -40,7 +40,9 @@ where the motion model is stronger."""
 
 def feet_of(joints: Sequence[str]) -> Index:
     """(F,) indices of a detector's joints that stand with a foot."""
-    return np.array([n for n, name in enumerate(joints) if name[:1] in "RL" and name[1:] in FEET], dtype=np.intp)
+    return np.array(
+        [n for n, name in enumerate(joints) if name[:1] in "RL" and name[1:] in FEET], dtype=np.intp
+    )
 
 
 def walking(problem: Problem, feet: Index, initial: Array, lost: Mask | None) -> Problem:
@@ -56,7 +58,9 @@ def walking(problem: Problem, feet: Index, initial: Array, lost: Mask | None) ->
         if lost is not None:
             # A standing guess of the body is not evidence, except for a short time.
             velocity = np.where(
-                near_in_time(~lost[:, joints], problem.times_s, UNSEEN_S)[..., None], velocity, np.nan
+                near_in_time(~lost[:, joints], problem.times_s, UNSEEN_S)[..., None],
+                velocity,
+                np.nan,
             )
         density = standing_density(velocity, chains.covariances(at)[1], problem.times_s)
         standing[:, joints] = np.where(density > FREE_M2_S, np.inf, density)
@@ -72,7 +76,9 @@ def standing_density(velocity: Array, covariance: Array, times_s: Array) -> Arra
     is uncertain whether a foot stands, it is hardly constrained.
     """
     known = np.asarray(np.isfinite(velocity).all(axis=2) & np.isfinite(covariance).all(axis=(2, 3)))
-    log = log_densities(np.nan_to_num(velocity), np.where(known[..., None, None], covariance, np.eye(3)))
+    log = log_densities(
+        np.nan_to_num(velocity), np.where(known[..., None, None], covariance, np.eye(3))
+    )
     probability = smoothed(np.where(known[..., None], log, 0.0), times_s)
     density = probability @ (2 * SPEEDS_M_S**2 * CORRELATION_S)
     return (density[1:] + density[:-1]) / 2

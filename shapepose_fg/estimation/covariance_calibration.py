@@ -66,7 +66,9 @@ class CovarianceFeatures:
         """
         known = np.isfinite(self.covariance).all(axis=(-2, -1))
         variance = np.where(known, np.trace(self.covariance, axis1=-2, axis2=-1) / 3, 0.0)
-        sigma_m = np.sqrt(variance).sum(axis=1, keepdims=True) / np.maximum(known.sum(axis=1, keepdims=True), 1)
+        sigma_m = np.sqrt(variance).sum(axis=1, keepdims=True) / np.maximum(
+            known.sum(axis=1, keepdims=True), 1
+        )
         return np.square(np.log(np.clip(sigma_m / SURE_M, 1.0, PERSON_MOST)))
 
 
@@ -91,9 +93,9 @@ class Calibration:
     """Factor on the feature of this name: probability that two limbs that fit both bodies are
     exchanged."""
     person: float
-    """Covariances are multiplied by the exponential of this times `CovarianceFeatures.person`. If the overall
-    uncertainty of a person is large, its detections more often belong to another person, and no
-    other feature shows this."""
+    """Covariances are multiplied by the exponential of this times `CovarianceFeatures.person`. If
+    the overall uncertainty of a person is large, its detections more often belong to another
+    person, and no other feature shows this."""
 
     @classmethod
     def load(cls, joints: tuple[str, ...]) -> "Calibration":
@@ -110,6 +112,10 @@ class Calibration:
     def covariance(self, clues: CovarianceFeatures) -> Array:
         """(N, J, 3, 3) covariances to report, m²."""
         times = self.scale * (1 + clues.disagreement) ** self.power * clues.carried**self.unseen
-        added = self.association * clues.association + self.draft * clues.draft + self.exchange * clues.exchange
+        added = (
+            self.association * clues.association
+            + self.draft * clues.draft
+            + self.exchange * clues.exchange
+        )
         whole = times[..., None, None] * clues.covariance + added
         return np.exp(self.person * clues.person)[..., None, None] * whole

@@ -11,7 +11,12 @@ from shapepose_fg.core.bounds import Settings
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, observation_sigmas, triangulate
+from shapepose_fg.estimation.linearisation import (
+    ObservationConfig,
+    linearise,
+    observation_sigmas,
+    triangulate,
+)
 
 _MIN_VIEWS = 3
 """Minimum number of views that agree on a joint; two that agree may both be wrong."""
@@ -29,8 +34,8 @@ class OffsetConfig(Settings):
     """
 
     source: str = "recording"
-    """"recording" learns both from the recording itself. "none" uses no offsets, and the shipped noise
-    law. Otherwise it is a file with offsets: the run.json of another recording with the same
+    """"recording" learns both from the recording itself. "none" uses no offsets, and the shipped
+    noise law. Otherwise it is a file with offsets: the run.json of another recording with the same
     detector, which also has a noise law, or a file from `KeypointOffsets.save`."""
     frames: Annotated[int, Interval(ge=1, le=10000)] = 30
     """Number of frames, spread over the whole recording, for estimating offsets."""
@@ -52,7 +57,9 @@ def spread_frames(length: int, count: int) -> list[int]:
     return np.unique(np.linspace(0, length - 1, count).round().astype(int)).tolist()
 
 
-def confident_targets(observations: Observations, rig: Rig, config: ObservationConfig) -> JointTargets:
+def confident_targets(
+    observations: Observations, rig: Rig, config: ObservationConfig
+) -> JointTargets:
     """Estimates of well observed joints from the views only, with zero information for all others.
 
     The body is not used, because its constraints would hide the detector's offsets.
@@ -62,6 +69,10 @@ def confident_targets(observations: Observations, rig: Rig, config: ObservationC
     sigmas = observation_sigmas(observations, points, views, config, BODY_25.joints)
     evidence = linearise(observations, sigmas, points, views, config)
     evidence = linearise(observations, sigmas, evidence.target, views, config)
-    sure = (evidence.inlier & (observations.confidence >= _MIN_CONFIDENCE)).sum(axis=-1) >= _MIN_VIEWS
+    sure = (evidence.inlier & (observations.confidence >= _MIN_CONFIDENCE)).sum(
+        axis=-1
+    ) >= _MIN_VIEWS
     sure &= evidence.sigma_m <= _MAX_SIGMA_M
-    return JointTargets(np.nan_to_num(evidence.target), np.where(sure[..., None, None], evidence.information, 0.0))
+    return JointTargets(
+        np.nan_to_num(evidence.target), np.where(sure[..., None, None], evidence.information, 0.0)
+    )

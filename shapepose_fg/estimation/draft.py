@@ -78,7 +78,11 @@ def draft(
 
 
 def redraft(
-    last: Draft | None, observations: Observations, views: Views, fitter: BodyFitter, config: EstimatorConfig
+    last: Draft | None,
+    observations: Observations,
+    views: Views,
+    fitter: BodyFitter,
+    config: EstimatorConfig,
 ) -> Draft:
     """`draft`, but rows keep their `last` estimate if their detections are the same, with similar
     probabilities.
@@ -93,7 +97,9 @@ def redraft(
         probability[here] = last.observations.probability[there]
     rows = np.setdiff1d(np.arange(len(places)), here)
     if len(rows) > 0:
-        places[rows], covariance[rows] = draft(observations.rows(rows), views.rows(rows), fitter, config)
+        places[rows], covariance[rows] = draft(
+            observations.rows(rows), views.rows(rows), fitter, config
+        )
     return Draft(replace(observations, probability=probability), places, covariance)
 
 
@@ -110,7 +116,9 @@ def _unchanged(now: Observations, before: Observations) -> tuple[Index, Index]:
     return here[same], there[same]
 
 
-def first_places(observations: Observations, views: Views, fitter: BodyFitter, config: EstimatorConfig) -> Array:
+def first_places(
+    observations: Observations, views: Views, fitter: BodyFitter, config: EstimatorConfig
+) -> Array:
     """X_0 (N, J, 3), metres: joints of stage I, else triangulated ones, and in windows of several
     frames initial estimates, so that a single view of a joint counts from the first round on.
     """
@@ -136,7 +144,9 @@ def drafted(evidence: ViewEvidence, body: BodyFit, disagreement: float) -> tuple
     from the body are ignored, as its robust kernel did.
     """
     known = (body.ok[:, None] & np.isfinite(body.covariance).all(axis=(2, 3)))[..., None]
-    covariance = np.where(known[..., None], body.covariance + MODEL_SIGMA_M**2 * np.eye(3), np.eye(3))
+    covariance = np.where(
+        known[..., None], body.covariance + MODEL_SIGMA_M**2 * np.eye(3), np.eye(3)
+    )
     of_body = np.where(known[..., None], inverses(covariance), 0.0)
     views, target = evidence.information, np.nan_to_num(evidence.target)
     at = np.where(known, body.joints, target)

@@ -72,7 +72,13 @@ class RefineConfig(Settings):
     @classmethod
     def paper(cls) -> "RefineConfig":
         """Algorithm 1 as written, with N = 10."""
-        return cls(alternations=10, settled_m=0.0, disagreement=0.0, complete_start=False, body_from_views=False)
+        return cls(
+            alternations=10,
+            settled_m=0.0,
+            disagreement=0.0,
+            complete_start=False,
+            body_from_views=False,
+        )
 
     @property
     def contradiction(self) -> float:

@@ -52,7 +52,9 @@ def factor_evidence(window: WindowGraph, t: int, joint: int) -> list[FactorEvide
         return []
 
 
-def _evidence(factor: UserFactor, key: int, window: WindowGraph, marginals: gtsam.Marginals) -> FactorEvidence:
+def _evidence(
+    factor: UserFactor, key: int, window: WindowGraph, marginals: gtsam.Marginals
+) -> FactorEvidence:
     linear = factor.factor.linearize(window.values)
     keys = list(linear.keys())
     sizes = [len(marginals.marginalCovariance(each)) for each in keys]

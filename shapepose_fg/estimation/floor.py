@@ -79,11 +79,15 @@ def find_floor(points: Array, look: Index, up: Array, tilt_rad: float = TILT_RAD
     """
     numbers, whose, count = np.unique(look, return_inverse=True, return_counts=True)
     if len(numbers) < LEAST_LOOKS:
-        return f"{len(numbers)} measurements of standing feet, but at least {LEAST_LOOKS} are needed"
+        return (
+            f"{len(numbers)} measurements of standing feet, but at least {LEAST_LOOKS} are needed"
+        )
     weight, height = 1.0 / count[whose], points @ up
     order = np.argsort(height, kind="stable")
     total = np.concatenate([[0.0], np.cumsum(weight[order])])
-    within = total[np.searchsorted(height[order], height[order] + 2 * NEAR_M, side="right")] - total[:-1]
+    within = (
+        total[np.searchsorted(height[order], height[order] + 2 * NEAR_M, side="right")] - total[:-1]
+    )
     start = height[order][within.argmax()] + NEAR_M
     middle = np.average(points, axis=0, weights=weight * (np.abs(height - start) <= NEAR_M))
     across = basis_across(up)
@@ -91,15 +95,20 @@ def find_floor(points: Array, look: Index, up: Array, tilt_rad: float = TILT_RAD
     prior = np.diag([0.0, *np.full(2, (SCALE_M / tilt_rad) ** 2)])
     found = np.array([start, 0.0, 0.0])
     for _ in range(20):
-        kept = weight * np.maximum(1 - ((height - design @ found) / (4.685 * SCALE_M)) ** 2, 0.0) ** 2  # Tukey
+        kept = (
+            weight * np.maximum(1 - ((height - design @ found) / (4.685 * SCALE_M)) ** 2, 0.0) ** 2
+        )  # Tukey
         information = design.T @ (kept[:, None] * design) + prior
         found = np.linalg.solve(information, design.T @ (kept * height))
     left = height - design @ found
     share, under = (
-        float(weight[chosen].sum() / len(numbers)) for chosen in (np.abs(left) <= NEAR_M, left < -UNDER_M)
+        float(weight[chosen].sum() / len(numbers))
+        for chosen in (np.abs(left) <= NEAR_M, left < -UNDER_M)
     )
     if share < AGREE:
-        return f"{share:.0%} of standing feet agree on a height, but at least {AGREE:.0%} are needed"
+        return (
+            f"{share:.0%} of standing feet agree on a height, but at least {AGREE:.0%} are needed"
+        )
     if under > UNDER_SHARE:
         return f"{under:.0%} of standing feet are below where most stand"
     normal = up - found[1:] @ across

@@ -50,8 +50,12 @@ def _hop_ends(known: Mask, times_s: Array) -> tuple[Index, Index]:
     before = np.searchsorted(times_s, times_s - _HOP_S, side="right") - 1
     after = np.searchsorted(times_s, times_s + _HOP_S)
     earlier = np.maximum.accumulate(np.where(known, at, -1))[np.minimum(before, at[:, 0] - 1)]
-    later = np.minimum.accumulate(np.where(known, at, T)[::-1])[::-1][np.clip(after, at[:, 0] + 1, T) % T]
-    return np.where((earlier >= 0) & (earlier < at), earlier, at), np.where((at < later) & (later < T), later, at)
+    later = np.minimum.accumulate(np.where(known, at, T)[::-1])[::-1][
+        np.clip(after, at[:, 0] + 1, T) % T
+    ]
+    return np.where((earlier >= 0) & (earlier < at), earlier, at), np.where(
+        (at < later) & (later < T), later, at
+    )
 
 
 def _median(values: Array, first: Index, until: Index) -> Array:
@@ -59,7 +63,9 @@ def _median(values: Array, first: Index, until: Index) -> Array:
     `until` (S,), at least 0; NaN is ignored, and the result is 0 without any value.
     """
     near = first[:, None] + np.arange(int((until - first).max(initial=1)))
-    each = np.where((near < until[:, None])[..., None], values[:, np.minimum(near, values.shape[1] - 1)], np.nan)
+    each = np.where(
+        (near < until[:, None])[..., None], values[:, np.minimum(near, values.shape[1] - 1)], np.nan
+    )
     each = np.sort(np.concatenate(list(each), axis=1), axis=1)
     middle = np.isfinite(each).sum(axis=1, keepdims=True) // 2
     return np.nan_to_num(np.maximum(np.take_along_axis(each, middle, axis=1)[:, 0], 0.0))
@@ -121,12 +127,17 @@ def interpolated(points: Array, times_s: Array) -> Array:
     return result
 
 
-def smoothed_in_time(values: Array, times_s: Array, width_s: float, where: Mask | None = None) -> Array:
+def smoothed_in_time(
+    values: Array, times_s: Array, width_s: float, where: Mask | None = None
+) -> Array:
     """Values (T, J, ...) smoothed by a Gaussian of `width_s`, one sigma, over frames with `where`
     (T, J); over distant frames if there are no nearer ones.
     """
     where = np.ones(values.shape[:2], dtype=bool) if where is None else where
     near = np.exp(-0.5 * ((times_s[:, None] - times_s) / width_s) ** 2) + 1e-9
-    total, flat = np.maximum(near @ where, 1e-9), values.reshape(*where.shape, -1) * where[..., None]
+    total, flat = (
+        np.maximum(near @ where, 1e-9),
+        values.reshape(*where.shape, -1) * where[..., None],
+    )
     whole = (near @ flat.reshape(len(near), -1)).reshape(flat.shape)
     return (whole / total[..., None]).reshape(values.shape)

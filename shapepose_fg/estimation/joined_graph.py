@@ -78,26 +78,31 @@ class JoinedPeople:
             return
         if people.observations is None or not np.isfinite(people.time_s).all():
             raise ValueError(
-                "people need observations and times: reconstruct over time, and keep observations.npz"
+                "people need observations and times: reconstruct over time, and keep "
+                "observations.npz"
             )
         table, motion = people.observations, MotionModel.load(tuple(people.joint_names.tolist()))
         # Scaled like the observations, so that joints are smoothed as if errors were independent in
         # each frame.
-        density = self._together * motion.density(np.linalg.norm(np.nan_to_num(people.velocity), axis=-1))
+        density = self._together * motion.density(
+            np.linalg.norm(np.nan_to_num(people.velocity), axis=-1)
+        )
         rows = table.observations(people.joints, people.time_s)
         views = Views.of(self._rig, rows.time_s)
         seen = rows, people.joints, views, self._config, people.joint_names.tolist()
         sigmas = np.sqrt(self._together) * observation_sigmas(*seen)
         # Observation at the row's time, by the camera at its own exposure pose.
-        xy = np.where(table.used[..., None], views.pixels(people.joints)[0] - table.residual_px, np.nan)
+        xy = np.where(
+            table.used[..., None], views.pixels(people.joints)[0] - table.residual_px, np.nan
+        )
         goes = reported_with_poses(*seen) if views.carried is not None else None
         for frame in np.unique(people.frame).tolist():
             here = np.flatnonzero(people.frame == frame)
             cameras = self._cameras(frame, rows.time_s[here[0]])
             made = self._people.add(
                 Sighting(
-                    int(people.person[n]), frame, float(people.time_s[n]), people.joints[n], xy[n], sigmas[n],
-                    density[n], cameras,
+                    int(people.person[n]), frame, float(people.time_s[n]), people.joints[n], xy[n],
+                    sigmas[n], density[n], cameras,
                 )
                 for n in here.tolist()
             )  # fmt: skip
@@ -105,19 +110,25 @@ class JoinedPeople:
                 self._report(people, n, views, None if goes is None else goes[n], made)
             yield frame, made
 
-    def _report(self, people: Reconstruction, n: int, views: Views, goes: Array | None, made: Increment) -> None:
+    def _report(
+        self, people: Reconstruction, n: int, views: Views, goes: Array | None, made: Increment
+    ) -> None:
         """Add the reported joints of a row."""
         person, frame, time_s = int(people.person[n]), int(people.frame[n]), float(people.time_s[n])
         X, C = people.joints[n], people.covariance[n]
         keys = self._people.space.reported(person, np.arange(len(X)), frame)
-        for j in np.flatnonzero(np.isfinite(X).all(axis=-1) & np.isfinite(C).all(axis=(-2, -1))).tolist():
+        for j in np.flatnonzero(
+            np.isfinite(X).all(axis=-1) & np.isfinite(C).all(axis=(-2, -1))
+        ).tolist():
             key, own, poses = int(keys[j]), C[j], []
             if goes is not None and views.carried is not None:
                 carried = views.carried
                 moves = np.linalg.norm(goes[j], axis=(1, 2))
                 for b in np.argsort(-moves, kind="stable")[:2][np.sort(-moves)[:2] < 0].tolist():
                     name = self._rig.trajectories[b].name
-                    poses.append((self._pose_key(name, frame), gtsam.Pose3(carried.wTb[n, b]), goes[j, b]))
+                    poses.append(
+                        (self._pose_key(name, frame), gtsam.Pose3(carried.wTb[n, b]), goes[j, b])
+                    )
                     # Your graph adds the uncertainty of poses; at least a tenth of the variance is
                     # the joint's own.
                     own = own - goes[j, b] @ carried.covariance[n, b] @ goes[j, b].T

@@ -119,8 +119,9 @@ class Chains:
     def _solve(self, initial: Array, steps: int, covariance: Array) -> Array:
         states, seen = self._at(initial), self.seen
         solve_chains(
-            states, self.joints, self.diagonal, self.below, self.right, seen.views.projection, ready(seen.xy),
-            seen.weight, seen.lead_s, ROBUST[seen.kernel], seen.width, steps, _SETTLED_M, covariance,
+            states, self.joints, self.diagonal, self.below, self.right, seen.views.projection,
+            ready(seen.xy), seen.weight, seen.lead_s, ROBUST[seen.kernel], seen.width, steps,
+            _SETTLED_M, covariance,
         )  # fmt: skip
         return states
 
@@ -139,7 +140,9 @@ class Chains:
             into[:, self.joints, part] = np.where(self.there[..., n, None], parts[:, :, n], np.nan)
 
 
-def solved_apart(seen: Projections, pulls: JointTargets, initial: Array, steps: int, settled_m: float) -> Array:
+def solved_apart(
+    seen: Projections, pulls: JointTargets, initial: Array, steps: int, settled_m: float
+) -> Array:
     """(R, J, 3) joints of minimum cost, metres, in R independent frames; NaN where `initial` (R, J,
     3) is.
 
@@ -153,7 +156,9 @@ def solved_apart(seen: Projections, pulls: JointTargets, initial: Array, steps: 
     information = pulls.information + _HELD * np.eye(3)
     right = (pulls.information @ pulls.xyz[..., None])[..., 0] + _HELD * start
     found = start.copy()
-    together = [slice(None)] if len(seen.views.projection) == 1 else [slice(n, n + 1) for n in range(R)]
+    together = (
+        [slice(None)] if len(seen.views.projection) == 1 else [slice(n, n + 1) for n in range(R)]
+    )
     for n, rows in enumerate(together):  # one state per chain
         states, xy, weight, own, to = (
             ready(each[rows].reshape(-1, *each.shape[2:]))
@@ -161,9 +166,10 @@ def solved_apart(seen: Projections, pulls: JointTargets, initial: Array, steps: 
         )
         states = states[:, None]
         solve_chains(
-            states, np.arange(len(states)), own[:, None], np.empty((len(states), 0, 3, 3)), to[:, None],
-            seen.views.projection[n : n + 1], xy[None], weight[None], np.zeros((1, *weight.shape)),
-            ROBUST[seen.kernel], seen.width, steps, settled_m, np.empty((0, 1, 1, 1)),
+            states, np.arange(len(states)), own[:, None], np.empty((len(states), 0, 3, 3)),
+            to[:, None], seen.views.projection[n : n + 1], xy[None], weight[None],
+            np.zeros((1, *weight.shape)), ROBUST[seen.kernel], seen.width, steps, settled_m,
+            np.empty((0, 1, 1, 1)),
         )  # fmt: skip
         found[rows] = states.reshape(-1, J, 3)
     far = np.abs(found - start).max(axis=-1, keepdims=True) > UNDETERMINED_M
@@ -223,7 +229,9 @@ class Problem:
         for axis in range(3):
             diagonal[:, :, :n, axis, :n, axis] += moving
             below[:, :, :n, axis, :n, axis] += linked
-        xyz, information = (each[:, joints].swapaxes(0, 1) for each in (self.pulls.xyz, self.pulls.information))
+        xyz, information = (
+            each[:, joints].swapaxes(0, 1) for each in (self.pulls.xyz, self.pulls.information)
+        )
         diagonal[:, :, 0, :, 0] += information
         right[:, :, 0] += (information @ xyz[..., None])[..., 0]
         holds = 1.0 / (self.standing[:, joints].T * dt)
@@ -236,17 +244,25 @@ class Problem:
             there[..., at] = spanned(self.said[parts[at] - n].where)[:, joints]
             self._add_offsets(joints, self.said[parts[at] - n], at, (diagonal, below, right))
         d = 3 * p
-        matrices = diagonal.reshape(C, T, d, d), below.reshape(C, T - 1, d, d), right.reshape(C, T, d)
+        matrices = (
+            diagonal.reshape(C, T, d, d),
+            below.reshape(C, T - 1, d, d),
+            right.reshape(C, T, d),
+        )
         return Chains(joints, parts, *matrices, there, self.seen)
 
-    def _add_offsets(self, joints: Index, said: Said, at: int, to: tuple[Array, Array, Array]) -> None:
+    def _add_offsets(
+        self, joints: Index, said: Said, at: int, to: tuple[Array, Array, Array]
+    ) -> None:
         """Add estimates with offset variables, the states' part `at`; offsets decay
         (`factors.lasting`).
         """
         diagonal, below, right = to
         message, span = said.message, spanned(said.where)[:, joints].T
         there = (said.where & message.known)[:, joints].T
-        xyz, information = (each[:, joints].swapaxes(0, 1)[there] for each in (message.xyz, message.information))
+        xyz, information = (
+            each[:, joints].swapaxes(0, 1)[there] for each in (message.xyz, message.information)
+        )
         roots = symmetric_root(information / said.scale)
         of_joint, of_offset, expected = lasting_blocks(xyz, roots, said.errors.white_share)
         for one, first in ((0, of_joint), (at, of_offset)):

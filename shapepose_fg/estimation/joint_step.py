@@ -40,7 +40,9 @@ def solve_between(
     seen = Projections(cameras, observed.xy, sigmas_px * scale, used, in_step, kernel, scale)
     pulls, solver = of_body.where(of_body.known, config.graph.weight_shape), config.graph
     # The error is quadratic in the step: a hundredth of a sigma corresponds to the tolerance 1e-4.
-    return solved_apart(seen, pulls, initial, solver.max_iterations, _SIGMA_M * float(np.sqrt(solver.tolerance)))
+    return solved_apart(
+        seen, pulls, initial, solver.max_iterations, _SIGMA_M * float(np.sqrt(solver.tolerance))
+    )
 
 
 def solve_joints(

@@ -30,7 +30,10 @@ def ready(values: Array) -> Array:
 def _add_velocity(camera, u, v, depth, to_u, to_v, weight, lead, information, gradient):
     """Add the terms of velocity v that `add_view` omits, if the pixel is of x + lead v."""
     for a in range(3):
-        ua, va = (camera[0, a] - u * camera[2, a]) / depth, (camera[1, a] - v * camera[2, a]) / depth
+        ua, va = (
+            (camera[0, a] - u * camera[2, a]) / depth,
+            (camera[1, a] - v * camera[2, a]) / depth,
+        )
         gradient[3 + a] += lead * weight * (ua * to_u + va * to_v)
         for b in range(3):
             ub, vb = camera[0, b] - u * camera[2, b], camera[1, b] - v * camera[2, b]
@@ -56,14 +59,24 @@ def complete(cameras, focal, xy, confidence, scale_m, reach_m, least_depth, poin
             if seen < 2 or not math.isnan(points[n, j, 0] + points[n, j, 1] + points[n, j, 2]):
                 continue
             agree = triangulated(
-                cameras[at], focal[at], xy[n, j], confidence[n, j], scale_m, reach_m, least_depth, weight, x
+                cameras[at],
+                focal[at],
+                xy[n, j],
+                confidence[n, j],
+                scale_m,
+                reach_m,
+                least_depth,
+                weight,
+                x,
             )
             if agree >= 2:
                 points[n, j, 0], points[n, j, 1], points[n, j, 2] = x[0], x[1], x[2]
 
 
 @part
-def add_detection(x, camera, focal, at, sigma, fixed_depth, least_depth, reach, by_reach, robust, width, H, g):
+def add_detection(
+    x, camera, focal, at, sigma, fixed_depth, least_depth, reach, by_reach, robust, width, H, g
+):
     """Add the measurement of a detection `at` (2,), with `sigma` in pixels, to the information and
     gradient of a joint at `x`, if it is within `reach`; returns whether it is, and the residual,
     NaN for a joint too near to or behind the camera. With `by_reach` all are, under a Geman-McClure
@@ -73,7 +86,10 @@ def add_detection(x, camera, focal, at, sigma, fixed_depth, least_depth, reach, 
     if not depth >= least_depth:
         return False, np.nan, np.nan
     to_u, to_v = u - at[0], v - at[1]
-    far, reach_px = to_u * to_u + to_v * to_v, reach * focal / (fixed_depth if fixed_depth > 0.0 else depth)
+    far, reach_px = (
+        to_u * to_u + to_v * to_v,
+        reach * focal / (fixed_depth if fixed_depth > 0.0 else depth),
+    )
     if not (by_reach or math.sqrt(far) < reach_px):
         return False, to_u, to_v
     weight = 1.0 / (sigma * sigma)
@@ -105,7 +121,17 @@ def look(
                     camera = cameras[n if cameras.shape[0] > 1 else 0, v]
                     of_view = focal[n if focal.shape[0] > 1 else 0, v], xy[n, j, v], sigmas[n, j, v]
                     inlier[n, j, v], residual[n, j, v, 0], residual[n, j, v, 1] = add_detection(
-                        x, camera, *of_view, fixed_depth, least_depth, reach, by_reach, robust, width, H, g
+                        x,
+                        camera,
+                        *of_view,
+                        fixed_depth,
+                        least_depth,
+                        reach,
+                        by_reach,
+                        robust,
+                        width,
+                        H,
+                        g,
                     )
 
 
@@ -131,7 +157,9 @@ def _normal(state, joint, diagonal, right, cameras, xy, weight, lead, robust, wi
                 u, v, depth = project(camera, at)
                 if depth > 0.0:
                     off_u, off_v = u - xy[t, joint, n, 0], v - xy[t, joint, n, 1]
-                    w *= robust_weight(robust, (off_u * off_u + off_v * off_v) * w / (width * width))
+                    w *= robust_weight(
+                        robust, (off_u * off_u + off_v * off_v) * w / (width * width)
+                    )
                     # J x directly, as the derivative of a quotient.
                     at_u = (u * camera[2, 3] - camera[0, 3]) / depth - off_u
                     at_v = (v * camera[2, 3] - camera[1, 3]) / depth - off_v
@@ -247,7 +275,20 @@ def _marginals(H, Z, M, G, S, covariance):
 
 @kernel("f3 i1 f4 f4 f3 f4 f4 f3 f3 i0 f0 i0 f0 f4")
 def solve_chains(
-    states, joints, diagonal, below, right, cameras, xy, weight, lead, robust, width, steps, tolerance, covariance
+    states,
+    joints,
+    diagonal,
+    below,
+    right,
+    cameras,
+    xy,
+    weight,
+    lead,
+    robust,
+    width,
+    steps,
+    tolerance,
+    covariance,
 ):
     """Gauss-Newton of C independent chains, in place, and marginal `covariance` (C, T, d, d) at the
     end, or for the first chains only (0, ...): NaN for singular chains, which are not moved.
@@ -268,7 +309,21 @@ def solve_chains(
         x, linked = states[c], below[c]
         moved, n, regular = 0.0, 0, True
         while regular and n <= steps and (n == 0 or moved > tolerance):
-            _normal(x, joints[c], diagonal[c], right[c], cameras, xy, weight, lead, robust, width, H, g, at)
+            _normal(
+                x,
+                joints[c],
+                diagonal[c],
+                right[c],
+                cameras,
+                xy,
+                weight,
+                lead,
+                robust,
+                width,
+                H,
+                g,
+                at,
+            )
             regular = _factored(H, linked, Z)
             if regular and n < steps:
                 moved = _solve(H, Z, g, x)

@@ -24,7 +24,8 @@ counts about four times, as if it were 5 cm: the share (s² / (v + s²))^4 of a 
 with s this value and v the variance of the ends along the limb. Ends of 2 cm each remove a quarter
 of it, ends of 10 cm each all but a hundredth. Reported accuracies include this."""
 ARMS_AND_LEGS = {
-    ("Shoulder", "Elbow"): 0.06, ("Elbow", "Wrist"): 0.05, ("Hip", "Knee"): 0.09, ("Knee", "Ankle"): 0.07,
+    ("Shoulder", "Elbow"): 0.06, ("Elbow", "Wrist"): 0.05, ("Hip", "Knee"): 0.09,
+    ("Knee", "Ankle"): 0.07,
 }  # fmt: skip
 """Limbs on either side, from the trunk outwards, and half their widths, metres."""
 _FEET = (("Ankle", "Heel"), ("Ankle", "BigToe"), ("BigToe", "SmallToe"))
@@ -68,7 +69,9 @@ def limb_steps(joints: Array, covariance: Array, unseen: Mask, fitter: BodyFitte
     I)^-1 of the distance to the body's, with s = `LIMB_SIGMA_M`. Covariances are unchanged: they
     already include the body's information on the joint.
     """
-    known = np.asarray(np.isfinite(joints).all(axis=-1) & np.isfinite(covariance).all(axis=(-2, -1)))
+    known = np.asarray(
+        np.isfinite(joints).all(axis=-1) & np.isfinite(covariance).all(axis=(-2, -1))
+    )
     moved = unseen & known
     rows = np.flatnonzero(moved.any(axis=-1))
     steps = np.zeros(joints.shape)

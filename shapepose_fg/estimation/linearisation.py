@@ -92,9 +92,10 @@ def _both(joint: str, scatter: float) -> dict[str, float]:
 
 
 JOINT_SCATTER = {
-    "Nose": 0.65, **_both("Eye", 0.67), **_both("Ear", 0.68), "Neck": 1.05, **_both("Shoulder", 1.08),
-    **_both("Elbow", 0.88), **_both("Wrist", 0.90), "MidHip": 1.33, **_both("Hip", 1.28), **_both("Knee", 1.18),
-    **_both("Ankle", 1.00), **_both("BigToe", 0.90), **_both("SmallToe", 0.96), **_both("Heel", 1.02),
+    "Nose": 0.65, **_both("Eye", 0.67), **_both("Ear", 0.68), "Neck": 1.05,
+    **_both("Shoulder", 1.08), **_both("Elbow", 0.88), **_both("Wrist", 0.90), "MidHip": 1.33,
+    **_both("Hip", 1.28), **_both("Knee", 1.18), **_both("Ankle", 1.00), **_both("BigToe", 0.90),
+    **_both("SmallToe", 0.96), **_both("Heel", 1.02),
 }  # fmt: skip
 """Ratio of each joint's detection error to the mean at the same confidence. Like sigma by
 confidence, measured on simulated detections of the `tune` sequences against the ground truth. The
@@ -107,7 +108,17 @@ def inverses(A: Array) -> Array:
     a, b, c, d, e, f = (A[..., i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)))
     first, second, third = d * f - e * e, c * e - b * f, b * e - c * d
     whole = np.stack(
-        [first, second, third, second, a * f - c * c, b * c - a * e, third, b * c - a * e, a * d - b * b]
+        [
+            first,
+            second,
+            third,
+            second,
+            a * f - c * c,
+            b * c - a * e,
+            third,
+            b * c - a * e,
+            a * d - b * b,
+        ]
     )
     with np.errstate(divide="ignore", invalid="ignore"):
         whole /= a * first + b * second + c * third
@@ -177,7 +188,11 @@ def weakest_sigma(information: Array) -> Array:
 
 
 def observation_sigmas(
-    observations: Observations, points: Array, views: Views, config: ObservationConfig, joints: Sequence[str]
+    observations: Observations,
+    points: Array,
+    views: Views,
+    config: ObservationConfig,
+    joints: Sequence[str],
 ) -> Array:
     """Standard deviation (N, J, V) of every observation, pixels, for joints near `points` (N, J,
     3); 0 if not observed.
@@ -197,7 +212,9 @@ def observation_sigmas(
     weight *= np.maximum(observations.probability, LEAST_PROBABILITY)
     at = config.fixed_depth_m if config.fixed_depth_m > 0 else depth
     sigma = np.hypot(config.floor_rad * focal, config.sigma_m * focal / at)
-    return np.where(observations.seen, sigma / np.sqrt(np.where(observations.seen, weight, 1.0)), 0.0)
+    return np.where(
+        observations.seen, sigma / np.sqrt(np.where(observations.seen, weight, 1.0)), 0.0
+    )
 
 
 def linearise(
@@ -229,8 +246,12 @@ def linearise(
     return ViewEvidence(points, inlier, residual, information, gradient)
 
 
-def information_by_view(evidence: ViewEvidence, sigmas: Array, views: Views, config: ObservationConfig) -> Array:
-    """(N, J, V, 3, 3) information of each used observation, times its robust weight, 1/m²; else zero."""
+def information_by_view(
+    evidence: ViewEvidence, sigmas: Array, views: Views, config: ObservationConfig
+) -> Array:
+    """(N, J, V, 3, 3) information of each used observation, times its robust weight, 1/m²; else
+    zero.
+    """
     _, _, slope = views.project(np.nan_to_num(evidence.points))
     used = evidence.inlier & (sigmas > 0) & np.isfinite(slope).all(axis=(-1, -2))
     sigma = np.where(used, sigmas, 1.0)

@@ -14,7 +14,10 @@ class NotFinite(RuntimeError):
 
 
 def confirmed(
-    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, ordering: gtsam.Ordering, config: WindowGraphConfig
+    graph: gtsam.NonlinearFactorGraph,
+    values: gtsam.Values,
+    ordering: gtsam.Ordering,
+    config: WindowGraphConfig,
 ) -> gtsam.Values | None:
     """The values after a Gauss-Newton step if the error decreases by at most the tolerance; else
     None.

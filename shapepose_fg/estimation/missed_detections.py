@@ -25,7 +25,12 @@ SPEED_M_S = 2.0
 """Speed of a joint since a view last detected it, m/s: `factors.CONSTANT_VELOCITY.start`."""
 _BEHIND_M = 0.05
 """Minimum depth behind a limb for occlusion, m."""
-_TRUNK = {("Neck", "MidHip"): 0.17, ("Neck", "Nose"): 0.11, ("RShoulder", "RHip"): 0.1, ("LShoulder", "LHip"): 0.1}
+_TRUNK = {
+    ("Neck", "MidHip"): 0.17,
+    ("Neck", "Nose"): 0.11,
+    ("RShoulder", "RHip"): 0.1,
+    ("LShoulder", "LHip"): 0.1,
+}
 """Occluders other than arms and legs: from joint to joint, with half their width in metres."""
 
 
@@ -33,8 +38,14 @@ def limbs_that_hide(joints: Sequence[str]) -> tuple[Index, Array]:
     """(L, 2) ends of occluding limbs among a detector's joints, and (L,) half their
     widths, metres.
     """
-    limbs = _TRUNK | {(f"{s}{a}", f"{s}{b}"): width for s in "RL" for (a, b), width in ARMS_AND_LEGS.items()}
-    there = [(joints.index(a), joints.index(b), w) for (a, b), w in limbs.items() if {a, b} <= set(joints)]
+    limbs = _TRUNK | {
+        (f"{s}{a}", f"{s}{b}"): width for s in "RL" for (a, b), width in ARMS_AND_LEGS.items()
+    }
+    there = [
+        (joints.index(a), joints.index(b), w)
+        for (a, b), w in limbs.items()
+        if {a, b} <= set(joints)
+    ]
     table = np.array(there).reshape(-1, 3)
     return table[:, :2].astype(np.intp), table[:, 2]
 
@@ -55,7 +66,9 @@ def elsewhere_variance(
     missed = np.zeros(joints.shape[:2])
     for number in np.unique(frame[row]).tolist():
         here, of_frame = frame[row] == number, np.flatnonzero(frame == number)
-        hidden = _behind_limbs((xy, depth), (row[here], joint[here]), of_frame, focal[row[here]], limbs)
+        hidden = _behind_limbs(
+            (xy, depth), (row[here], joint[here]), of_frame, focal[row[here]], limbs
+        )
         missed[row[here], joint[here]] = (inside[row[here], joint[here]] & ~hidden).sum(axis=-1)
     unusual = UNUSUAL / (UNUSUAL + MISSED**missed)
     return np.where(missed >= LEAST_VIEWS, unusual * ELSEWHERE_M**2, 0.0)
@@ -78,5 +91,7 @@ def _behind_limbs(
     squared, ahead = beside_segment(x, y, first, second)
     hides = (squared * ahead**2 < (radius[:, None] * focal_px[:, None, None]) ** 2) & (ahead > 0)
     hides &= ahead < deep - _BEHIND_M
-    own = (people == row[:, None])[..., None] & (ends == joint[:, None, None]).any(axis=-1)[:, None]  # (K, P, L)
+    own = (people == row[:, None])[..., None] & (ends == joint[:, None, None]).any(axis=-1)[
+        :, None
+    ]  # (K, P, L)
     return (hides & ~own[..., None]).any(axis=(1, 2))

@@ -25,7 +25,8 @@ class MotionConfig(Settings):
     """Settings of the links between frames of a person."""
 
     model: str = ""
-    """File of the motion model, with the entries of `estimation/data/motion.json`; empty: that one."""
+    """File of the motion model, with the entries of `estimation/data/motion.json`; empty: that
+    one."""
     psd_scale: Factor = 1.0
     """Factor on the power spectral densities of the joints' accelerations: larger values follow
     faster and smooth less."""
@@ -71,8 +72,8 @@ class MotionModel:
     """(J,) increase of this density per (m/s)² of the joint's speed: fast joints also accelerate
     more."""
     psd_lost: Array
-    """(J,) minimum of this density while a joint is lost. Its speed is then unknown, so the minimum is
-    the mean over all speeds."""
+    """(J,) minimum of this density while a joint is lost. Its speed is then unknown, so the minimum
+    is the mean over all speeds."""
     views: CorrelatedError
     """Error of estimates of a joint from all views of one frame."""
     body: CorrelatedError
@@ -83,7 +84,9 @@ class MotionModel:
     law: Motion = CONSTANT_VELOCITY
     """Motion model of the states."""
 
-    def density(self, speed_m_s: Array, within_s: float = MEASURED_S, turning: Array | float = 0.0) -> Array:
+    def density(
+        self, speed_m_s: Array, within_s: float = MEASURED_S, turning: Array | float = 0.0
+    ) -> Array:
         """Density (..., J) of the motion noise of joints with speed (..., J), m/s, and a power
         spectral density of accelerations of at least `turning` (..., J), m²/s³; see
         `Motion.density`.
@@ -102,7 +105,10 @@ class MotionModel:
 
     @classmethod
     def load(
-        cls, joints: tuple[str, ...], config: MotionConfig | None = None, law: Motion = CONSTANT_VELOCITY
+        cls,
+        joints: tuple[str, ...],
+        config: MotionConfig | None = None,
+        law: Motion = CONSTANT_VELOCITY,
     ) -> "MotionModel":
         """Read the parameters from the configuration's file for the `joints` of a detector and the
         motion model `law`.
@@ -117,7 +123,9 @@ class MotionModel:
             return cls._read(path, joints, config, law)
 
     @classmethod
-    def _read(cls, path: Path, joints: tuple[str, ...], config: MotionConfig, law: Motion) -> "MotionModel":
+    def _read(
+        cls, path: Path, joints: tuple[str, ...], config: MotionConfig, law: Motion
+    ) -> "MotionModel":
         data = read_json(path)
         try:
             if data["format"] != FORMAT:
@@ -126,23 +134,31 @@ class MotionModel:
             if any(len(numbers) != 3 for numbers in known.values()):
                 raise ValueError("a joint must have 3 densities")
             views, body = (
-                CorrelatedError(*(float(data[name][key]) for key in ("white_share", "correlation_s", "kept")))
+                CorrelatedError(
+                    *(float(data[name][key]) for key in ("white_share", "correlation_s", "kept"))
+                )
                 for name in ("views", "body")
             )
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise InputError(
-                f"{path}: this is not a motion model ({error}); give the entries of estimation/data/motion.json"
+                f"{path}: this is not a motion model ({error}); give the entries of "
+                "estimation/data/motion.json"
             ) from None
         table = np.array(list(known.values())).reshape(-1, 3)
-        if len(table) == 0 or not (np.isfinite(table).all() and (table[:, 0] > 0).all() and (table >= 0).all()):
+        if len(table) == 0 or not (
+            np.isfinite(table).all() and (table[:, 0] > 0).all() and (table >= 0).all()
+        ):
             raise InputError(
-                f"{path}: densities must be positive; give the entries of estimation/data/motion.json"
+                f"{path}: densities must be positive; give the entries of "
+                "estimation/data/motion.json"
             )
         if not (views.possible and body.possible):
             raise InputError(
-                f"{path}: for views and body, white_share must be between 0 and 1, correlation_s positive and"
-                " kept 0 to 1; give the entries of estimation/data/motion.json"
+                f"{path}: for views and body, white_share must be between 0 and 1, correlation_s "
+                "positive and kept 0 to 1; give the entries of estimation/data/motion.json"
             )
-        chosen = config.psd_scale * np.array([known.get(name, tuple(table.mean(axis=0))) for name in joints])
+        chosen = config.psd_scale * np.array(
+            [known.get(name, tuple(table.mean(axis=0))) for name in joints]
+        )
         still, speed, lost = np.ascontiguousarray(chosen.T)
         return cls(still, speed, lost, views, body, config.around_s, law)

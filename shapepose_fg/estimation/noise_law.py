@@ -2,8 +2,8 @@
 
 The law is learnt from the recording itself, without ground truth. Each keypoint of a person in one
 view is compared with the position triangulated from confident detections of the other views.
-Keypoints that the solver rejected are compared too, since gates have removed the large errors of the
-others. The prior is the law shipped with the package (`calibration.json`), so a short recording
+Keypoints that the solver rejected are compared too, since gates have removed the large errors of
+the others. The prior is the law shipped with the package (`calibration.json`), so a short recording
 changes it little.
 """
 
@@ -30,7 +30,8 @@ from shapepose_fg.estimation.linearisation import (
 )
 
 EDGES = (0.1, 0.3, 0.5, 0.7, 0.8, 0.9)
-"""Bounds between the K = 7 ranges of scores. Relative to the shipped law, a law is constant in each."""
+"""Bounds between the K = 7 ranges of scores. Relative to the shipped law, a law is constant in
+each."""
 GROSS_M = 0.2
 """Standard deviation of a gross error along an axis, m. It lies on another joint or person."""
 _MIDDLES = (0.05, 0.2, 0.4, 0.6, 0.75, 0.85, 0.95)
@@ -51,7 +52,8 @@ class NoiseLaw:
     """Error distribution in K ranges of scores: a Gaussian core and a share of gross errors."""
 
     times: tuple[float, ...]
-    """(K,) standard deviation of the core, as a multiple of that of Eq. 1's weights (`core_sigma_m`)."""
+    """(K,) standard deviation of the core, as a multiple of that of Eq. 1's weights
+    (`core_sigma_m`)."""
     gross: tuple[float, ...]
     """(K,) share of gross errors, 0 to 1."""
     count: tuple[int, ...] = (0,) * (len(EDGES) + 1)
@@ -63,26 +65,34 @@ class NoiseLaw:
             values = getattr(self, name)
             most = 1.0 if name == "gross" else 1e9
             if len(values) != len(EDGES) + 1 or not all(0 <= each <= most for each in values):
-                raise ValueError(f"{name} must be {len(EDGES) + 1} numbers, 0 to {most:g}, got {values}")
+                raise ValueError(
+                    f"{name} must be {len(EDGES) + 1} numbers, 0 to {most:g}, got {values}"
+                )
         if min(self.times) <= 0:
             raise ValueError(f"times must be above 0, got {self.times}")
 
     @classmethod
     @cache
     def shipped(cls) -> "NoiseLaw":
-        """The law for which the covariances of joints are calibrated (`scripts/fit_covariances.py`)."""
+        """The law for which the covariances of joints are calibrated
+        (`scripts/fit_covariances.py`).
+        """
         with as_file(files("shapepose_fg.estimation") / "data" / "calibration.json") as path:
             return cls.from_dict(read_json(path)["noise"])
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> "NoiseLaw":
-        """The law from the result of `as_dict`; KeyError, TypeError or ValueError for other content."""
+        """The law from the result of `as_dict`; KeyError, TypeError or ValueError for other
+        content.
+        """
         times, gross, count = (content[name] for name in cls.COLUMNS)
         return cls(tuple(map(float, times)), tuple(map(float, gross)), tuple(map(int, count)))
 
     @classmethod
     def load(cls, path: str | Path) -> "NoiseLaw":
-        """The law in a run.json, or the shipped law if it has none. InputError if the law is damaged."""
+        """The law in a run.json, or the shipped law if it has none. InputError if the law is
+        damaged.
+        """
         return cls.read(read_json(Path(path)), Path(path))
 
     @classmethod
@@ -92,11 +102,18 @@ class NoiseLaw:
         try:
             return cls.shipped() if told is None else cls.from_dict(told)
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-            raise InputError(f"{path}: noise_law is damaged ({error}); reconstruct the recording again") from None
+            raise InputError(
+                f"{path}: noise_law is damaged ({error}); reconstruct the recording again"
+            ) from None
 
     def as_dict(self) -> dict[str, Any]:
-        """The law as JSON values, with the score and sigma of each range for readers of run.json."""
-        sigma_m = [times * float(core_sigma_m(score)) for times, score in zip(self.times, _MIDDLES, strict=True)]
+        """The law as JSON values, with the score and sigma of each range for readers of
+        run.json.
+        """
+        sigma_m = [
+            times * float(core_sigma_m(score))
+            for times, score in zip(self.times, _MIDDLES, strict=True)
+        ]
         return {
             "score": list(_MIDDLES),
             "sigma_mm": [round(1e3 * each, 1) for each in sigma_m],
@@ -161,12 +178,16 @@ class Residuals:
             good[..., view] = False
             good &= (good.sum(axis=-1) >= 2)[..., None]
             nowhere = np.full(chosen.initial.shape, np.nan)
-            rows = replace(chosen, confidence=np.where(good, chosen.confidence, 0.0), initial=nowhere)
+            rows = replace(
+                chosen, confidence=np.where(good, chosen.confidence, 0.0), initial=nowhere
+            )
             points = triangulate(rows, views, config)
             sigmas = observation_sigmas(rows, points, views, config, joints)
             evidence = linearise(rows, sigmas, points, views, config)
             evidence = linearise(rows, sigmas, evidence.target, views, config)
-            off = np.nan_to_num(np.linalg.norm(evidence.residual_px, axis=-1)) / np.where(good, sigmas, 1.0)
+            off = np.nan_to_num(np.linalg.norm(evidence.residual_px, axis=-1)) / np.where(
+                good, sigmas, 1.0
+            )
             there = (evidence.inlier == good).all(axis=-1) & (off < _AGREE_SIGMA).all(axis=-1)
             there &= every.seen[..., view] & (evidence.sigma_m < _GOOD_M)
             row, joint = np.nonzero(there)
@@ -207,8 +228,13 @@ class Residuals:
         count, expected = total(np.ones(len(score))), np.square(prior.times)
         squared_times, gross = expected, np.array(prior.gross)
         for _ in range(_ROUNDS):
-            theirs = np.where(seen, squared_times[of_others], 0.0).sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
-            others, own = self.others * theirs[:, None], (squared_times[score] * self.scatter**2)[:, None]
+            theirs = np.where(seen, squared_times[of_others], 0.0).sum(axis=1) / np.maximum(
+                seen.sum(axis=1), 1
+            )
+            others, own = (
+                self.others * theirs[:, None],
+                (squared_times[score] * self.scatter**2)[:, None],
+            )
             likely = [
                 -0.5 * (self.squared / variance + np.log(variance)).sum(axis=1)
                 for variance in (others + own, others + own + GROSS_M**2)
@@ -218,11 +244,17 @@ class Residuals:
             # Expected square of the error of the detection itself, which is part of the residual.
             share = own / (others + own)
             error = (share**2 * self.squared + share * others).mean(axis=1) / self.scatter**2
-            squared_times = (_PRIOR_COUNT * expected + total(core * error)) / (_PRIOR_COUNT + total(core))
-            gross = (_PRIOR_COUNT * np.array(prior.gross) + total(1 - core)) / (_PRIOR_COUNT + count)
+            squared_times = (_PRIOR_COUNT * expected + total(core * error)) / (
+                _PRIOR_COUNT + total(core)
+            )
+            gross = (_PRIOR_COUNT * np.array(prior.gross) + total(1 - core)) / (
+                _PRIOR_COUNT + count
+            )
         # Rounded as in run.json, from which a later run reads the law.
         times, gross = np.sqrt(squared_times).round(4), gross.round(4)
-        return NoiseLaw(tuple(times.tolist()), tuple(gross.tolist()), tuple(count.astype(int).tolist()))
+        return NoiseLaw(
+            tuple(times.tolist()), tuple(gross.tolist()), tuple(count.astype(int).tolist())
+        )
 
 
 def variance_ratio(
@@ -232,10 +264,10 @@ def variance_ratio(
 
     `scores` (N, J, V) are those of the observations, and `sigma_m` (N, J, V) their standard
     deviations by Eq. 1's weights, m. `by_view` (N, J, V, 3, 3) is the information of the used
-    observations, and `body` (N, J, 3, 3) that of the body constraint, 1/m². The variance of the body
-    is scaled by the mean ratio of the person's detections; with temporal factors, which average
-    them, by the square root of this ratio. Gross errors count only in `alone` (N,) rows, which have
-    no temporal factors; in others, the calibration of covariances includes them.
+    observations, and `body` (N, J, 3, 3) that of the body constraint, 1/m². The variance of the
+    body is scaled by the mean ratio of the person's detections; with temporal factors, which
+    average them, by the square root of this ratio. Gross errors count only in `alone` (N,) rows,
+    which have no temporal factors; in others, the calibration of covariances includes them.
     """
     core, gross_m2 = law.variances(scores)
     ratio = core + np.where(alone[:, None, None], gross_m2 / sigma_m**2, 0.0)
@@ -243,7 +275,9 @@ def variance_ratio(
         return np.ones(scores.shape[:2])
     used = by_view.any(axis=(-2, -1))
     count = used.sum(axis=(1, 2))
-    mean = np.where(count > 0, np.where(used, ratio, 0.0).sum(axis=(1, 2)) / np.maximum(count, 1), 1.0)
+    mean = np.where(
+        count > 0, np.where(used, ratio, 0.0).sum(axis=(1, 2)) / np.maximum(count, 1), 1.0
+    )
     of_body = np.where(alone, mean, np.sqrt(mean))[:, None, None, None]
     least = 1e-2 * np.eye(3)
     covariance = inverses(by_view.sum(axis=2) + body + least)

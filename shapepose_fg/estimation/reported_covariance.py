@@ -60,7 +60,9 @@ def outcome(state: State, fitter: BodyFitter) -> WindowSolution:
     rows, people, shape = state.observations, state.people, state.joints.shape
     solved, covariance, velocity_covariance = (np.full((*shape, 3), np.nan) for _ in range(3))
     velocity = np.full(shape, np.nan)
-    for person, (of_positions, of_velocities) in zip(people, state_covariances(people), strict=True):
+    for person, (of_positions, of_velocities) in zip(
+        people, state_covariances(people), strict=True
+    ):
         solved[person.rows] = covariance[person.rows] = of_positions
         if person.temporal:
             velocity[person.rows] = person.velocity
@@ -86,7 +88,9 @@ def outcome(state: State, fitter: BodyFitter) -> WindowSolution:
     wrong = problems(state, covariance)
     doubted = np.median(rows.mirrored.max(axis=2, initial=0.0), axis=1) > DOUBTED
     sided = np.where(doubted, Status.CONTRADICTED, Status.OK)
-    status = np.where(fit.ok, sided, np.where(state.enough, Status.BODY_UNDETERMINED, Status.TOO_FEW_VIEWS))
+    status = np.where(
+        fit.ok, sided, np.where(state.enough, Status.BODY_UNDETERMINED, Status.TOO_FEW_VIEWS)
+    )
     status[[problem.row for problem in wrong]] = Status.NOT_SOLVED
     return WindowSolution(
         observations=rows,
@@ -104,8 +108,9 @@ def outcome(state: State, fitter: BodyFitter) -> WindowSolution:
         problems=wrong,
         people=tied([
             PersonGraph(
-                person, X[person.rows], covariance[person.rows], fit.rows(person.rows), state.joints[person.rows],
-                solved[person.rows], state.motion.views, state.of_body.rows(person.rows),
+                person, X[person.rows], covariance[person.rows], fit.rows(person.rows),
+                state.joints[person.rows], solved[person.rows], state.motion.views,
+                state.of_body.rows(person.rows),
             )
             for person in people
         ]),
@@ -137,30 +142,42 @@ def final_bodies(state: State, covariance: Array, fitter: BodyFitter) -> BodyFit
         return fit
     rows = np.concatenate(chosen)
     rows = rows[fit.ok[rows]]
-    again = fitter.fit_whole(JointTargets.solved(state.joints[rows], covariance[rows]), fit.rows(rows))
+    again = fitter.fit_whole(
+        JointTargets.solved(state.joints[rows], covariance[rows]), fit.rows(rows)
+    )
     return fit.with_rows(rows[again.ok], again.rows(np.flatnonzero(again.ok)))
 
 
 def _calibrated(state: State, X: Array, covariance: Array, final: ViewEvidence) -> Array:
-    """Covariances (N, J, 3, 3) of the joints `X` with all uncertainty, for the detector's noise law.
+    """Covariances (N, J, 3, 3) of the joints `X` with all uncertainty, for the detector's noise
+    law.
 
     `covariance` is that of the graph, with correlated errors, and `final` the linearised
     observations at `X`. In rows without temporal factors, the result is not smaller than
     `covariance`.
     """
-    rows, body, count, joints = state.observations, state.of_body, state.inlier.sum(axis=-1), state.config.joints
+    rows, body, count, joints = (
+        state.observations,
+        state.of_body,
+        state.inlier.sum(axis=-1),
+        state.config.joints,
+    )
     config, alone = state.config.observations, np.ones(len(X), dtype=bool)
     for person in state.people:
         alone[person.rows] = not person.temporal
     sigma_m = core_sigma_m(rows.confidence, config) * config.scatter(joints)[:, None]
     by_view = information_by_view(final, state.sigmas, state.views, config)
-    ratio = variance_ratio(state.config.noise, alone, rows.confidence, sigma_m, by_view, body.information)
+    ratio = variance_ratio(
+        state.config.noise, alone, rows.confidence, sigma_m, by_view, body.information
+    )
     widened = ratio[..., None, None] * covariance
     of_body = np.nan_to_num(squared_distance(body, state.joints, widened))
     association = association_spread(rows, state.sigmas, final, body, state.views, config)
     moved = np.nan_to_num(state.joints - rows.initial)
     draft = moved[..., None] * moved[..., None, :]
-    exchange = exchange_spread(state.joints, state.fit.joints, rows.frame, limbs_to_exchange(joints))
+    exchange = exchange_spread(
+        state.joints, state.fit.joints, rows.frame, limbs_to_exchange(joints)
+    )
     for person in state.people:
         mine, times_s = person.rows, person.times_s
         association[mine] = smoothed_in_time(association[mine], times_s, LASTS_S, count[mine] > 0)
@@ -229,7 +246,9 @@ def problems(state: State, covariance: Array) -> tuple[Problem, ...]:
     away[known] = np.linalg.solve(information[known], pulls[known][..., None])[..., 0]
     sigmas = np.sqrt(np.maximum(np.einsum("...i,...i->...", away, pulls), 0.0))
     far = np.linalg.norm(away, axis=2)
-    reasons[known & (far > _HALF_M) & (sigmas > RUNAWAY_SIGMA)] = "diverged from its views and the body"
+    reasons[known & (far > _HALF_M) & (sigmas > RUNAWAY_SIGMA)] = (
+        "diverged from its views and the body"
+    )
     for person in state.people:
         rows = person.rows
         touched = np.ix_(rows, np.flatnonzero(person.touched))
@@ -241,11 +260,19 @@ def problems(state: State, covariance: Array) -> tuple[Problem, ...]:
     lost = finite & ~np.isfinite(covariance).all(axis=(2, 3)) & (reasons == "")
     reasons[lost] = "undetermined: its system is singular"
     return tuple(
-        Problem(int(n), int(observations.track[n]), int(observations.frame[n]), int(j), str(reasons[n, j]))
+        Problem(
+            int(n),
+            int(observations.track[n]),
+            int(observations.frame[n]),
+            int(j),
+            str(reasons[n, j]),
+        )
         for n, j in np.argwhere(reasons != "")
     )
 
 
 def _pull(message: JointTargets, X: Array) -> Array:
     """(N, J, 3) information times displacement from `X` to the estimate, 1/m."""
-    return np.einsum("...ij,...j->...i", message.information, np.nan_to_num(message.xyz) - np.nan_to_num(X))
+    return np.einsum(
+        "...ij,...j->...i", message.information, np.nan_to_num(message.xyz) - np.nan_to_num(X)
+    )

@@ -42,10 +42,19 @@ def smoothed(
     speed, turning = (each.reshape(T - 1, len(people), J) for each in motion_of(*by_time, times))
     known = np.asarray(np.isfinite(variance) & np.isfinite(place).all(axis=-1))
     place = np.where(known[..., None], place, 0.0).reshape(C, T, 3)
-    information = np.where(known, 1.0 / np.where(known, variance, 1.0), 1.0 / _UNKNOWN).reshape(C, T)
+    information = np.where(known, 1.0 / np.where(known, variance, 1.0), 1.0 / _UNKNOWN).reshape(
+        C, T
+    )
     density = motion.density(np.maximum(speed, SPEED_M_S), turning=turning).reshape(T - 1, C)
     moving, below = motion_information(motion.law, np.diff(times), density)
-    unseen = np.zeros((1, 0, 3, 4)), np.zeros((T, 1, 0, 2)), np.zeros((T, 1, 0)), np.zeros((T, 1, 0)), 0, 1.0
+    unseen = (
+        np.zeros((1, 0, 3, 4)),
+        np.zeros((T, 1, 0, 2)),
+        np.zeros((T, 1, 0)),
+        np.zeros((T, 1, 0)),
+        0,
+        1.0,
+    )
     n, weight, mean, of_mean = motion.law.order, information, place, 1.0 / information
     for _ in range(_ROUNDS):
         diagonal, right = moving.copy(), np.zeros((3, C, T, n))
@@ -53,8 +62,8 @@ def smoothed(
         right[..., 0] = np.moveaxis(place * weight[..., None], -1, 0)
         states, spread = np.zeros((3 * C, T, n)), np.empty((C, T, n, n))
         solve_chains(
-            states, np.zeros(3 * C, dtype=np.intp), np.tile(diagonal, (3, 1, 1, 1)), np.tile(below, (3, 1, 1, 1)),
-            right.reshape(states.shape), *unseen, 1, np.inf, spread,
+            states, np.zeros(3 * C, dtype=np.intp), np.tile(diagonal, (3, 1, 1, 1)),
+            np.tile(below, (3, 1, 1, 1)), right.reshape(states.shape), *unseen, 1, np.inf, spread,
         )  # fmt: skip
         mean, of_mean = np.moveaxis(states.reshape(right.shape)[..., 0], 0, -1), spread[..., 0, 0]
         apart = ((place - mean) ** 2).sum(axis=-1) / (of_mean + 1.0 / information)
@@ -62,4 +71,6 @@ def smoothed(
     ever = np.asarray(known.any(axis=2))[who]
     mean, of_mean = (each.reshape(-1, J, *each.shape[1:])[who, :, at] for each in (mean, of_mean))
     isotropic = of_mean[..., None, None] * np.eye(3)
-    return np.where(ever[..., None], mean, np.nan), np.where(ever[..., None, None], isotropic, np.nan)
+    return np.where(ever[..., None], mean, np.nan), np.where(
+        ever[..., None, None], isotropic, np.nan
+    )

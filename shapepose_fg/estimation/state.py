@@ -74,7 +74,9 @@ class State:
         if len(extra_factors) > 0:
             add_factors(people, extra_factors)
         N, J, V = sigmas.shape
-        of_views, of_body = (JointTargets(np.full((N, J, 3), np.nan), np.zeros((N, J, 3, 3))) for _ in range(2))
+        of_views, of_body = (
+            JointTargets(np.full((N, J, 3), np.nan), np.zeros((N, J, 3, 3))) for _ in range(2)
+        )
         return cls(
             observations, views, sigmas, first, config, motion, people, first.copy(),
             np.zeros((N, J, V), dtype=bool), np.zeros((N, J), dtype=bool), of_views, of_body,
@@ -84,7 +86,13 @@ class State:
         )  # fmt: skip
 
     def put(
-        self, rows: Index, joints: Array, evidence: ViewEvidence, wrong: Mask, of_body: JointTargets, fit: BodyFit
+        self,
+        rows: Index,
+        joints: Array,
+        evidence: ViewEvidence,
+        wrong: Mask,
+        of_body: JointTargets,
+        fit: BodyFit,
     ) -> None:
         """Store the results of a round for some `rows` (R,)."""
         self.joints[rows], self.inlier[rows] = joints, evidence.inlier
@@ -97,7 +105,9 @@ class State:
 def parts_of(people: Sequence[WindowGraph]) -> list[tuple[WindowGraph, slice]]:
     """People with the slices of their rows in the concatenation of all."""
     ends = np.cumsum([len(person) for person in people]).tolist()
-    return [(person, slice(end - len(person), end)) for person, end in zip(people, ends, strict=True)]
+    return [
+        (person, slice(end - len(person), end)) for person, end in zip(people, ends, strict=True)
+    ]
 
 
 def window_rows(observations: Observations) -> list[Index]:
@@ -107,5 +117,7 @@ def window_rows(observations: Observations) -> list[Index]:
     order = np.lexsort((observations.frame, observations.track))
     track, frame = observations.track[order], observations.frame[order]
     if np.any((np.diff(track) == 0) & (np.diff(frame) == 0)):
-        raise ValueError("a track may have only one row per frame: give each person another track number")
+        raise ValueError(
+            "a track may have only one row per frame: give each person another track number"
+        )
     return np.split(order, np.flatnonzero(np.diff(track)) + 1) if len(order) else []

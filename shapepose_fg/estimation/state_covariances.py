@@ -44,7 +44,9 @@ def _of_graph(graph: WindowGraph, known: dict[int, gtsam.Marginals]) -> tuple[Ar
     return of_positions, of_velocities
 
 
-def _by_gtsam(graph: WindowGraph, keys: NDArray[np.int64], known: dict[int, gtsam.Marginals]) -> Array:
+def _by_gtsam(
+    graph: WindowGraph, keys: NDArray[np.int64], known: dict[int, gtsam.Marginals]
+) -> Array:
     """Marginal covariances (K, D, 3, 3) of `keys` (K, D), one variable at a time, for any graph.
 
     Coupled people share one graph, which is factorised once: `known` is the cache.
@@ -52,7 +54,9 @@ def _by_gtsam(graph: WindowGraph, keys: NDArray[np.int64], known: dict[int, gtsa
     for make in (lambda: graph.graph, lambda: _damped(graph)):
         try:
             marginals = known.get(id(graph.ties)) or gtsam.Marginals(make(), graph.values)
-            found = np.array([[marginals.marginalCovariance(key) for key in row] for row in keys.tolist()])
+            found = np.array(
+                [[marginals.marginalCovariance(key) for key in row] for row in keys.tolist()]
+            )
         except RuntimeError:
             known.pop(id(graph.ties), None)
             continue

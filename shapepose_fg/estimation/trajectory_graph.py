@@ -32,7 +32,12 @@ from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.camera_pose_uncertainty import POSES_LAST_S
-from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, observation_sigmas, triangulate
+from shapepose_fg.estimation.linearisation import (
+    ObservationConfig,
+    linearise,
+    observation_sigmas,
+    triangulate,
+)
 
 CameraFactors = Callable[["TrajectoryGraph", NDArray[np.int64]], Iterable[gtsam.NonlinearFactor]]
 """Function that makes your own factors on poses, from a window's keys (T, B), T frames and B
@@ -85,7 +90,9 @@ class Mounted:
     @cached_property
     def odometry(self) -> Array:
         """(T, B, 4, 4) world from carrier at the frames' times, as given."""
-        return np.stack([each.at(self.time_s.mean(axis=1)) for each in self.rig.trajectories], axis=1)
+        return np.stack(
+            [each.at(self.time_s.mean(axis=1)) for each in self.rig.trajectories], axis=1
+        )
 
     @cached_property
     def sensors(self) -> Array:
@@ -98,8 +105,12 @@ class Mounted:
         return sensors
 
     def keys(self) -> NDArray[np.int64]:
-        """(T, B) key of each pose, `Pose3`, world from carrier: `factors.camera_key(carrier, frame)`."""
-        return np.stack([camera_keys(each, self.frames) for each in range(self.odometry.shape[1])], axis=1)
+        """(T, B) key of each pose, `Pose3`, world from carrier: `factors.camera_key(carrier,
+        frame)`.
+        """
+        return np.stack(
+            [camera_keys(each, self.frames) for each in range(self.odometry.shape[1])], axis=1
+        )
 
     def views(self, poses: Array, at: Index) -> Views:
         """The cameras of N rows at frames `at` (N,), indices in `frames`, with carriers
@@ -129,7 +140,9 @@ class Mounted:
             covariance = _GAUGE
         covariances = np.tile(covariance, (len(keys), 1, 1))
         if trajectory.covariance is not None:
-            at = np.unique(np.floor((middle - middle[0]) / POSES_LAST_S), return_index=True)[1].tolist()
+            at = np.unique(np.floor((middle - middle[0]) / POSES_LAST_S), return_index=True)[
+                1
+            ].tolist()
             covariances = trajectory.covariance_at(middle)
         poses = self.odometry[:, carrier]
         return [
@@ -193,7 +206,9 @@ class TrajectoryGraph:
             parameters.setMaxIterations(10)
             parameters.setRelativeErrorTol(1e-4)
             parameters.setOrdering(gtsam.Ordering([*joints, *self.keys.ravel().tolist()]))
-            self.values = gtsam.LevenbergMarquardtOptimizer(both, self.values, parameters).optimize()
+            self.values = gtsam.LevenbergMarquardtOptimizer(
+                both, self.values, parameters
+            ).optimize()
             self.poses = poses_of(self.values, self.keys)
 
     def of_poses(self) -> list[gtsam.NonlinearFactor]:
@@ -210,7 +225,9 @@ class TrajectoryGraph:
             here.insert(key, gtsam.Pose3(pose))
         factors = (rest.at(n) for n in range(rest.size()))
         return [
-            gtsam.LinearContainerFactor(each, here) for each in factors if each is not None and each.size() > 0
+            gtsam.LinearContainerFactor(each, here)
+            for each in factors
+            if each is not None and each.size() > 0
         ]
 
     def _build(self, reach_m: float) -> list[int]:
@@ -222,18 +239,31 @@ class TrajectoryGraph:
         chosen, points, sigmas = self._chosen(reach_m)
         row, joint, view = np.nonzero(chosen)
         at, on = self._at[row], mounted.rig.carrier[view]
-        step_s = float(np.median(np.diff(mounted.time_s.mean(axis=1)))) if len(mounted.frames) > 1 else 1.0
+        step_s = (
+            float(np.median(np.diff(mounted.time_s.mean(axis=1))))
+            if len(mounted.frames) > 1
+            else 1.0
+        )
         scale = np.sqrt(dilution(step_s))
         # A correlated error is not an outlier: the kernel's width in pixels is unchanged.
         name = config.robust_kernel
         kernel = robust_kernel(name, None if name is None else DEFAULT_WIDTH_SIGMA[name] / scale)
         keys, xy, sigma = self._joint_keys[row, joint], rows.xy[chosen], scale * sigmas[chosen]
         still, moving = on < 0, np.flatnonzero(on >= 0)
-        seen = projection_factors(self._still, view[still], keys[still], xy[still], sigma[still], kernel)
+        seen = projection_factors(
+            self._still, view[still], keys[still], xy[still], sigma[still], kernel
+        )
         sensors = list(map(gtsam.Pose3, mounted.sensors[at[moving], view[moving]]))
         poses = self.keys[at[moving], on[moving]]
         seen += posed_projection_factors(
-            self._lenses, view[moving], poses, sensors, keys[moving], xy[moving], sigma[moving], kernel
+            self._lenses,
+            view[moving],
+            poses,
+            sensors,
+            keys[moving],
+            xy[moving],
+            sigma[moving],
+            kernel,
         )
         deque(map(self.graph.add, seen), maxlen=0)
         there = chosen.any(axis=2)
@@ -262,7 +292,9 @@ class TrajectoryGraph:
         with np.errstate(invalid="ignore"):
             chosen = rows.seen & (away_m < reach_m) & (evidence.sigma_m < _WEAKEST_M)[..., None]
         on = self.mounted.rig.carrier
-        groups = np.sum([chosen[..., on == each].any(axis=-1) for each in np.unique(on).tolist()], axis=0)
+        groups = np.sum(
+            [chosen[..., on == each].any(axis=-1) for each in np.unique(on).tolist()], axis=0
+        )
         return chosen & (groups >= 2)[..., None], evidence.target, sigmas
 
 

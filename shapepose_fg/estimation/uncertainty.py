@@ -30,9 +30,9 @@ and a part smoothed by motion, (1 + t / 0.115 s) exp(-t / 0.115 s). Measured: 0.
 number of views (simulated: the recordings of `scripts/fit_covariances.py`)."""
 _LIMBS = {
     ("Neck", "MidHip"): 0.50, ("Nose", "Neck"): 0.30, ("Eye", "Nose"): 0.52, ("Ear", "Eye"): 0.44,
-    ("Shoulder", "Neck"): 0.71, ("Elbow", "Shoulder"): 0.23, ("Wrist", "Elbow"): 0.39, ("Hip", "MidHip"): 0.85,
-    ("Knee", "Hip"): 0.53, ("Ankle", "Knee"): 0.47, ("Heel", "Ankle"): 0.78, ("BigToe", "Ankle"): 0.43,
-    ("SmallToe", "BigToe"): 0.77,
+    ("Shoulder", "Neck"): 0.71, ("Elbow", "Shoulder"): 0.23, ("Wrist", "Elbow"): 0.39,
+    ("Hip", "MidHip"): 0.85, ("Knee", "Hip"): 0.53, ("Ankle", "Knee"): 0.47,
+    ("Heel", "Ankle"): 0.78, ("BigToe", "Ankle"): 0.43, ("SmallToe", "BigToe"): 0.77,
 }  # fmt: skip
 """Correlation of the errors of two joints of a person in one frame, in standard deviations, along a
 limb; for other pairs the product along the path between them. Measured as above. Between two people
@@ -122,9 +122,13 @@ class Distance:
         errors allow, the interval would be nearly empty: the upper end is at least the quantile.
         """
         away = np.linalg.norm(self.apart, axis=-1)
-        way = np.where(away[..., None] > 0, self.apart / np.maximum(away, 1e-12)[..., None], [1.0, 0.0, 0.0])
+        way = np.where(
+            away[..., None] > 0, self.apart / np.maximum(away, 1e-12)[..., None], [1.0, 0.0, 0.0]
+        )
         limits = self._span()
-        shorter = np.stack([Distance(each[..., None] * way, self.covariance).below(away) for each in limits])
+        shorter = np.stack(
+            [Distance(each[..., None] * way, self.covariance).below(away) for each in limits]
+        )
         ends = ((1 + probability) / 2, (1 - probability) / 2)
         low, high = (_reached(end, shorter[::-1], limits[::-1]) for end in ends)
         return low, np.maximum(high, self.quantile(ends[0]))
@@ -151,7 +155,9 @@ class Distance:
     def _table(self) -> tuple[Array, Array]:
         """Limits (S, ...) and the probabilities of distances below them."""
         limits = self._span()
-        return limits, np.maximum.accumulate(np.stack([self.below(each) for each in limits]), axis=0)
+        return limits, np.maximum.accumulate(
+            np.stack([self.below(each) for each in limits]), axis=0
+        )
 
 
 @dataclass(frozen=True)
@@ -176,7 +182,10 @@ class SurfaceDistance:
 
 
 def marginal(
-    people: Reconstruction, *joints: JointAt, rig: Rig | None = None, graphs: Iterable[PersonGraph] = ()
+    people: Reconstruction,
+    *joints: JointAt,
+    rig: Rig | None = None,
+    graphs: Iterable[PersonGraph] = (),
 ) -> Marginal:
     """Joint distribution of joints of any people and frames.
 
@@ -187,7 +196,9 @@ def marginal(
     joints coupled by these, also of two people, have the graph's correlation. Raises NotDetermined
     for a joint without a position, ValueError for one that does not exist.
     """
-    rows, numbers = np.array([_place(people, each) for each in joints], dtype=np.intp).reshape(-1, 2).T
+    rows, numbers = (
+        np.array([_place(people, each) for each in joints], dtype=np.intp).reshape(-1, 2).T
+    )
     K = len(joints)
     reported = people.covariance[rows, numbers]
     shared = np.zeros((K, 3, K, 3))
@@ -203,12 +214,16 @@ def marginal(
     return Marginal(people.joints[rows, numbers], covariance.reshape(3 * K, 3 * K))
 
 
-def _of_graphs(graphs: Sequence[PersonGraph], joints: Sequence[JointAt], numbers: Index, errors: Array) -> Array:
+def _of_graphs(
+    graphs: Sequence[PersonGraph], joints: Sequence[JointAt], numbers: Index, errors: Array
+) -> Array:
     """Correlations `errors` (K, 3, K, 3) of K joints, in standard deviations; replaced by the
     graph's for pairs coupled by user factors.
     """
     K, found, tied = len(joints), errors.copy(), False
-    for graph in {id(each.window.ties): each for each in graphs if len(each.window.ties.active) > 0}.values():
+    for graph in {
+        id(each.window.ties): each for each in graphs if len(each.window.ties.active) > 0
+    }.values():
         members = {each.person: each for each in graph.together or [graph]}
         keys = dict[int, int]()
         for n, asked in enumerate(joints):
@@ -223,7 +238,9 @@ def _of_graphs(graphs: Sequence[PersonGraph], joints: Sequence[JointAt], numbers
         asked = sorted({keys[n] for pair in pairs for n in pair})
         if len(asked) == 0:
             continue
-        joint = gtsam.Marginals(graph.graph, graph.values).jointMarginalCovariance(gtsam.KeyVector(asked))
+        joint = gtsam.Marginals(graph.graph, graph.values).jointMarginalCovariance(
+            gtsam.KeyVector(asked)
+        )
         white = {key: np.linalg.inv(symmetric_root(joint.at(key, key)[None])[0]) for key in asked}
         tied = True
         for a, b in pairs:
@@ -237,21 +254,25 @@ def _of_graphs(graphs: Sequence[PersonGraph], joints: Sequence[JointAt], numbers
     return (np.eye(3 * K) + apart / max(1.0, -least)).reshape(K, 3, K, 3)
 
 
-def _of_poses(people: Reconstruction, rig: Rig, rows: Index, numbers: Index, reported: Array) -> Array:
+def _of_poses(
+    people: Reconstruction, rig: Rig, rows: Index, numbers: Index, reported: Array
+) -> Array:
     """(K, 3, K, 3) error covariance of K joints from poses of moving cameras: common to all on one
     carrier, and correlated over time. In no direction it exceeds `reported` (K, 3, 3).
     """
     own = people.rows(rows)
     if own.observations is None:
-        raise ValueError("the measurements of moving cameras are missing: keep observations.npz, or give no rig")
+        raise ValueError(
+            "the measurements of moving cameras are missing: keep observations.npz, or give no rig"
+        )
     seen, config = own.observations.observations(own.joints, own.time_s), ObservationConfig()
     views = Views.of(rig, seen.time_s)
     assert views.carried is not None
     goes = reported_with_poses(seen, own.joints, views, config, own.joint_names.tolist())
     goes = goes[np.arange(len(rows)), numbers] @ symmetric_root(views.carried.covariance)
-    ends = symmetric_root(np.asarray(np.linalg.inv(reported), dtype=np.float64)) @ np.moveaxis(goes, 1, 2).reshape(
-        len(rows), 3, -1
-    )
+    ends = symmetric_root(np.asarray(np.linalg.inv(reported), dtype=np.float64)) @ np.moveaxis(
+        goes, 1, 2
+    ).reshape(len(rows), 3, -1)
     most = np.linalg.eigvalsh(ends @ ends.mT)[:, -1]
     goes /= np.sqrt(np.maximum(most, 1.0))[:, None, None, None]
     lasting = np.exp(-np.abs(own.time_s[:, None] - own.time_s) / POSES_LAST_S)
@@ -311,17 +332,26 @@ def surface_distance(
     nearest, away = vertices[near], where - vertices[near]
     signed, length = float(away @ normal), float(np.linalg.norm(away))
     # Within the triangles around the vertex the distance is to the plane, else to the vertex.
-    beside = np.sqrt(max(length**2 - signed**2, 0.0)) > np.sqrt(((around - nearest) ** 2).sum(axis=-1).max())
+    beside = np.sqrt(max(length**2 - signed**2, 0.0)) > np.sqrt(
+        ((around - nearest) ** 2).sum(axis=-1).max()
+    )
     if beside and length > 0:
-        normal, signed = away / length * (1.0 if signed >= 0 else -1.0), length * (1.0 if signed >= 0 else -1.0)
+        normal, signed = (
+            away / length * (1.0 if signed >= 0 else -1.0),
+            length * (1.0 if signed >= 0 else -1.0),
+        )
     names = people.joint_names.tolist()
-    known = np.isfinite(people.covariance[row]).all(axis=(1, 2)) & np.isfinite(people.joints[row]).all(axis=1)
+    known = np.isfinite(people.covariance[row]).all(axis=(1, 2)) & np.isfinite(
+        people.joints[row]
+    ).all(axis=1)
     weight = np.exp(-0.5 * ((people.joints[row] - nearest) ** 2).sum(axis=1) / _REACH_M**2)
     weight = np.where(known, weight, 0.0)
     chosen = np.argsort(-weight, kind="stable")[:4]
     chosen = chosen[known[chosen]]
     if len(chosen) == 0:
-        raise NotDetermined(person, "body", frame, float(people.time_s[row]), "none of its joints has a position")
+        raise NotDetermined(
+            person, "body", frame, float(people.time_s[row]), "none of its joints has a position"
+        )
     share = weight[chosen] / max(weight[chosen].sum(), 1e-300)
     both = marginal(people, *(JointAt(person, names[j], frame) for j in chosen.tolist()))
     along = (share[:, None] * normal).ravel()
@@ -353,7 +383,9 @@ def _way_up(joint: str) -> dict[str, float]:
     """Joints on the path from one to the middle of the hips, with the correlation to each."""
     way, side, correlation = {joint: 1.0}, joint[0] if joint[:1] in ("R", "L") else "", 1.0
     table = {f"{s}{a}": (b if b in ("Neck", "MidHip", "Nose") else f"{s}{b}", r)
-             for (a, b), r in _LIMBS.items() for s in (("",) if a in ("Neck", "Nose") else (side,))}  # fmt: skip
+             for (a, b),
+             r in _LIMBS.items() for s in (("",) if a in ("Neck", "Nose") else (side,
+                                                                                ))}  # fmt: skip
     while joint in table:
         joint, along = table[joint]
         way[joint] = correlation = correlation * along
@@ -371,18 +403,30 @@ def _place(people: Reconstruction, asked: JointAt) -> tuple[int, int]:
     """Row and index of a joint with a position."""
     row, names = _row(people, asked.person, asked.frame), people.joint_names.tolist()
     if asked.joint not in names:
-        raise ValueError(f"joint {asked.joint}: there is no joint of this name; there are {' '.join(names)}")
+        raise ValueError(
+            f"joint {asked.joint}: there is no joint of this name; there are {' '.join(names)}"
+        )
     joint = names.index(asked.joint)
-    if not (np.isfinite(people.joints[row, joint]).all() and np.isfinite(people.covariance[row, joint]).all()):
+    if not (
+        np.isfinite(people.joints[row, joint]).all()
+        and np.isfinite(people.covariance[row, joint]).all()
+    ):
         raise NotDetermined(
-            asked.person, asked.joint, asked.frame, float(people.time_s[row]), _missing(people, row, joint)
+            asked.person,
+            asked.joint,
+            asked.frame,
+            float(people.time_s[row]),
+            _missing(people, row, joint),
         )
     return row, joint
 
 
 def _missing(people: Reconstruction, row: int, joint: int) -> str:
     """The missing evidence for a joint without a position."""
-    table, body = people.observations, "" if np.isfinite(people.transl[row]).all() else ", and no body was fitted"
+    table, body = (
+        people.observations,
+        "" if np.isfinite(people.transl[row]).all() else ", and no body was fitted",
+    )
     if table is None:
         return f"the row's status is {people.status[row]}{body}"
     used = table.view_names[table.used[row, joint]].tolist()

@@ -164,7 +164,10 @@ class WindowGraph:
         self._cameras = _cameras(views)
         self._kernel: KernelName | None = config.observations.robust_kernel
         self._offset_keys = np.stack(
-            [offset_keys(self.track, joints, self.frames[:, None], source) for source in (_OF_VIEWS, _OF_BODY)]
+            [
+                offset_keys(self.track, joints, self.frames[:, None], source)
+                for source in (_OF_VIEWS, _OF_BODY)
+            ]
         )
         self.first: Array = np.full((T, J, 3), np.nan) if first is None else first
         """(T, J, 3) initial joints, accurate to decimetres, metres; NaN if unknown. Functions may
@@ -190,7 +193,9 @@ class WindowGraph:
 
     @property
     def velocity_keys(self) -> NDArray[np.int64]:
-        """(T, J) key of each joint's velocity, `Point3`, m/s; not in the graph of a single frame."""
+        """(T, J) key of each joint's velocity, `Point3`, m/s; not in the graph of a single
+        frame.
+        """
         return self.state_keys[..., 1]
 
     def __len__(self) -> int:
@@ -221,7 +226,9 @@ class WindowGraph:
 
     def shared(self, other: "WindowGraph") -> tuple[Index, Index]:
         """Rows (S,) of this person and of another in their common frames."""
-        _, mine, theirs = np.intersect1d(self.frames, other.frames, assume_unique=True, return_indices=True)
+        _, mine, theirs = np.intersect1d(
+            self.frames, other.frames, assume_unique=True, return_indices=True
+        )
         return mine, theirs
 
     def add(self, item: gtsam.NonlinearFactor | gtsam.Values, name: str = "") -> None:
@@ -249,9 +256,10 @@ class WindowGraph:
             holder = self._holder(key)
             if holder is None:
                 raise ValueError(
-                    f"{whose} uses {format_key(key)}, which is not in this window: use keys of its people"
-                    " (`keys` and `velocity_keys` of `window.people`; people are not in every frame), or"
-                    " first yield gtsam.Values with the initial value of your variable"
+                    f"{whose} uses {format_key(key)}, which is not in this window: use keys of "
+                    "its people (`keys` and `velocity_keys` of `window.people`; people are not "
+                    "in every frame), or first yield gtsam.Values with the initial value of your "
+                    "variable"
                 )
             nodes.append((-1, key))
             self.ties.take_in(holder)
@@ -268,14 +276,18 @@ class WindowGraph:
         new = gtsam.Values(start)
         for key in start.keys():  # noqa: SIM118 - GTSAM's, not a dictionary's
             if any(key in person._own for person in self.people):
-                raise ValueError(f"{format_key(key)} is the key of a joint: use gtsam.symbol for your variables")
+                raise ValueError(
+                    f"{format_key(key)} is the key of a joint: use gtsam.symbol for your variables"
+                )
             if self._holder(key) is not None:
                 new.erase(key)
         self.ties.start.insert(new)
 
     def _holder(self, key: int) -> CoupledGraph | None:
         """The coupling that contains a user variable."""
-        return next((each.ties for each in (self, *self.people) if each.ties.start.exists(key)), None)
+        return next(
+            (each.ties for each in (self, *self.people) if each.ties.start.exists(key)), None
+        )
 
     @cached_property
     def _own(self) -> frozenset[int]:
@@ -284,7 +296,10 @@ class WindowGraph:
     @property
     def coupled(self) -> list[frozenset[int]]:
         """Disjoint sets of two or more joints of the person coupled by user factors."""
-        mine = [frozenset(joint for track, joint in part if track == self.track) for part in self.ties.parts]
+        mine = [
+            frozenset(joint for track, joint in part if track == self.track)
+            for part in self.ties.parts
+        ]
         return [each for each in mine if len(each) > 1]
 
     @property
@@ -369,7 +384,9 @@ class WindowGraph:
                 values.insert(person.values)
         there = values.exists
         ties.active = [
-            each for each in ties.factors if all(there(key) or ties.start.exists(key) for key in each.keys)
+            each
+            for each in ties.factors
+            if all(there(key) or ties.start.exists(key) for key in each.keys)
         ]
         for each in ties.active:
             graph.add(each.factor)
@@ -413,14 +430,20 @@ class WindowGraph:
                 density = np.where(lost[1:] & lost[:-1], self._motion.density_lost(speed), density)
         # A correlated error is not an outlier, and a weight also multiplies the kernel's cost: in
         # pixels the kernel's width is as before either scaled the sigma.
-        scale, weight, xy = np.sqrt(share / self.config.weight_2d), self.config.weight_shape, self._observations.xy
+        scale, weight, xy = (
+            np.sqrt(share / self.config.weight_2d),
+            self.config.weight_shape,
+            self._observations.xy,
+        )
         lead = leads(self._observations, self._views) if self.temporal else np.zeros(inlier.shape)
         used = inlier & (self._sigmas_px > 0) & (self.present & ~of_views)[..., None]
         return Problem(
             times_s=self.times_s,
             law=self._motion.law,
             density=density,
-            seen=Projections(self._views, xy, self._sigmas_px * scale, used, lead, self._kernel, scale),
+            seen=Projections(
+                self._views, xy, self._sigmas_px * scale, used, lead, self._kernel, scale
+            ),
             pulls=body.where(self.present & ~of_body, weight / share),
             said=(
                 Said(views, 1.0 / self.config.weight_2d, self._motion.views, of_views),
@@ -436,11 +459,19 @@ class WindowGraph:
             over_time = any(person.temporal for person in self.ties.people)
             own = not self.ties.start.empty()
             return descend(
-                graph, values, self._ordering() if chains and not own else None, self.config, over_time=over_time
+                graph,
+                values,
+                self._ordering() if chains and not own else None,
+                self.config,
+                over_time=over_time,
             )
         ordering = self._ordering()
         found = confirmed(graph, values, ordering, self.config)
-        return descend(graph, values, ordering, self.config, over_time=self.temporal) if found is None else found
+        return (
+            descend(graph, values, ordering, self.config, over_time=self.temporal)
+            if found is None
+            else found
+        )
 
     def _ordering(self) -> gtsam.Ordering:
         """Elimination by joint, then frame, which causes no fill-in."""
@@ -493,7 +524,9 @@ class WindowGraph:
         chain = spanned(said.where)
         for joint in np.flatnonzero(chain.any(axis=0)).tolist():
             there = chain[:, joint]
-            factors += offset_factors(keys[there, joint], self.times_s[there], said.errors.correlation_s)
+            factors += offset_factors(
+                keys[there, joint], self.times_s[there], said.errors.correlation_s
+            )
         return factors
 
     def _moving(self, problem: Problem) -> list[gtsam.NonlinearFactor]:
@@ -506,14 +539,21 @@ class WindowGraph:
                 factors.append(gtsam.PriorFactorPoint3(key, np.zeros(3), noise))
             factors += problem.law.factors(states, self.times_s, problem.density[:, joint])
         step, joint = np.nonzero(np.isfinite(problem.standing))
-        before, after, held = self.keys[step, joint], self.keys[step + 1, joint], problem.standing[step, joint]
+        before, after, held = (
+            self.keys[step, joint],
+            self.keys[step + 1, joint],
+            problem.standing[step, joint],
+        )
         return factors + standing_factors(before, after, np.diff(self.times_s)[step], held)
 
     def _start(self, states: Array) -> None:
         """Set `values` from `states` (T, J, S, 3), NaN where absent."""
         self._there = np.isfinite(states[..., 0])
         self.values = gtsam.Values()
-        deque(map(self.values.insert, self.states[self._there].tolist(), states[self._there]), maxlen=0)
+        deque(
+            map(self.values.insert, self.states[self._there].tolist(), states[self._there]),
+            maxlen=0,
+        )
 
     def _points(self) -> tuple[Array, Array]:
         """Positions and velocities (T, J, 3) of the last solution."""
@@ -523,7 +563,9 @@ class WindowGraph:
         kinds = [(positions, self.keys), *([(speeds, self.velocity_keys)] if self.temporal else [])]
         if len(self.ties.people) > 1 or not self.ties.start.empty():
             for into, keys in kinds:
-                into[self.present] = [self.values.atPoint3(key) for key in keys[self.present].tolist()]
+                into[self.present] = [
+                    self.values.atPoint3(key) for key in keys[self.present].tolist()
+                ]
             return positions, speeds
         # Values are sorted by key: kind, joint, frame.
         points, count = gtsam.utilities.extractPoint3(self.values), int(self.present.sum())
@@ -532,7 +574,9 @@ class WindowGraph:
         return positions, speeds
 
 
-FactorFunction = Callable[[WindowGraph, NDArray[np.int64]], Iterable[gtsam.NonlinearFactor | gtsam.Values]]
+FactorFunction = Callable[
+    [WindowGraph, NDArray[np.int64]], Iterable[gtsam.NonlinearFactor | gtsam.Values]
+]
 """Function that makes your own factors for a person's window, from its keys (T, J) and those of
 `window.people`."""
 ExtraFactors = FactorFunction | Sequence[FactorFunction]
@@ -575,7 +619,10 @@ def _where(error: RuntimeError, people: Sequence[WindowGraph]) -> str:
         return ""
     joint = split_key(key)
     whose = f" of person {joint.person}" if len(people) > 1 else ""
-    return f" near {people[0]._names[joint.joint]}{whose} in frame {joint.frame}: no factor determines it there"
+    return (
+        f" near {people[0]._names[joint.joint]}{whose} in frame {joint.frame}: no factor "
+        "determines it there"
+    )
 
 
 def _cameras(views: Views) -> list[gtsam.PinholeCameraCal3_S2]:

@@ -72,7 +72,9 @@ class WindowSolution(Rows):
     def rows(self, index: Index) -> "WindowSolution":
         """Some of the rows, without graphs: plain data that can be sent to another process."""
         place = {row: n for n, row in enumerate(index.tolist())}
-        problems = tuple(replace(each, row=place[each.row]) for each in self.problems if each.row in place)
+        problems = tuple(
+            replace(each, row=place[each.row]) for each in self.problems if each.row in place
+        )
         observations = self.observations.rows(index)
         return replace(super().rows(index), observations=observations, problems=problems, people=())
 
@@ -89,13 +91,23 @@ class WindowSolution(Rows):
         gate = np.where(self.inlier, Gate.USED, dropped)
         views = Views.of(rig, rows.time_s)
         carried = carried_to_frames(rows, self.joints, np.nan_to_num(self.velocity), views)
-        names = ("joints", "covariance", "velocity", "velocity_covariance", "known", "confidence", "status")
+        names = (
+            "joints",
+            "covariance",
+            "velocity",
+            "velocity_covariance",
+            "known",
+            "confidence",
+            "status",
+        )
         return Reconstruction(
             frame=rows.frame,
             person=rows.track,
             time_s=rows.time_s.mean(axis=1),
             joint_names=np.array(joint_names),
-            observations=ObservationTable.of(rows, place, self.joints, gate, rig, joint_names, carried),
+            observations=ObservationTable.of(
+                rows, place, self.joints, gate, rig, joint_names, carried
+            ),
             **{name: getattr(self, name) for name in names},
             **body,
         )
@@ -207,33 +219,47 @@ class PersonGraph:
         includes it, has no solution. None if the error concerns another variable.
         """
         key = undetermined_key(error)
-        keys = np.concatenate([self.window.states, self.keys[..., None], self._offset_keys[..., None]], axis=-1)
+        keys = np.concatenate(
+            [self.window.states, self.keys[..., None], self._offset_keys[..., None]], axis=-1
+        )
         found = np.argwhere(keys == key)
         if key is None or len(found) == 0:
             return None
         t, joint, _ = found[0].tolist()
         views = int(self.window.seen[t, joint].sum())
         name, frame = str(joint_names[joint]), int(self.frames[t])
-        saw = {0: "no camera saw it", 1: "only one camera saw it"}.get(views, f"{views} cameras saw it")
-        body = "the body constrains it" if self.body.known[t, joint] else "the body does not constrain it"
-        return NotDetermined(self.person, name, frame, float(self.window.times_s[t]), f"{saw}, and {body}")
+        saw = {0: "no camera saw it", 1: "only one camera saw it"}.get(
+            views, f"{views} cameras saw it"
+        )
+        body = (
+            "the body constrains it"
+            if self.body.known[t, joint]
+            else "the body does not constrain it"
+        )
+        return NotDetermined(
+            self.person, name, frame, float(self.window.times_s[t]), f"{saw}, and {body}"
+        )
 
     @property
     def _offset_keys(self) -> NDArray[np.int64]:
-        return offset_keys(self.person, np.arange(self.joints.shape[1]), self.frames[:, None], _OF_SOLUTION)
+        return offset_keys(
+            self.person, np.arange(self.joints.shape[1]), self.frames[:, None], _OF_SOLUTION
+        )
 
     @property
     def _known(self) -> Mask:
         """(T, J) joints that are reported with covariance."""
-        finite = np.isfinite(self.covariance).all(axis=(2, 3)) & np.isfinite(self.solved_covariance).all(
-            axis=(2, 3)
-        )
+        finite = np.isfinite(self.covariance).all(axis=(2, 3)) & np.isfinite(
+            self.solved_covariance
+        ).all(axis=(2, 3))
         return np.asarray(finite & np.isfinite(self.joints).all(axis=2) & self.window.present)
 
     @property
     def _more(self) -> Array:
         """(T, J, 3, 3) reported minus solver's covariance, m²: positive definite."""
-        more = np.where(self._known[..., None, None], self.covariance - self.solved_covariance, np.eye(3))
+        more = np.where(
+            self._known[..., None, None], self.covariance - self.solved_covariance, np.eye(3)
+        )
         return raise_eigenvalues(more, LEAST_M**2)
 
 

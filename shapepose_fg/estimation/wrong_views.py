@@ -62,7 +62,9 @@ class Seen:
     """(N, J, V) mask of the used detections."""
 
 
-def wrong_view(seen: Seen, joints: Array, views: Views, config: ObservationConfig) -> WrongView | None:
+def wrong_view(
+    seen: Seen, joints: Array, views: Views, config: ObservationConfig
+) -> WrongView | None:
     """The view with the pose change that best makes all views agree on `joints` (N, J, 3); None if
     no change is significant.
 
@@ -78,7 +80,9 @@ def wrong_view(seen: Seen, joints: Array, views: Views, config: ObservationConfi
     sigma, used = np.where(there, seen.sigmas_px, 1.0), seen.used & there
     slope = np.where(there[..., None, None], slope, 0.0)
     residual = np.where(there[..., None], np.nan_to_num(seen.residual_px), 0.0)
-    weight = kernel_weight(config.robust_kernel, np.linalg.norm(residual, axis=-1) / sigma) / sigma**2
+    weight = (
+        kernel_weight(config.robust_kernel, np.linalg.norm(residual, axis=-1) / sigma) / sigma**2
+    )
     weight = np.where(used, weight, 0.0)
     information = np.einsum("njv,njvki,njvkl->njvil", weight, slope, slope)
     whole = information.sum(axis=2) + np.eye(3) / _REST_M**2
@@ -100,14 +104,22 @@ def wrong_view(seen: Seen, joints: Array, views: Views, config: ObservationConfi
         changed = residual.copy()
         changed[:, :, view] -= twist @ step
         change = np.einsum(
-            "nj,njki,njk->nji", weight[:, :, view], slope[:, :, view], (changed - residual)[:, :, view]
+            "nj,njki,njk->nji",
+            weight[:, :, view],
+            slope[:, :, view],
+            (changed - residual)[:, :, view],
         )
-        changed -= np.einsum("njvki,nji->njvk", slope, np.linalg.solve(whole, change[..., None])[..., 0])
+        changed -= np.einsum(
+            "njvki,nji->njvk", slope, np.linalg.solve(whole, change[..., None])[..., 0]
+        )
         after = whitened(changed)
         if _cost(after, there) < best:
             best, only = _cost(after, there), there[:, :, [view]]
             turn, shift = (
-                (float(np.linalg.norm(step[part])), float(np.sqrt(np.linalg.norm(covariance[part, part], ord=2))))
+                (
+                    float(np.linalg.norm(step[part])),
+                    float(np.sqrt(np.linalg.norm(covariance[part, part], ord=2))),
+                )
                 for part in (slice(3), slice(3, 6))
             )
             costs = _cost(off[:, :, [view]], only), _cost(after[:, :, [view]], only)

@@ -65,21 +65,32 @@ def held_out(
     ValueError if `people` have no observations.
     """
     others = Rig(tuple(camera for n, camera in enumerate(rig.cameras) if n != view), rig.up)
-    return compare_view(rig.cameras[view], view, people, solve(without_view(recording, view), others), config)
+    return compare_view(
+        rig.cameras[view], view, people, solve(without_view(recording, view), others), config
+    )
 
 
 def compare_view(
-    camera: Camera, view: int, people: Reconstruction, without: Reconstruction, config: ObservationConfig
+    camera: Camera,
+    view: int,
+    people: Reconstruction,
+    without: Reconstruction,
+    config: ObservationConfig,
 ) -> HeldOut:
-    """Compare the detections of `people` in `camera`, which is `view`, with the same people solved `without` it.
+    """Compare the detections of `people` in `camera`, which is `view`, with the same people solved
+    `without` it.
 
     Rows are matched frame by frame (Hungarian, mean joint distance under 0.5 m). Compared are the
     detections that were assigned to a joint; gated ones only within `NEAR_M` of it.
     """
     if people.observations is None:
-        raise ValueError("the people have no observations: give the result of `reconstruct`, or load its folder")
+        raise ValueError(
+            "the people have no observations: give the result of `reconstruct`, or load its folder"
+        )
     table = people.observations
-    xy, confidence = (values[:, :, view].astype(np.float64) for values in (table.xy, table.confidence))
+    xy, confidence = (
+        values[:, :, view].astype(np.float64) for values in (table.xy, table.confidence)
+    )
     projected, depth = camera.project(people.joints)
     near = np.linalg.norm(projected - xy, axis=-1) * depth / _focal(camera) < NEAR_M
     there = np.isfinite(xy).all(axis=-1) & (table.used[:, :, view] | near)
@@ -114,7 +125,8 @@ def squared_distances(
     scatter: Array,
     config: ObservationConfig,
 ) -> Array:
-    """(M,) squared Mahalanobis distances of detections `xy` (M, 2), undistorted pixels, from projected `points`.
+    """(M,) squared Mahalanobis distances of detections `xy` (M, 2), undistorted pixels, from
+    projected `points`.
 
     `points` (M, 3) in metres with `covariance` (M, 3, 3), m², were estimated without them. S = J C
     J^T + sigma² I has the joint's uncertainty in the image and the noise variance that the graph

@@ -64,51 +64,69 @@ class Matches:
     """(K, 2) frame and person of the people without a prediction."""
 
 
-def match_people(frame: Whole, joints: Real, truth: Real, frames: Sequence[int] | range | None = None) -> Matches:
-    """Match predictions `joints` (N, J, 3) of `frame` (N,) with `truth` (T, P, J, 3), all in metres.
+def match_people(
+    frame: Whole, joints: Real, truth: Real, frames: Sequence[int] | range | None = None
+) -> Matches:
+    """Match predictions `joints` (N, J, 3) of `frame` (N,) with `truth` (T, P, J, 3), all in
+    metres.
 
-    `frames` (T,) numbers the frames of the truth, 0 to T - 1 by default; predictions of other frames are left out,
-    as are predictions and true people without any joint. The cost of a pair is its `mean_distance`; the assignment
-    is optimal in each frame (Hungarian), without pairs of 0.5 m or more.
+    `frames` (T,) numbers the frames of the truth, 0 to T - 1 by default; predictions of other
+    frames are left out, as are predictions and true people without any joint. The cost of a pair is
+    its `mean_distance`; the assignment is optimal in each frame (Hungarian), without pairs of 0.5 m
+    or more.
     """
     predicted, true = np.asarray(joints, dtype=np.float64), np.asarray(truth, dtype=np.float64)
     if true.ndim != 4 or true.shape[3] != 3:
         raise ValueError(f"truth must be (T, P, J, 3), got {true.shape}")
     if predicted.shape != (len(frame), *true.shape[2:]):
-        raise ValueError(f"joints must be ({len(frame)}, {true.shape[2]}, 3), got {predicted.shape}")
+        raise ValueError(
+            f"joints must be ({len(frame)}, {true.shape[2]}, 3), got {predicted.shape}"
+        )
     numbers = range(len(true)) if frames is None else frames
     if len(numbers) != len(true):
-        raise ValueError(f"frames must number the {len(true)} frames of the truth, got {len(numbers)}")
+        raise ValueError(
+            f"frames must number the {len(true)} frames of the truth, got {len(numbers)}"
+        )
     has_joint = np.isfinite(predicted.sum(axis=2)).any(axis=1)
     is_there = np.isfinite(true.sum(axis=3)).any(axis=2)
     pairs, missed = list[tuple[int, int, int]](), list[tuple[int, int]]()
     duplicated, invented = list[int](), list[int]()
     for index, number in enumerate(numbers):
-        rows, people = np.flatnonzero((np.asarray(frame) == number) & has_joint), np.flatnonzero(is_there[index])
+        rows, people = (
+            np.flatnonzero((np.asarray(frame) == number) & has_joint),
+            np.flatnonzero(is_there[index]),
+        )
         cost = mean_distance(predicted[rows, None], true[index, people])
         # All pairs beyond the bound cost the same, so that distant pairs do not influence the near
         # ones.
         at_row, at_person = linear_sum_assignment(np.minimum(cost, MAX_DISTANCE_M))
         near = cost[at_row, at_person] < MAX_DISTANCE_M
         at_row, at_person = at_row[near], at_person[near]
-        pairs += [(row, index, who) for row, who in zip(rows[at_row], people[at_person], strict=True)]
+        pairs += [
+            (row, index, who) for row, who in zip(rows[at_row], people[at_person], strict=True)
+        ]
         missed += [(index, who) for who in np.setdiff1d(people, people[at_person])]
         for left in np.setdiff1d(np.arange(len(rows)), at_row):
-            (duplicated if (cost[left] < MAX_DISTANCE_M).any() else invented).append(int(rows[left]))
+            (duplicated if (cost[left] < MAX_DISTANCE_M).any() else invented).append(
+                int(rows[left])
+            )
     row, at, who = np.array(pairs, dtype=np.intp).reshape(-1, 3).T
     twice, nowhere = (np.array(each, dtype=np.intp) for each in (duplicated, invented))
     return Matches(row, at, who, twice, nowhere, np.array(missed, dtype=np.intp).reshape(-1, 2))
 
 
 def mean_distance(predicted: Array, truth: Array) -> Array:
-    """Mean joint distance (...) in metres of pairs of people: `predicted` and `truth` (..., J, 3) broadcast.
+    """Mean joint distance (...) in metres of pairs of people: `predicted` and `truth` (..., J, 3)
+    broadcast.
 
     A joint that is missing only in the prediction counts 0.5 m; one that is missing in the truth is
     ignored. Infinite for a person without joints.
     """
     distance = np.linalg.norm(predicted - truth, axis=-1)
     known = np.isfinite(truth).all(axis=-1)
-    distance = np.where(known, np.where(np.isfinite(distance), distance, MAX_DISTANCE_M), 0.0).sum(axis=-1)
+    distance = np.where(known, np.where(np.isfinite(distance), distance, MAX_DISTANCE_M), 0.0).sum(
+        axis=-1
+    )
     count = known.sum(axis=-1)
     return np.where(count > 0, distance / np.maximum(count, 1), np.inf)
 
@@ -134,7 +152,8 @@ class JointMetrics:
     joints_true: int
     """Number of joints in the truth."""
     mpjpe_mm: float
-    """Mean distance of the joints of matched people, near or far, millimetres; NaN if there are none."""
+    """Mean distance of the joints of matched people, near or far, millimetres; NaN if there are
+    none."""
     people_true: int
     """Number of people in the truth."""
     people_found: int
@@ -171,7 +190,9 @@ class JointMetrics:
 
     @property
     def everyone_once(self) -> bool:
-        """Whether every person was found in every frame, exactly once, and there was no false positive."""
+        """Whether every person was found in every frame, exactly once, and there was no false
+        positive.
+        """
         return self.people_missed == self.people_duplicated == self.people_invented == 0
 
 
@@ -182,17 +203,20 @@ def joint_metrics(
     *,
     correct_m: float = CORRECT_M,
 ) -> JointMetrics:
-    """Compare predictions with the `truth` (T, P, J, 3), metres, NaN where a person or joint is absent.
+    """Compare predictions with the `truth` (T, P, J, 3), metres, NaN where a person or joint is
+    absent.
 
-    `predicted` is a `Reconstruction`, or one array (P_t, J, 3) for each frame; NaN joints are missing. `frames`
-    (T,) are the frame numbers of the truth in a `Reconstruction`, 0 to T - 1 by default; other frames are not
-    scored. People are matched by `match_people`. A predicted joint that the truth lacks is not counted.
+    `predicted` is a `Reconstruction`, or one array (P_t, J, 3) for each frame; NaN joints are
+    missing. `frames` (T,) are the frame numbers of the truth in a `Reconstruction`, 0 to T - 1 by
+    default; other frames are not scored. People are matched by `match_people`. A predicted joint
+    that the truth lacks is not counted.
     """
     truth = np.asarray(truth, dtype=np.float64)
     if isinstance(predicted, Sequence):
         if len(predicted) != len(truth):
             raise ValueError(
-                f"give one array for each of the {len(truth)} frames of the truth, got {len(predicted)}"
+                f"give one array for each of the {len(truth)} frames of the truth, got "
+                f"{len(predicted)}"
             )
         frame = np.repeat(np.arange(len(predicted)), [len(people) for people in predicted])
         rows = np.concatenate([np.zeros((0, *truth.shape[2:])), *predicted])
@@ -202,7 +226,9 @@ def joint_metrics(
     return metrics_of(matches, joints, truth, correct_m=correct_m)
 
 
-def metrics_of(matches: Matches, joints: Array, truth: Array, *, correct_m: float = CORRECT_M) -> JointMetrics:
+def metrics_of(
+    matches: Matches, joints: Array, truth: Array, *, correct_m: float = CORRECT_M
+) -> JointMetrics:
     """The metrics of matched people: rows `joints` (N, J, 3), `truth` (T, P, J, 3), metres."""
     true_known = np.isfinite(truth.sum(axis=3))
     distance = np.linalg.norm(joints[matches.row] - truth[matches.frame, matches.person], axis=2)
@@ -225,8 +251,8 @@ class CovarianceCalibration:
     """Consistency of covariances with the joints' errors."""
 
     nees: Array
-    """(M,) normalised estimation error squared e^T C^-1 e of each joint: chi-squared with 3 degrees of freedom
-    if the covariances are correct."""
+    """(M,) normalised estimation error squared e^T C^-1 e of each joint: chi-squared with 3 degrees
+    of freedom if the covariances are correct."""
     coverage: dict[float, float]
     """Share of the truths inside the ellipsoids of the levels 0.5, 0.9 and 0.95, by level."""
     log_score: float
@@ -235,7 +261,9 @@ class CovarianceCalibration:
 
     @property
     def mean_nees(self) -> float:
-        """Mean NEES: 3 if the covariances are correct; more if they are too small; NaN without joints."""
+        """Mean NEES: 3 if the covariances are correct; more if they are too small; NaN without
+        joints.
+        """
         return float(self.nees.mean()) if len(self.nees) else float("nan")
 
 
@@ -256,8 +284,13 @@ def covariance_calibration(errors: Real, covariances: Real) -> CovarianceCalibra
         raise ValueError("a covariance is not positive definite") from None
     nees = np.sum(np.linalg.solve(root, error[..., None])[..., 0] ** 2, axis=1)
     # `2 gammaincinv(1.5, level)` is the quantile of chi-squared with 3 degrees of freedom.
-    inside = {level: share((nees <= 2 * gammaincinv(1.5, level)).sum(), len(nees)) for level in COVERAGE_LEVELS}
-    density = -0.5 * (nees + 3 * np.log(2 * np.pi)) - np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
+    inside = {
+        level: share((nees <= 2 * gammaincinv(1.5, level)).sum(), len(nees))
+        for level in COVERAGE_LEVELS
+    }
+    density = -0.5 * (nees + 3 * np.log(2 * np.pi)) - np.log(
+        np.diagonal(root, axis1=1, axis2=2)
+    ).sum(axis=1)
     score = float(np.maximum(density, _LEAST_LOG_SCORE).mean()) if len(nees) > 0 else float("nan")
     return CovarianceCalibration(nees, inside, score)
 

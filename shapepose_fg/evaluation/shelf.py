@@ -84,7 +84,10 @@ class ShelfScore:
     def as_dict(self) -> dict[str, Any]:
         """The figures by plain names, for JSON; None if there is nothing to score."""
         by_limb = _percent(self.limbs_right, self.limbs_all)
-        limbs = {f"actor {a + 1}": dict(zip(LIMB_NAMES, map(_plain, by_limb[a]), strict=True)) for a in ACTORS}
+        limbs = {
+            f"actor {a + 1}": dict(zip(LIMB_NAMES, map(_plain, by_limb[a]), strict=True))
+            for a in ACTORS
+        }
         return {
             "pcp_average": _plain(self.pcp_average),
             "pcp_actor": {f"actor {a + 1}": _plain(self.pcp[a]) for a in ACTORS},
@@ -101,7 +104,9 @@ class ShelfScore:
 
     def table(self) -> Table:
         """PCP by limb and actor, for a terminal."""
-        table = Table(title=f"Shelf, {self.frames} of {self.frames_annotated} annotated frames: PCP@0.5, %")
+        table = Table(
+            title=f"Shelf, {self.frames} of {self.frames_annotated} annotated frames: PCP@0.5, %"
+        )
         table.add_column("limb")
         for heading in (*(f"actor {actor + 1}" for actor in ACTORS), "pooled", "right / all"):
             table.add_column(heading, justify="right")
@@ -114,13 +119,15 @@ class ShelfScore:
         totals = f"{right.sum()} / {count.sum()}"
         table.add_row("all limbs", *map(_cell, [*self.pcp, self.pcp_pooled]), totals, style="bold")
         table.caption = (
-            f"Avg {_cell(self.pcp_average)} %   MPJPE {_cell(self.mpjpe_mm)} mm\n"
-            f"recall at 0.2 m {100 * self.recall:.2f} %   people found {self.people_found} / {self.people}"
+            f"Avg {_cell(self.pcp_average)} %   MPJPE {_cell(self.mpjpe_mm)} mm\nrecall at 0.2 m "
+            f"{100 * self.recall:.2f} %   people found {self.people_found} / {self.people}"
         )
         return table
 
 
-def evaluate_shelf(people: People, ground_truth: PlainPeople, frames: Iterable[int] | None = None) -> ShelfScore:
+def evaluate_shelf(
+    people: People, ground_truth: PlainPeople, frames: Iterable[int] | None = None
+) -> ShelfScore:
     """Score `people` against the annotated actors, in `frames` or in all annotated frames.
 
     Each annotated person is matched with the prediction of the frame that has the smallest mean
@@ -141,9 +148,13 @@ def evaluate_shelf(people: People, ground_truth: PlainPeople, frames: Iterable[i
         )
     truth, frame = ground_truth.joints[scored], ground_truth.frame[scored]
     distance = _distances(truth, frame, people)
-    found = np.where(np.isfinite(distance), distance, MISSING_JOINT_M).mean(axis=1) < MISSING_JOINT_M
+    found = (
+        np.where(np.isfinite(distance), distance, MISSING_JOINT_M).mean(axis=1) < MISSING_JOINT_M
+    )
     length = np.linalg.norm(truth[:, LIMBS[:, 0]] - truth[:, LIMBS[:, 1]], axis=2)
-    right = distance[:, LIMBS].mean(axis=2) <= 0.5 * length  # a missing end (NaN) makes the limb wrong
+    right = (
+        distance[:, LIMBS].mean(axis=2) <= 0.5 * length
+    )  # a missing end (NaN) makes the limb wrong
     member = ground_truth.person[scored, None] == np.array(ACTORS)
     known = np.isfinite(distance) & found[:, None]
     return ShelfScore(
@@ -164,7 +175,9 @@ def _distances(truth: Array, frame: NDArray[np.int64], people: People) -> Array:
     """
     joints = np.asarray(people.joints, dtype=np.float64)
     if tuple(getattr(people, "joint_names", BODY_25.joints)) != BODY_25.joints:
-        raise InputError("the people's joints are not those of BODY_25, which this protocol maps to Shelf's 15")
+        raise InputError(
+            "the people's joints are not those of BODY_25, which this protocol maps to Shelf's 15"
+        )
     joints = shelf_joints(joints)
     person, row = np.nonzero(frame[:, None] == np.asarray(people.frame)[None, :])
     distance = np.linalg.norm(joints[row] - truth[person], axis=2)
@@ -189,7 +202,9 @@ def shelf_joints(body25: Array) -> Array:
     if body25.ndim != 3 or body25.shape[1:] != (25, 3):
         raise ValueError(f"body25 must be (N, 25, 3), got {body25.shape}")
     named = ("RShoulder", "LShoulder", "MidHip", "Neck", "REar", "LEar")
-    right, left, midhip, neck, right_ear, left_ear = (body25[:, BODY_25.index(name)] for name in named)
+    right, left, midhip, neck, right_ear, left_ear = (
+        body25[:, BODY_25.index(name)] for name in named
+    )
     shoulders, across = 0.5 * (right + left), _unit(right - left)
     ear = np.where(np.isfinite(right_ear), right_ear, left_ear)
     mirrored = ear - np.sum((ear - shoulders) * across, axis=1, keepdims=True) * across
@@ -198,7 +213,9 @@ def shelf_joints(body25: Array) -> Array:
     result = np.empty((len(body25), 15, 3))
     result[:, :12] = body25[:, [BODY_25.index(name) for name in SHELF_JOINTS[:12]]]
     result[:, 12] = shoulders + 0.5 * (middle - shoulders)
-    result[:, 13] = result[:, 12] + 0.125 * _unit(np.cross(neck - midhip, right - left)) + [0.0, 0.0, 0.145]
+    result[:, 13] = (
+        result[:, 12] + 0.125 * _unit(np.cross(neck - midhip, right - left)) + [0.0, 0.0, 0.145]
+    )
     result[:, 14] = midhip
     return result
 
@@ -221,7 +238,10 @@ def _frames_run(people: People) -> Iterable[int] | None:
 def _spans(frames: NDArray[np.int64]) -> str:
     """Frames in words: "0-100, 216-230"."""
     spans = spans_of(frames.tolist())
-    return ", ".join(f"{span[0]}-{span[-1]}" if len(span) > 1 else f"{span[0]}" for span in spans) or "none"
+    return (
+        ", ".join(f"{span[0]}-{span[-1]}" if len(span) > 1 else f"{span[0]}" for span in spans)
+        or "none"
+    )
 
 
 def _percent(part: Any, whole: Any) -> Array:

@@ -12,8 +12,8 @@ from shapepose_fg.core.storage.files import read_text
 from shapepose_fg.evaluation.metrics import PlainPeople
 
 SHELF_JOINTS = tuple(
-    "RAnkle RKnee RHip LHip LKnee LAnkle RWrist RElbow RShoulder LShoulder LElbow LWrist Neck HeadTop "
-    "MidHip".split()
+    "RAnkle RKnee RHip LHip LKnee LAnkle RWrist RElbow RShoulder LShoulder LElbow LWrist Neck "
+    "HeadTop MidHip".split()
 )
 """The 15 annotated joints, in the order of the file."""
 _MAX_PEOPLE, _MAX_FRAMES = 1000, 10**7
@@ -21,15 +21,20 @@ _MAX_PEOPLE, _MAX_FRAMES = 1000, 10**7
 
 
 def read_shelf_ground_truth(path: Path | str) -> PlainPeople:
-    """Annotated people in `SHELF_JOINTS`: `person` 0, 1, 2 are the actors 1, 2, 3; others are not scored.
+    """Annotated people in `SHELF_JOINTS`: `person` 0, 1, 2 are the actors 1, 2, 3; others are not
+    scored.
 
-    The file has the numbers of joints and of frames, then per frame the number of people, and per person an id and
-    the rows x, y, z and confidence of all joints. InputError that names file and line for anything else.
+    The file has the numbers of joints and of frames, then per frame the number of people, and per
+    person an id and the rows x, y, z and confidence of all joints. InputError that names file and
+    line for anything else.
     """
     lines = _Lines(Path(path))
     joints, frames = lines.integers(2, "the number of joints and of frames")
     if joints != len(SHELF_JOINTS) or not 0 <= frames <= _MAX_FRAMES:
-        lines.refuse(f"must say {len(SHELF_JOINTS)} joints and the number of frames, got {joints} and {frames}")
+        lines.refuse(
+            f"must say {len(SHELF_JOINTS)} joints and the number of frames, got {joints} and "
+            f"{frames}"
+        )
     who, rows = list[tuple[int, int]](), list[Array]()
     for frame in range(frames):
         (people,) = lines.integers(1, f"the number of people in frame {frame}")
@@ -39,10 +44,15 @@ def read_shelf_ground_truth(path: Path | str) -> PlainPeople:
         for _ in range(people):
             (person,) = lines.integers(1, f"a person's id in frame {frame}")
             if person in seen or not 0 <= person < 2**62:
-                lines.refuse(f"gives the id {person} in frame {frame}; ids must be 0 or more and differ")
+                lines.refuse(
+                    f"gives the id {person} in frame {frame}; ids must be 0 or more and differ"
+                )
             seen.add(person)
             who.append((frame, person))
-            meanings = (f"{joints} values of {row} in frame {frame}" for row in ("x", "y", "z", "confidence"))
+            meanings = (
+                f"{joints} values of {row} in frame {frame}"
+                for row in ("x", "y", "z", "confidence")
+            )
             rows.append(np.stack([lines.numbers(joints, meaning) for meaning in meanings], axis=1))
     if lines.left():
         lines.refuse(f"goes on after the {frames} frames that line 1 promises")
@@ -60,7 +70,9 @@ class _Lines:
         self._path = path
         self._place = 0
         self._lines: Iterator[tuple[int, str]] = (
-            (place, line) for place, line in enumerate(read_text(path).splitlines(), 1) if line.strip()
+            (place, line)
+            for place, line in enumerate(read_text(path).splitlines(), 1)
+            if line.strip()
         )
 
     def refuse(self, complaint: str) -> NoReturn:
@@ -92,8 +104,8 @@ class _Lines:
         entry = next(self._lines, None)
         if entry is None:
             raise InputError(
-                f"{self._path}: the file ends after line {self._place}, before {meaning}; copy the whole file"
-                " again"
+                f"{self._path}: the file ends after line {self._place}, before {meaning}; copy "
+                "the whole file again"
             )
         self._place, line = entry
         words = line.split()

@@ -1,4 +1,6 @@
-"""Metrics of a reconstruction over time against ground truth: joints, identities, motion, covariances."""
+"""Metrics of a reconstruction over time against ground truth: joints, identities, motion,
+covariances.
+"""
 
 from dataclasses import dataclass
 from typing import Any
@@ -85,10 +87,12 @@ class TrackingScore:
     bodies: MotionScore
     """The motion of the bodies' own joints."""
     velocity_error: float
-    """Mean length of the difference between a joint's velocity and the true one, m/s; NaN without velocities."""
+    """Mean length of the difference between a joint's velocity and the true one, m/s; NaN without
+    velocities."""
     calibration: dict[str, CovarianceCalibration]
-    """Covariances of `velocity`, and of the joints of matched rows that two views or more see in that frame
-    (`seen`), one view (`one_view`), none (`no_view`), and none in this frame and the nine before (`unseen`)."""
+    """Covariances of `velocity`, and of the joints of matched rows that two views or more see in
+    that frame (`seen`), one view (`one_view`), none (`no_view`), and none in this frame and the
+    nine before (`unseen`)."""
 
     def as_dict(self) -> dict[str, Any]:
         """The figures by plain names, for tables and JSON; None if there is nothing to measure."""
@@ -97,9 +101,15 @@ class TrackingScore:
         figures["velocity_error"] = self.velocity_error
         for prefix, motion in {"": self.motion, "body_": self.bodies}.items():
             figures |= {f"{prefix}{name}": value for name, value in vars(motion).items()}
-        counts = {"false_positives": self.joints.false_positives, "people_missed": self.joints.people_missed}
+        counts = {
+            "false_positives": self.joints.false_positives,
+            "people_missed": self.joints.people_missed,
+        }
         for name, calibration in self.calibration.items():
-            figures |= {f"{name}_inside_{100 * level:.0f}": 100 * s for level, s in calibration.coverage.items()}
+            figures |= {
+                f"{name}_inside_{100 * level:.0f}": 100 * s
+                for level, s in calibration.coverage.items()
+            }
             figures[f"{name}_log_score"] = calibration.log_score
             counts[f"joints_{name}"] = len(calibration.nees)
         if self.identities is not None:
@@ -111,7 +121,8 @@ class TrackingScore:
 def score_tracks(
     people: Reconstruction, truth: Reconstruction, fps: float, *, identities: bool = True
 ) -> TrackingScore:
-    """Compare `people` with the `truth` of a recording of `fps` frames a second (`truth_of`, or any result).
+    """Compare `people` with the `truth` of a recording of `fps` frames a second (`truth_of`, or any
+    result).
 
     The frames from the first to the last of the truth are scored. Without `identities` the column
     `person` only numbers the people of a frame; metrics over time then use the true person with
@@ -145,23 +156,28 @@ def score_tracks(
         "unseen": frames_unseen(views > 0, found.frame, identity) >= LONG_UNSEEN,
     }
     calibration = {
-        name: covariance_calibration(error[those], found.covariance[those]) for name, those in classes.items()
+        name: covariance_calibration(error[those], found.covariance[those])
+        for name, those in classes.items()
     }
     index = np.where(np.isin(people.frame, frames), people.frame - first, -1)
     return TrackingScore(
         metrics_of(matches, people.joints, true),
-        identity_metrics(matches, index, people.person, people.joints, true) if identities else None,
+        identity_metrics(matches, index, people.person, people.joints, true)
+        if identities
+        else None,
         motion=motion(found.joints),
         bodies=motion(body_joints(found)),
         velocity_error=_mean(np.linalg.norm(moving, axis=-1)),
-        calibration=calibration | {"velocity": covariance_calibration(moving, found.velocity_covariance)},
+        calibration=calibration
+        | {"velocity": covariance_calibration(moving, found.velocity_covariance)},
     )
 
 
 def identity_metrics(
     matches: Matches, index: Whole, identity: Whole, joints: Array, truth: Array
 ) -> IdentityMetrics:
-    """Compare the identities of rows with those of the truth (T, P, J, 3), NaN where a person is absent.
+    """Compare the identities of rows with those of the truth (T, P, J, 3), NaN where a person is
+    absent.
 
     Row n has `identity` (N,), `joints` (N, J, 3) in metres and belongs to frame `index` (N,) of the
     truth, -1 for a frame that is not scored. For IDF1 identities and people are assigned one to one
@@ -188,7 +204,9 @@ def identity_metrics(
         true_positives=int(together[best].sum()),
         rows=len(scored),
         people_true=int(present.sum()),
-        switches=sum(int((np.diff(column[column != UNMATCHED]) != 0).sum()) for column in by_frame.T),
+        switches=sum(
+            int((np.diff(column[column != UNMATCHED]) != 0).sum()) for column in by_frame.T
+        ),
         tracks=len(names),
         false_tracks=int((2 * matched <= length).sum()),
         longest_false_positive=int((length - matched).max(initial=0)),
@@ -207,7 +225,11 @@ def body_joints(people: Reconstruction) -> Array:
 def detector_s_body(people: Reconstruction) -> BodyModel:
     """The open body, with its joints moved by the detector offsets that the run estimated."""
     model, offsets = BodyModel.default(), people.run.get("keypoint_offsets")
-    return model if offsets is None else model.with_keypoint_offsets(KeypointOffsets.from_dict(offsets))
+    return (
+        model
+        if offsets is None
+        else model.with_keypoint_offsets(KeypointOffsets.from_dict(offsets))
+    )
 
 
 def views_used(people: Reconstruction) -> Index:
@@ -221,7 +243,9 @@ def views_used(people: Reconstruction) -> Index:
 
 
 def joints_by_frame(people: Reconstruction) -> Array:
-    """(T, P, J, 3) joints of the P identities, in rising order, from first to last frame; NaN where absent."""
+    """(T, P, J, 3) joints of the P identities, in rising order, from first to last frame; NaN where
+    absent.
+    """
     names, number = np.unique(people.person, return_inverse=True)
     index = people.frame - people.frame.min() if len(people) > 0 else people.frame
     table = np.full((index.max(initial=-1) + 1, len(names), *people.joints.shape[1:]), np.nan)
@@ -230,7 +254,8 @@ def joints_by_frame(people: Reconstruction) -> Array:
 
 
 def acceleration_errors(placed: Array, truth: Array, follows: Mask, fps: float) -> Array:
-    """(T - 2, P, J) error of second differences, m/s², of `placed` and `truth` (T, P, J, 3), metres.
+    """(T - 2, P, J) error of second differences, m/s², of `placed` and `truth` (T, P, J, 3),
+    metres.
 
     `follows` (T, P) marks frames that directly follow the previous row; NaN if one of the three
     frames does not.

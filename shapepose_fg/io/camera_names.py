@@ -23,8 +23,13 @@ def match_names(cameras: Sequence[str], names: Sequence[str]) -> list[int] | Non
     (`2022-09-19_synced_Cam1` is `view_01_json`). None if a camera has no match or several: nothing
     is guessed.
     """
-    words = [re.compile(rf"(?<![A-Za-z0-9]){re.escape(camera)}(?![A-Za-z0-9])") for camera in cameras]
-    found = [[index for index, name in enumerate(names) if word.search(name) is not None] for word in words]
+    words = [
+        re.compile(rf"(?<![A-Za-z0-9]){re.escape(camera)}(?![A-Za-z0-9])") for camera in cameras
+    ]
+    found = [
+        [index for index, name in enumerate(names) if word.search(name) is not None]
+        for word in words
+    ]
     if all(len(each) == 1 for each in found) and len({each[0] for each in found}) == len(found):
         return [each[0] for each in found]
     for part in (_one_number_each, _own_words):
@@ -38,7 +43,10 @@ def _own_words(names: Sequence[str]) -> list[tuple[str | int, ...]] | None:
     """Words and numbers of each name, in lower case, without those with which all names begin or
     end; None if a name has no words left, or if two are equal.
     """
-    words = [[int(word) if word.isdigit() else word for word in _WORDS.findall(name.lower())] for name in names]
+    words = [
+        [int(word) if word.isdigit() else word for word in _WORDS.findall(name.lower())]
+        for name in names
+    ]
     for _ in range(2):  # from the beginning, then from the end
         while all(each and each[0] == words[0][0] for each in words) and len(words) > 1:
             words = [each[1:] for each in words]
@@ -59,7 +67,8 @@ def _one_number_each(names: Sequence[str]) -> list[tuple[str | int, ...]] | None
 def told_by_parts(
     folder: Path, cameras: Sequence[str], paths: Sequence[Path], names: Sequence[str]
 ) -> tuple[list[Path], list[str]] | None:
-    """Return the path of each camera, found in `paths` (called `names`) with `match_names`, and a note about it.
+    """Return the path of each camera, found in `paths` (called `names`) with `match_names`, and a
+    note about it.
 
     None if the names do not identify the cameras.
     """
@@ -67,13 +76,17 @@ def told_by_parts(
     if chosen is None:
         return None
     found = [paths[index] for index in chosen]
-    pairs = ", ".join(f"{camera} is {path.name}" for camera, path in zip(cameras, found, strict=True))
+    pairs = ", ".join(
+        f"{camera} is {path.name}" for camera, path in zip(cameras, found, strict=True)
+    )
     return found, [f"{folder}: cameras were matched by parts of the file names: {pairs}"]
 
 
 def listing(names: Sequence[str], nothing: str = "nothing") -> str:
     """The first few of some names, for a message; `nothing` if there are none."""
-    return (" ".join(names[:8]) or nothing) + (f" and {len(names) - 8} more" if len(names) > 8 else "")
+    return (" ".join(names[:8]) or nothing) + (
+        f" and {len(names) - 8} more" if len(names) > 8 else ""
+    )
 
 
 def last_number(name: str) -> int | None:
@@ -89,9 +102,15 @@ def numbered(folder: Path, ending: str) -> list[tuple[int, Path]]:
     sorted by number.
     """
     # macOS writes ._000000_keypoints.json beside each copied file.
-    files = [each for each in folder.iterdir() if not each.name.startswith(".")] if folder.is_dir() else []
+    files = (
+        [each for each in folder.iterdir() if not each.name.startswith(".")]
+        if folder.is_dir()
+        else []
+    )
     found = ((re.search(rf"(\d+){ending}$", each.name), each) for each in files)
-    return sorted((int(match[1]), each) for match, each in found if match is not None and each.is_file())
+    return sorted(
+        (int(match[1]), each) for match, each in found if match is not None and each.is_file()
+    )
 
 
 def in_order(files: Sequence[tuple[int, Path]]) -> list[tuple[int, Path]]:
@@ -99,9 +118,12 @@ def in_order(files: Sequence[tuple[int, Path]]) -> list[tuple[int, Path]]:
     ordered = sorted(files)
     if ordered[-1][0] >= MOST_FRAME:
         raise InputError(
-            f"{ordered[-1][1]}: this frame number is too large; number the files by the frames of the recording"
+            f"{ordered[-1][1]}: this frame number is too large; number the files by the frames "
+            "of the recording"
         )
     for (number, file), (following, other) in pairwise(ordered):
         if following == number:
-            raise InputError(f"{other}: frame {number} is also in {file.name}; keep one recording per folder")
+            raise InputError(
+                f"{other}: frame {number} is also in {file.name}; keep one recording per folder"
+            )
     return ordered

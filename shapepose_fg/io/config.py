@@ -34,7 +34,9 @@ def read_config(path: str | Path, kind: type[T]) -> T:
 
 
 _CURE = "`shapepose-fg config` prints the defaults"
-ANOTHER_VERSION = "it was written by another version of this program; reconstruct the recording again"
+ANOTHER_VERSION = (
+    "it was written by another version of this program; reconstruct the recording again"
+)
 """Advice for errors in settings that this program wrote."""
 
 
@@ -44,8 +46,8 @@ def config_from(
     """Settings of the dataclass `kind` from nested plain values (`asdict`), such as those in the
     run.json at `path`.
 
-    `place` is the dotted name of the table in the file. Raises InputError naming file and key, as `read_config`
-    does, with `cure` at its end.
+    `place` is the dotted name of the table in the file. Raises InputError naming file and key, as
+    `read_config` does, with `cure` at its end.
     """
     hints, prefix = get_type_hints(kind), f"{place}." if place else ""
     known = [field.name for field in fields(cast(Any, kind)) if field.init]
@@ -62,7 +64,8 @@ def config_from(
         hint = hints[key]
         if is_dataclass(hint) and not isinstance(value, dict):
             raise InputError(
-                f"{path}: {name} must be a table, got {describe(value)}; write [{name}] above its keys"
+                f"{path}: {name} must be a table, got {describe(value)}; write [{name}] above "
+                "its keys"
             )
         if is_dataclass(hint):
             values[key] = config_from(value, cast(type, hint), path, place=name, cure=cure)
@@ -107,13 +110,17 @@ def _lines(config: Any, table: str = "") -> list[str]:
             bounds = range_of(type(config), field.name)
             words = [comments.get(field.name), None if bounds is None else f"({bounds})"]
             settings += _comment(" ".join(filter(None, words)) or None)
-            settings.append(f"# {field.name} is not set" if value is None else f"{field.name} = {_toml(value)}")
+            settings.append(
+                f"# {field.name} is not set" if value is None else f"{field.name} = {_toml(value)}"
+            )
     return settings + tables
 
 
 def _comment(text: str | None) -> list[str]:
     """`text` as comment lines."""
-    return [] if text is None else [f"# {line}" for line in textwrap.wrap(" ".join(text.split()), 100)]
+    return (
+        [] if text is None else [f"# {line}" for line in textwrap.wrap(" ".join(text.split()), 100)]
+    )
 
 
 def _toml(value: Any) -> str:
@@ -136,6 +143,10 @@ def _field_docstrings(kind: type) -> dict[str, str]:
     comments = {}
     for statement, following in pairwise(cast(ast.ClassDef, body).body):
         if isinstance(statement, ast.AnnAssign) and isinstance(following, ast.Expr):
-            text = ast.literal_eval(following.value) if isinstance(following.value, ast.Constant) else None
+            text = (
+                ast.literal_eval(following.value)
+                if isinstance(following.value, ast.Constant)
+                else None
+            )
             comments[cast(ast.Name, statement.target).id] = text
     return {name: text for name, text in comments.items() if isinstance(text, str)}

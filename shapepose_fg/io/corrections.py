@@ -24,7 +24,10 @@ CORRECTIONS, UNCORRECTED = "corrections.json", "uncorrected"
 _PART = f".{UNCORRECTED}.part"
 """Name of the folder of the uncorrected result while it is created, or deleted."""
 _FILES = (PEOPLE, RUN, OBSERVATIONS)
-_CURE = f"copy the files of {UNCORRECTED} back and delete {UNCORRECTED} and {CORRECTIONS} to start again"
+_CURE = (
+    f"copy the files of {UNCORRECTED} back and delete {UNCORRECTED} and {CORRECTIONS} to start "
+    "again"
+)
 
 Number = Annotated[int, Field(ge=0, le=MOST_NUMBER)]
 
@@ -54,9 +57,9 @@ def read_corrections(folder: str | Path) -> tuple[Edit, ...]:
     if not file.is_file():
         if (Path(folder) / UNCORRECTED).exists():
             raise InputError(
-                f"{file}: this file is missing beside {UNCORRECTED}, so a correction was interrupted; copy the"
-                f" files of {UNCORRECTED} back and delete that folder, or only delete it if people.npz is"
-                " of a later run"
+                f"{file}: this file is missing beside {UNCORRECTED}, so a correction was "
+                f"interrupted; copy the files of {UNCORRECTED} back and delete that folder, or "
+                "only delete it if people.npz is of a later run"
             )
         return ()
     content = validated(_File, read_json(file), file, _CURE)
@@ -102,7 +105,9 @@ def take_back(folder: str | Path, solve: Solve | None = None) -> tuple[Edit, Rec
     folder = Path(folder)
     edits = _kept_edits(folder)
     if len(edits) == 0:
-        raise InputError(f"{folder}: there is no correction to undo; see shapepose-fg tracks {folder}")
+        raise InputError(
+            f"{folder}: there is no correction to undo; see shapepose-fg tracks {folder}"
+        )
     if len(edits) == 1:
         _restore(folder)
         return edits[-1], Reconstruction.load(folder)
@@ -121,7 +126,9 @@ def refuse_corrected(folder: Path) -> None:
     there = [name for name in (CORRECTIONS, UNCORRECTED) if (folder / name).exists()]
     if len(there) > 0:
         cure = f"give another folder, or delete {CORRECTIONS} and {UNCORRECTED} first"
-        raise InputError(f"{folder}: this result was corrected by hand ({' and '.join(there)}); {cure}")
+        raise InputError(
+            f"{folder}: this result was corrected by hand ({' and '.join(there)}); {cure}"
+        )
 
 
 def _write(folder: Path, people: Reconstruction, edits: Sequence[Edit]) -> None:
@@ -130,7 +137,9 @@ def _write(folder: Path, people: Reconstruction, edits: Sequence[Edit]) -> None:
     """
     counts = people.run.get("people", {})
     people.with_run(people=counts | people.counts()).save(folder)
-    kept = [{name: value for name, value in vars(edit).items() if value is not None} for edit in edits]
+    kept = [
+        {name: value for name, value in vars(edit).items() if value is not None} for edit in edits
+    ]
     content = {"format": "shapepose-fg corrections 1", "people": _checksum(folder), "edits": kept}
     write_content(folder / CORRECTIONS, json.dumps(content, indent=1) + "\n")
 

@@ -70,15 +70,21 @@ class DetectionTable:
         block = self._at_hand[number]
         rows = slice(*block["candidate_start"][at : at + 2].tolist())
         links = slice(*block["pair_start"][at : at + 2].tolist())
-        view, joint, xy, confidence = (block[name][rows] for name in ("view", "joint", "xy", "confidence"))
+        view, joint, xy, confidence = (
+            block[name][rows] for name in ("view", "joint", "xy", "confidence")
+        )
         pairs, affinity = block["pairs"][links].astype(np.intp), block["affinity"][links]
-        return Detections(view.astype(np.intp), joint.astype(np.intp), xy, confidence, pairs, affinity)
+        return Detections(
+            view.astype(np.intp), joint.astype(np.intp), xy, confidence, pairs, affinity
+        )
 
     def __iter__(self) -> Iterator[Detections]:
         return (self[frame] for frame in range(len(self)))
 
 
-def keep_block(kept: KeptArrays, number: int, candidates: Detections, start: Index, pair_start: Index) -> None:
+def keep_block(
+    kept: KeptArrays, number: int, candidates: Detections, start: Index, pair_start: Index
+) -> None:
     """Store block `number` of a recording: the candidates of its T frames, sorted by frame.
 
     Indices in `pairs` are relative to the first candidate of their frame; `start` and `pair_start`

@@ -8,7 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.storage.files import MIDDLE, bounded, has_long_number, not_json, text_pieces, unique_keys
+from shapepose_fg.core.storage.files import (
+    MIDDLE,
+    bounded,
+    has_long_number,
+    not_json,
+    text_pieces,
+    unique_keys,
+)
 
 _SPACE = " \t\n\r"
 _NEAR = 16
@@ -124,14 +131,22 @@ class _Text:
             try:
                 value, end = self._decoder.raw_decode(self._left, self._at)
             except json.JSONDecodeError as error:
-                cut = error.msg.startswith("Unterminated string") or error.pos >= len(self._left) - _NEAR
+                cut = (
+                    error.msg.startswith("Unterminated string")
+                    or error.pos >= len(self._left) - _NEAR
+                )
                 if cut and self._more():
                     continue
                 raise self.refuse(error.msg, error.pos) from None
             except InputError:
                 raise
-            except (ValueError, RecursionError) as error:  # of 5,000 digits, or 10,000 open brackets
-                raise InputError(f"{self._path}: cannot be read as JSON ({error}); write the file again") from None
+            except (
+                ValueError,
+                RecursionError,
+            ) as error:  # of 5,000 digits, or 10,000 open brackets
+                raise InputError(
+                    f"{self._path}: cannot be read as JSON ({error}); write the file again"
+                ) from None
             number = isinstance(value, int | float) and end >= len(self._left) - len("e-")
             if number and self._more():  # the number may continue
                 continue
@@ -152,7 +167,9 @@ class _Text:
         line = self._lines + self._left.count("\n", 0, at) + 1
         begin = self._left.rfind("\n", 0, at)
         column = at - begin if begin >= 0 else self._column + at + 1
-        return not_json(self._path, line, column, problem, rest=self._left[at:] if self._over else None)
+        return not_json(
+            self._path, line, column, problem, rest=self._left[at:] if self._over else None
+        )
 
     def _more(self) -> bool:
         """Read as much text again as is in memory, and drop decoded text; returns whether there was
@@ -162,7 +179,9 @@ class _Text:
         breaks = done.count("\n")
         if left > MIDDLE:
             problem = f"one value has over {MIDDLE >> 20} MiB"
-            raise InputError(f"{self._path}: line {self._lines + breaks + 1}: {problem}; write the file again")
+            raise InputError(
+                f"{self._path}: line {self._lines + breaks + 1}: {problem}; write the file again"
+            )
         parts, wanted = [self._left[self._at :]], max(left, 1)
         while wanted > 0 and (piece := next(self._pieces, None)) is not None:
             parts.append(piece)

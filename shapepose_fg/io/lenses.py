@@ -30,7 +30,8 @@ _USUAL = 65.0
 
 
 def lenses_of(detections: Path, fields: Sequence[str], size: tuple[int, int] | None) -> Rig:
-    """Cameras without poses, one for each file or folder of `detections`, in the order of their names.
+    """Cameras without poses, one for each file or folder of `detections`, in the order of their
+    names.
 
     `fields` are horizontal fields of view in degrees, or photos of the same lens with the focal
     length in EXIF; `CAMERA=` before a value restricts it to one camera. `size` is (width, height)
@@ -38,7 +39,9 @@ def lenses_of(detections: Path, fields: Sequence[str], size: tuple[int, int] | N
     InputError names what is missing.
     """
     names = camera_names(detections)
-    given = dict(zip(names, per_camera("--field-of-view", fields, names, one_for_all=True), strict=True))
+    given = dict(
+        zip(names, per_camera("--field-of-view", fields, names, one_for_all=True), strict=True)
+    )
     footage = detections / "footage.json"
     sizes = (
         {}
@@ -51,7 +54,10 @@ def lenses_of(detections: Path, fields: Sequence[str], size: tuple[int, int] | N
         if field is None:
             raise InputError(f"--field-of-view: missing for camera {name}; give {name}=DEGREES")
         if picture is None:
-            raise InputError(f"camera {name}: the size of its pictures is unknown; pass --image-size WIDTHxHEIGHT")
+            raise InputError(
+                f"camera {name}: the size of its pictures is unknown; pass --image-size "
+                "WIDTHxHEIGHT"
+            )
         with naming(detections):
             cameras.append(_camera(name, picture, _degrees(field, picture)))
     with naming(detections):
@@ -60,7 +66,9 @@ def lenses_of(detections: Path, fields: Sequence[str], size: tuple[int, int] | N
 
 def pictures_only(names: Sequence[str], sizes: Sequence[tuple[int, int]]) -> Rig:
     """Upright cameras for which only the picture sizes (width, height) are known, without poses."""
-    return Rig(tuple(_camera(name, size, _USUAL) for name, size in zip(names, sizes, strict=True)), "z")
+    return Rig(
+        tuple(_camera(name, size, _USUAL) for name, size in zip(names, sizes, strict=True)), "z"
+    )
 
 
 def _camera(name: str, size: tuple[int, int], degrees: float) -> Camera:
@@ -82,7 +90,8 @@ def _degrees(given: str, size: tuple[int, int]) -> float:
         degrees = np.nan
     if not _NARROWEST <= degrees <= _WIDEST:
         raise InputError(
-            f"--field-of-view {given[:80]}: must be {_NARROWEST:g} to {_WIDEST:g} degrees, or a .jpg with EXIF"
+            f"--field-of-view {given[:80]}: must be {_NARROWEST:g} to {_WIDEST:g} degrees, or a "
+            ".jpg with EXIF"
         )
     return degrees
 
@@ -94,14 +103,23 @@ def _focal_of_photo(file: Path) -> float:
     image = optional("PIL.Image", "photos")
     cure = "give an unedited photo of the camera, or degrees"
     with open_regular(file, cure, BIG) as stream, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Pillow's warning about large pictures; none is decoded here
+        warnings.simplefilter(
+            "ignore"
+        )  # Pillow's warning about large pictures; none is decoded here
         try:
             with image.open(stream, formats=_FORMATS) as photo:
                 # Without EXIF in its header, a PNG would be decoded to look behind the image data.
                 known = photo.format != "PNG" or "exif" in photo.info
-                sides, found = photo.size, photo.getexif().get_ifd(_EXIF).get(_FOCAL_35MM) if known else None
-        except Exception as error:  # for damaged files Pillow raises many kinds of errors, such as SyntaxError
-            raise InputError(f"{file}: cannot be read as a photo ({type(error).__name__}); {cure}") from None
+                sides, found = (
+                    photo.size,
+                    photo.getexif().get_ifd(_EXIF).get(_FOCAL_35MM) if known else None,
+                )
+        except (
+            Exception
+        ) as error:  # for damaged files Pillow raises many kinds of errors, such as SyntaxError
+            raise InputError(
+                f"{file}: cannot be read as a photo ({type(error).__name__}); {cure}"
+            ) from None
     if not isinstance(found, int | float) or not 0 < found < 2000 or min(sides) < 1:
         raise InputError(f"{file}: its EXIF data have no FocalLengthIn35mmFilm; {cure}")
     return float(found / np.hypot(*_FILM_MM) * np.hypot(*sides) / max(sides))

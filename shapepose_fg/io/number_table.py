@@ -21,7 +21,8 @@ def read_number_table(
     units: str,
     may_lack: Callable[[str], bool] = lambda name: False,
 ) -> tuple[list[str], Array, Index]:
-    """The names of the columns, the numbers (R, C), NaN for missing ones, and the line (R,) of each row.
+    """The names of the columns, the numbers (R, C), NaN for missing ones, and the line (R,) of each
+    row.
 
     Words are separated by commas or spaces, and `#` begins a comment. `heads` receives the number
     and the words of the first line, and returns the names of the columns, and whether that line is
@@ -39,12 +40,16 @@ def read_number_table(
                 continue
         if len(words) != len(names):
             cure = "correct the line, or name the columns in the first line"
-            raise InputError(f"{path}: line {line} must hold {len(names)} numbers, got {len(words)}; {cure}")
+            raise InputError(
+                f"{path}: line {line} must hold {len(names)} numbers, got {len(words)}; {cure}"
+            )
         row = list[float]()
         for name, word in zip(names, words, strict=True):
             lacks = word == MISSING and may_lack(name)
             if not (lacks or is_number(word)):
-                raise InputError(f"{path}: line {line} must hold numbers, got {word[:20]!r}; {units}")
+                raise InputError(
+                    f"{path}: line {line} must hold numbers, got {word[:20]!r}; {units}"
+                )
             row.append(np.nan if lacks else float(word))
         rows.append(row)
         lines.append(line)

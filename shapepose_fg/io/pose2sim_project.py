@@ -43,7 +43,8 @@ class Pose2SimProject:
     first_number: int
     """Number of the first frame in the project: results use the project's numbers."""
     frames: tuple[int, int] | None
-    """Frame numbers in the project: the first frame to reconstruct, and the first after the last."""
+    """Frame numbers in the project: the first frame to reconstruct, and the first after the
+    last."""
     multi_person: bool
     """Whether all people are wanted, or one person."""
     joints: DeclaredJoints | None
@@ -83,8 +84,9 @@ class Pose2SimProject:
         if start >= stop:
             last = self.first_number + count
             raise InputError(
-                f"{self.folder / CONFIG}: project.frame_range is {list(self.frames)}, but the detections have"
-                f" frames {self.first_number} to {last - 1}; correct it, or write 'all'"
+                f"{self.folder / CONFIG}: project.frame_range is {list(self.frames)}, but the "
+                f"detections have frames {self.first_number} to {last - 1}; correct it, or write "
+                "'all'"
             )
         return range(start, stop)
 
@@ -96,7 +98,9 @@ def read_pose2sim_project(folder: Path) -> Pose2SimProject:
     config, session = _settings(folder)
     project = config.get("project", {})
     if not isinstance(project, dict):
-        raise InputError(f"{folder / CONFIG}: project must be a table; write [project] as Pose2Sim's demos do")
+        raise InputError(
+            f"{folder / CONFIG}: project must be a table; write [project] as Pose2Sim's demos do"
+        )
     rate, span, multi_person = _checked(project, folder / CONFIG)
     calibration = _calibration(session, folder)
     entries = sorted((folder / "videos").iterdir()) if (folder / "videos").is_dir() else []
@@ -109,7 +113,9 @@ def read_pose2sim_project(folder: Path) -> Pose2SimProject:
         told = ((glance(video)[1], f" (from {video.name})") for video in videos)
         assumed = _RATE, " are assumed, because project.frame_rate is 'auto' and there is no video"
         given = rate != "auto"
-        fps, origin = (rate, f" (from {CONFIG})") if given else next((e for e in told if e[0] > 0), assumed)
+        fps, origin = (
+            (rate, f" (from {CONFIG})") if given else next((e for e in told if e[0] > 0), assumed)
+        )
         said = f"{fps:g} Hz{origin}"
     # Results have the numbers in the file names (or counted from 0), from the first frame that all
     # cameras have.
@@ -124,7 +130,10 @@ def read_pose2sim_project(folder: Path) -> Pose2SimProject:
         (span[0], span[1]) if isinstance(span, list) and len(span) == 2 else None,
         multi_person,
         _joints(config, folder / CONFIG),
-        (f"{folder}: cameras from {calibration}, detections from {detections}", f"{folder}: {said}"),
+        (
+            f"{folder}: cameras from {calibration}, detections from {detections}",
+            f"{folder}: {said}",
+        ),
     )
 
 
@@ -132,7 +141,9 @@ def _checked(project: dict[str, Any], file: Path) -> tuple[Any, Any, bool]:
     """frame_rate, frame_range and multi_person of [project]; InputError for invalid values."""
 
     def wrong(key: str, wanted: str) -> InputError:
-        return InputError(f"{file}: project.{key} must be {wanted}, got {project[key]!r}; correct it")
+        return InputError(
+            f"{file}: project.{key} must be {wanted}, got {project[key]!r}; correct it"
+        )
 
     rate, span = project.get("frame_rate", "auto"), project.get("frame_range", "auto")
     number = isinstance(rate, int | float) and not isinstance(rate, bool)
@@ -156,7 +167,11 @@ def _joints(config: dict[str, Any], file: Path) -> DeclaredJoints | None:
     if not isinstance(name, str) or not name.strip():
         return None
     tree, source = pose.get(name), f"{file}: pose.pose_model"
-    names = {} if layouts_called(name) else _joints_of_tree(tree[0] if isinstance(tree, list) and tree else tree)
+    names = (
+        {}
+        if layouts_called(name)
+        else _joints_of_tree(tree[0] if isinstance(tree, list) and tree else tree)
+    )
     if not names:
         return DeclaredJoints(name, source)
     return DeclaredJoints(tuple(names.get(place, "") for place in range(max(names) + 1)), source)
@@ -173,7 +188,9 @@ def _joints_of_tree(tree: Any) -> dict[int, str]:
             continue
         children, place, name = each.get("children"), each.get("id"), each.get("name")
         waiting += children if isinstance(children, list) else []
-        place = int(place) if isinstance(place, str) and place.isdecimal() and len(place) < 6 else place
+        place = (
+            int(place) if isinstance(place, str) and place.isdecimal() and len(place) < 6 else place
+        )
         if type(place) is int and 0 <= place < _MOST_KEYPOINTS and isinstance(name, str):
             names[place] = name
     return names
@@ -182,13 +199,20 @@ def _joints_of_tree(tree: Any) -> dict[int, str]:
 def _settings(folder: Path) -> tuple[dict[str, Any], Path]:
     """Config.toml of a trial merged over that of its session, and the session's folder."""
     if not folder.is_dir():
-        raise InputError(f"{folder}: there is no such folder; give the folder of a Pose2Sim project")
+        raise InputError(
+            f"{folder}: there is no such folder; give the folder of a Pose2Sim project"
+        )
     own, above = folder / CONFIG, folder.resolve().parent / CONFIG
     if not own.is_file():
-        raise InputError(f"{own}: there is no such file; give the folder of a Pose2Sim project, which contains it")
+        raise InputError(
+            f"{own}: there is no such file; give the folder of a Pose2Sim project, which "
+            "contains it"
+        )
     trials = sorted(each.parent.name for each in folder.glob(f"*/{CONFIG}"))
     if len(trials) > 0 and not any((folder / name).is_dir() for name in (*_POSES, "videos")):
-        raise InputError(f"{folder}: this is a session of several trials; give one of them: {listing(trials)}")
+        raise InputError(
+            f"{folder}: this is a session of several trials; give one of them: {listing(trials)}"
+        )
     config = read_toml(own, may_be_empty=True)
     if not above.is_file():
         return config, folder
@@ -213,7 +237,8 @@ def _calibration(session: Path, folder: Path) -> Path:
     rooms = [each for each in inside if "calib" in each.name.lower()]
     if len(rooms) == 0:
         raise InputError(
-            f"{session}: there is no calibration folder; put the calibration into {session}/calibration"
+            f"{session}: there is no calibration folder; put the calibration into "
+            f"{session}/calibration"
         )
     files = [each for room in rooms for each in room.iterdir() if each.is_file()]
     files.sort(key=lambda file: (file.stat().st_mtime, file.name), reverse=True)
@@ -222,7 +247,9 @@ def _calibration(session: Path, folder: Path) -> Path:
     if found is None:
         there = listing(sorted(each.name for each in rooms[0].iterdir()))
         cure = "run Pose2Sim's calibration, or put one of the formats of docs/conventions.md there"
-        raise InputError(f"{rooms[0]}: there is no calibration in a known format, only {there}; {cure}")
+        raise InputError(
+            f"{rooms[0]}: there is no calibration in a known format, only {there}; {cure}"
+        )
     return found
 
 
@@ -232,7 +259,11 @@ def _detections(folder: Path, has_videos: bool) -> Path:
     """
 
     def is_pose(path: Path) -> bool:
-        there = len(numbered(path, FRAME_FILE)) > 0 if path.is_dir() else path.suffix in (".json", ".txt")
+        there = (
+            len(numbered(path, FRAME_FILE)) > 0
+            if path.is_dir()
+            else path.suffix in (".json", ".txt")
+        )
         return there and not path.name.startswith(".")
 
     for place in (folder / name for name in _POSES):
@@ -241,9 +272,15 @@ def _detections(folder: Path, has_videos: bool) -> Path:
     pose, videos = folder / "pose", folder / "videos"
     if not has_videos:
         problem = f"there are neither 2D detections ({' '.join(_POSES)}) nor videos"
-        raise InputError(f"{folder}: {problem}; put the videos into {videos} and detect people in them")
-    command = shlex.join(["shapepose-fg", "detect", "--project", str(folder.resolve()), "--network", "NETWORK"])
-    raise InputError(f"{pose}: there are no 2D detections yet; run Pose2Sim's poseEstimation, or {command}")
+        raise InputError(
+            f"{folder}: {problem}; put the videos into {videos} and detect people in them"
+        )
+    command = shlex.join(
+        ["shapepose-fg", "detect", "--project", str(folder.resolve()), "--network", "NETWORK"]
+    )
+    raise InputError(
+        f"{pose}: there are no 2D detections yet; run Pose2Sim's poseEstimation, or {command}"
+    )
 
 
 def footage_of(folder: Path) -> tuple[Path, Path, Path]:

@@ -28,7 +28,9 @@ def times_beside(detections: Path, fps: float | None, timestamps: Path | None) -
     detections; or None.
     """
     if fps is not None and timestamps is not None:
-        raise InputError("--fps and --timestamps: both determine the times of frames; give one of them")
+        raise InputError(
+            "--fps and --timestamps: both determine the times of frames; give one of them"
+        )
     beside = detections / TIMES
     return timestamps or (beside if fps is None and beside.is_file() else None)
 
@@ -70,7 +72,9 @@ def read_recording(
 
 
 def own_times(recording: DetectionTable, times: FrameTimes, views: int) -> Array:
-    """(T, V) times of each camera's own frames, on its own clock, seconds; NaN for missing frames."""
+    """(T, V) times of each camera's own frames, on its own clock, seconds; NaN for missing
+    frames.
+    """
     own = times.of_views(views)
     return own if recording.picture is None else np.where(recording.picture >= 0, own, np.nan)
 
@@ -81,7 +85,9 @@ def _own(there: Mask) -> Index:
 
 
 def write_moments(file: Path, rig: Rig, picture: Index) -> None:
-    """Write the number of each camera's own picture in each frame, `picture` (T, V), -1 for none."""
+    """Write the number of each camera's own picture in each frame, `picture` (T, V), -1 for
+    none.
+    """
     rows = [", ".join(["frame", *rig.names])]
     rows += [", ".join(map(str, [frame, *row])) for frame, row in enumerate(picture.tolist())]
     write_content(file, "\n".join(rows) + "\n")
@@ -96,7 +102,15 @@ def read_moments(file: Path) -> dict[str, Index]:
     try:
         numbers = np.array(rows, dtype=np.intp).reshape(len(rows), len(names))
     except ValueError:
-        raise InputError(f"{file}: lines must have the same number of whole numbers; reconstruct again") from None
-    if names[0] != "frame" or (numbers[:, 0] != np.arange(len(rows))).any() or (numbers[:, 1:] < -1).any():
-        raise InputError(f"{file}: there must be a line for each frame from 0 on; reconstruct again")
+        raise InputError(
+            f"{file}: lines must have the same number of whole numbers; reconstruct again"
+        ) from None
+    if (
+        names[0] != "frame"
+        or (numbers[:, 0] != np.arange(len(rows))).any()
+        or (numbers[:, 1:] < -1).any()
+    ):
+        raise InputError(
+            f"{file}: there must be a line for each frame from 0 on; reconstruct again"
+        )
     return dict(zip(names[1:], numbers.T[1:], strict=True))

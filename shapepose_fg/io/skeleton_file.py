@@ -16,8 +16,8 @@ from shapepose_fg.io.validation import validated
 
 _Pair = Annotated[list[str], Field(min_length=2, max_length=2)]
 _FACE_AND_TOES = {
-    "REye", "LEye", "REar", "LEar", "Head", "LBigToe", "RBigToe", "LSmallToe", "RSmallToe", "LHeel", "RHeel",
-    "left_hand", "right_hand", "left_foot", "right_foot",
+    "REye", "LEye", "REar", "LEar", "Head", "LBigToe", "RBigToe", "LSmallToe", "RSmallToe", "LHeel",
+    "RHeel", "left_hand", "right_hand", "left_foot", "right_foot",
 }  # fmt: skip
 """Body points that are not core joints."""
 _HIPS = ({"RHip", "LHip"}, {"right_hip", "left_hip"})
@@ -53,7 +53,9 @@ def find_skeleton(wanted: Skeleton | str | Path | None) -> Skeleton | None:
             if called
             else ("this is neither a file nor a known skeleton; give")
         )
-        raise InputError(f"{name}: {what} {'one of' if called else 'a TOML file, or one of'} {names}")
+        raise InputError(
+            f"{name}: {what} {'one of' if called else 'a TOML file, or one of'} {names}"
+        )
     return read_skeleton(name)
 
 
@@ -65,23 +67,33 @@ def read_skeleton(path: str | Path) -> Skeleton:
     path = Path(path)
     file = validated(_File, read_toml(path), path, "docs/conventions.md describes the file")
     # The body point of each joint, by the joint's name in the file.
-    points = {joint: file.body.get(joint, joint) for joint in (*file.keypoints, *file.middles) if joint}
+    points = {
+        joint: file.body.get(joint, joint) for joint in (*file.keypoints, *file.middles) if joint
+    }
     unknown = [name for name in file.body if name not in points]
     if unknown:
-        raise InputError(f"{path}: body.{unknown[0]} is not a keypoint of {file.name}; it has {' '.join(points)}")
+        raise InputError(
+            f"{path}: body.{unknown[0]} is not a keypoint of {file.name}; it has {' '.join(points)}"
+        )
     for joint, point in points.items():
         if point not in BODY_POINTS:
             raise InputError(
-                f"{path}: the body has no point {point!r}; write under [body] which of its points {joint} is"
+                f"{path}: the body has no point {point!r}; write under [body] which of its points"
+                f" {joint} is"
                 f' ({" ".join(BODY_POINTS)}), or "" to ignore the keypoint'
             )
 
     def pair(names: list[str]) -> tuple[str, str]:
         return points.get(names[0], names[0]), points.get(names[1], names[1])
 
-    anchor = points.get(file.anchor, file.anchor) if isinstance(file.anchor, str) else pair(file.anchor)
+    anchor = (
+        points.get(file.anchor, file.anchor) if isinstance(file.anchor, str) else pair(file.anchor)
+    )
     if not isinstance(anchor, str) and set(anchor) not in _HIPS:
-        raise InputError(f"{path}: an anchor of two joints must be the hips; name other midpoints under [middles]")
+        raise InputError(
+            f"{path}: an anchor of two joints must be the hips; name other midpoints under "
+            "[middles]"
+        )
     core = [points.get(joint, joint) for joint in file.core or ()]
     if file.core is None:
         core = [point for point in points.values() if point not in _FACE_AND_TOES]

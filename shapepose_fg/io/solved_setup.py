@@ -17,8 +17,9 @@ def cameras_of(folder: Path) -> Rig:
     file = folder / CAMERAS
     if not file.exists():
         raise InputError(
-            f"{file}: this file with the cameras of the result is missing; write it with `people.save(folder,"
-            " rig)` or `write_rig(rig, file)`, or copy the calibration to this path"
+            f"{file}: this file with the cameras of the result is missing; write it with "
+            "`people.save(folder, rig)` or `write_rig(rig, file)`, or copy the calibration to "
+            "this path"
         )
     return read_rig(file)
 

@@ -46,9 +46,13 @@ def read_timestamps(path: str | Path, rig: Rig, frames: int) -> tuple[FrameTimes
         raise InputError(f"{path}: {error}") from None
     # Frames that a camera lacks keep their numbers, as in the detections.
     number = [np.append(np.flatnonzero(np.isfinite(each)), -1) for each in time_s.T]
-    picture = np.column_stack([own[place] for own, place in zip(number, found.picture.T, strict=True)])
+    picture = np.column_stack(
+        [own[place] for own, place in zip(number, found.picture.T, strict=True)]
+    )
     notes = tuple(f"{path}: {each}" for each in found.notes)
-    return FrameTimes(cast(Array, found.time_s), source=str(path)), Moments(picture, found.time_s, notes)
+    return FrameTimes(cast(Array, found.time_s), source=str(path)), Moments(
+        picture, found.time_s, notes
+    )
 
 
 def read_own_times(path: Path, rig: Rig, frames: int) -> tuple[FrameTimes, Mask]:
@@ -62,8 +66,12 @@ def read_own_times(path: Path, rig: Rig, frames: int) -> tuple[FrameTimes, Mask]
     periods = [clock.period for clock in clocks]
     if max(periods) > 1.01 * min(periods):
         slow, fast = (clocks[periods.index(end(periods))].name for end in (max, min))
-        what = f"cameras {slow} and {fast} have {1 / max(periods):.3g} and {1 / min(periods):.3g} Hz"
-        raise InputError(f"{path}: {what}, but synchronisation needs a common rate; give detections of one rate")
+        what = (
+            f"cameras {slow} and {fast} have {1 / max(periods):.3g} and {1 / min(periods):.3g} Hz"
+        )
+        raise InputError(
+            f"{path}: {what}, but synchronisation needs a common rate; give detections of one rate"
+        )
     there = np.isfinite(time_s)
     filled = time_s.copy()
     for own, has, clock in zip(filled.T, there.T, clocks, strict=True):
@@ -87,23 +95,33 @@ def _times(path: Path, rig: Rig, frames: int) -> tuple[Array, list[CameraClock]]
         return (words if header else [_TIME]), header
 
     in_seconds = "write seconds like 0.033"
-    names, numbers, lines = read_number_table(path, heads, in_seconds, lambda name: name not in (_FRAME, _TIME))
+    names, numbers, lines = read_number_table(
+        path, heads, in_seconds, lambda name: name not in (_FRAME, _TIME)
+    )
     twice = next((name for name, count in Counter(names).items() if count > 1), None)
     if twice is not None:
         raise InputError(f"{path}: column {twice} occurs twice; give each its own name")
     wanted = [_TIME] if _TIME in names else rig.names
     missing = [name for name in wanted if name not in names]
     if len(missing) > 0:
-        problem = f"times of camera {missing[0]} are missing; the columns are {' '.join(names)[:80]}"
-        raise InputError(f"{path}: {problem}; name a column {_TIME}, or one for each camera of the calibration")
+        problem = (
+            f"times of camera {missing[0]} are missing; the columns are {' '.join(names)[:80]}"
+        )
+        raise InputError(
+            f"{path}: {problem}; name a column {_TIME}, or one for each camera of the calibration"
+        )
     picked = np.arange(frames)
     if _FRAME in names:
         picked = _lines_of_frames(path, numbers[:, names.index(_FRAME)], lines, frames)
     elif len(numbers) != frames:
         problem = f"must hold a time for each of the {frames} frames, got {len(numbers)}"
-        raise InputError(f"{path}: {problem}; add a column frame if the file has more frames than the recording")
+        raise InputError(
+            f"{path}: {problem}; add a column frame if the file has more frames than the recording"
+        )
     time_s = numbers[picked][:, [names.index(name) for name in wanted]]
-    clocks = [_clock(path, name, each, lines[picked]) for name, each in zip(wanted, time_s.T, strict=True)]
+    clocks = [
+        _clock(path, name, each, lines[picked]) for name, each in zip(wanted, time_s.T, strict=True)
+    ]
     return time_s, clocks
 
 
@@ -117,11 +135,15 @@ def write_timestamps(path: Path, names: Sequence[str], times: Array) -> None:
     each camera, NaN for missing frames.
     """
     if times.ndim == 2 and not nameable(names):
-        raise InputError(f"{path}: a camera's name has a blank, a comma or #; rename it in the calibration")
+        raise InputError(
+            f"{path}: a camera's name has a blank, a comma or #; rename it in the calibration"
+        )
     columns = [_TIME] if times.ndim == 1 else names
     rows = [", ".join([_FRAME, *columns])]
     for frame, row in enumerate((times - np.nanmin(times)).reshape(len(times), -1).tolist()):
-        rows.append(", ".join([str(frame), *(f"{each:.6f}" if each == each else MISSING for each in row)]))
+        rows.append(
+            ", ".join([str(frame), *(f"{each:.6f}" if each == each else MISSING for each in row)])
+        )
     write_content(path, "\n".join(rows) + "\n")
 
 
@@ -148,10 +170,14 @@ def _lines_of_frames(path: Path, numbers: Array, lines: Index, frames: int) -> I
     odd = np.flatnonzero((numbers != np.round(numbers)) | (numbers < 0))
     if len(odd) > 0:
         line, number = lines[odd[0]], numbers[odd[0]]
-        raise InputError(f"{path}: line {line} must name a frame, 0 or more, got {number:g}; correct it")
+        raise InputError(
+            f"{path}: line {line} must name a frame, 0 or more, got {number:g}; correct it"
+        )
     found, first, count = np.unique(numbers, return_index=True, return_counts=True)
     if (count > 1).any():
-        raise InputError(f"{path}: frame {found[np.argmax(count > 1)]:.0f} occurs twice; keep one line")
+        raise InputError(
+            f"{path}: frame {found[np.argmax(count > 1)]:.0f} occurs twice; keep one line"
+        )
     missing = np.setdiff1d(np.arange(frames), found)
     if len(missing) > 0:
         has = f"the recording has frames 0 to {frames - 1}"

@@ -11,7 +11,9 @@ from shapepose_fg.core.errors import InputError
 Model = TypeVar("Model", bound=BaseModel)
 
 
-def validated(model: type[Model], value: object, place: object, cure: str | Mapping[str, str]) -> Model:
+def validated(
+    model: type[Model], value: object, place: object, cure: str | Mapping[str, str]
+) -> Model:
     """Validate `value`, from a file, as a `model`; InputError that names place, key and cure if it
     is invalid.
 
@@ -33,7 +35,9 @@ def validated_list(
         raise _refused(error, place, cure, start) from None
 
 
-def _refused(error: ValidationError, place: object, cure: str | Mapping[str, str], start: int = 0) -> InputError:
+def _refused(
+    error: ValidationError, place: object, cure: str | Mapping[str, str], start: int = 0
+) -> InputError:
     """The first problem in `error`, as a sentence."""
     keys, problem = first_problem(error)
     if start > 0 and isinstance(keys[0], int):

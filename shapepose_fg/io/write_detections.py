@@ -1,4 +1,5 @@
-"""Writes 2D detections for other programs: 4D Association's text with its calibration, and OpenPose's JSON.
+"""Writes 2D detections for other programs: 4D Association's text with its calibration, and
+OpenPose's JSON.
 
 Both formats have distorted pixels, so detections are distorted again if the rig has distortion.
 """
@@ -27,7 +28,8 @@ settings."""
 
 
 def write_association(recording: DetectionSequence, rig: Rig, folder: str | Path) -> None:
-    """Write calibration.json and detection/<camera>.txt into `folder`, as 4D Association reads them.
+    """Write calibration.json and detection/<camera>.txt into `folder`, as 4D Association reads
+    them.
 
     Positions (relative to the picture) have seven decimals, scores and affinities six. Joints
     outside the picture by a quarter of its size or more are left out, because readers refuse them.
@@ -38,10 +40,13 @@ def write_association(recording: DetectionSequence, rig: Rig, folder: str | Path
     for camera in rig.cameras:
         if camera.lens != "perspective" or camera.distortion[5:].any():
             raise ValueError(
-                f"the format has five distortion coefficients, but camera {camera.name} has another lens model"
+                f"the format has five distortion coefficients, but camera {camera.name} has "
+                "another lens model"
             )
     if rig.up != "z":
-        raise ValueError(f"the format has z up, but this rig {rig.up}; rotate the world and the truth first")
+        raise ValueError(
+            f"the format has z up, but this rig {rig.up}; rotate the world and the truth first"
+        )
     folder, calibration = Path(folder), dict[str, Any]()
     for camera in rig.cameras:
         entry = {
@@ -51,7 +56,9 @@ def write_association(recording: DetectionSequence, rig: Rig, folder: str | Path
         }
         # Distortion under the key that readers of this format use.
         straight = not camera.distortion.any()
-        calibration[camera.name] = entry | ({} if straight else {"distCoeff": camera.distortion[:5].tolist()})
+        calibration[camera.name] = entry | (
+            {} if straight else {"distCoeff": camera.distortion[:5].tolist()}
+        )
     write_content(folder / "calibration.json", json.dumps(calibration, indent=1, allow_nan=False))
     for view, camera in enumerate(rig.cameras):
         content = partial(_write_frames, recording=recording, view=view, camera=camera)
@@ -59,7 +66,8 @@ def write_association(recording: DetectionSequence, rig: Rig, folder: str | Path
 
 
 def write_openpose(recording: DetectionSequence, rig: Rig, folder: str | Path) -> None:
-    """Write <camera>/<camera>_000000000000_keypoints.json and so on into `folder`: people, as OpenPose does.
+    """Write <camera>/<camera>_000000000000_keypoints.json and so on into `folder`: people, as
+    OpenPose does.
 
     Candidates are grouped by `group_people`; groups of fewer joints than `SMALLEST_PERSON` are
     false positives, and are left out. Positions are in pixels with three decimals. ValueError if
@@ -81,7 +89,9 @@ def write_openpose(recording: DetectionSequence, rig: Rig, folder: str | Path) -
                     keypoints = np.zeros((len(BODY_25), 3))  # missing joints are 0 0 0
                     keypoints[found.joint[members], :2] = camera.distort(found.xy[members]).round(3)
                     keypoints[found.joint[members], 2] = found.confidence[members].round(6)
-                    listed.append({"person_id": [-1], "pose_keypoints_2d": keypoints.ravel().tolist()})
+                    listed.append(
+                        {"person_id": [-1], "pose_keypoints_2d": keypoints.ravel().tolist()}
+                    )
             # Thousands of small files are not written atomically; readers notice missing or
             # truncated ones.
             file = each / f"{camera.name}_{frame:012d}_keypoints.json"
@@ -95,7 +105,9 @@ def refuse_leftovers(rig: Rig, folder: str | Path) -> None:
     for camera in rig.cameras:
         place = Path(folder) / camera.name
         if next(place.glob("*_keypoints.json"), None) is not None:
-            raise InputError(f"{place}: there are frames of another recording already; delete them first")
+            raise InputError(
+                f"{place}: there are frames of another recording already; delete them first"
+            )
 
 
 def _check(recording: DetectionSequence) -> None:
@@ -106,8 +118,12 @@ def _check(recording: DetectionSequence) -> None:
         raise ValueError("there is no frame to write; these formats need at least one")
 
 
-def _write_frames(stream: BinaryIO, recording: DetectionSequence, view: int, camera: Camera) -> None:
-    """Write the text of one camera frame by frame, because the recording may be larger than memory."""
+def _write_frames(
+    stream: BinaryIO, recording: DetectionSequence, view: int, camera: Camera
+) -> None:
+    """Write the text of one camera frame by frame, because the recording may be larger than
+    memory.
+    """
     kind, size = TEXT_SKELETONS[BODY_25.name], np.array(camera.image_size, dtype=np.float64)
     stream.write(f"{kind.number} {len(recording)}\n".encode())
     for frame in range(len(recording)):
@@ -123,7 +139,12 @@ def _write_frames(stream: BinaryIO, recording: DetectionSequence, view: int, cam
 
 
 def association_lines(
-    kind: TextSkeleton, joint: Index, fractions: Array, confidence: Array, pairs: Index, affinity: Array
+    kind: TextSkeleton,
+    joint: Index,
+    fractions: Array,
+    confidence: Array,
+    pairs: Index,
+    affinity: Array,
 ) -> Iterable[str]:
     """The lines of one frame: candidates joint by joint, then affinities limb by limb.
 

@@ -1,1 +1,3 @@
-"""Online reconstruction: the people of the newest frame at once, and refined results within a fixed lag."""
+"""Online reconstruction: the people of the newest frame at once, and refined results within a fixed
+lag.
+"""

@@ -1,4 +1,6 @@
-"""Detects faulty cameras online: those that repeat pictures, fall silent, or contradict the others."""
+"""Detects faulty cameras online: those that repeat pictures, fall silent, or contradict the
+others.
+"""
 
 from dataclasses import dataclass, replace
 from enum import IntEnum
@@ -15,17 +17,18 @@ _OVER_S = 1.0
 SILENT_S = 0.5
 """Time without detections after which a camera is silent, and is not waited for, s."""
 _NEAREST = 0.25
-"""Quantile of the distances between people's joints and detections that measures a camera: other people may be
-hidden from it, and it may see further ones."""
+"""Quantile of the distances between people's joints and detections that measures a camera: other
+people may be hidden from it, and it may see further ones."""
 _OFF_M, _TIMES = 0.06, 2.5
-"""A camera contradicts the others above this distance, m, three times a detector's error, and above this
-multiple of the median camera's distance."""
+"""A camera contradicts the others above this distance, m, three times a detector's error, and above
+this multiple of the median camera's distance."""
 _BACK_M = 0.04
 """Distance below which a camera is used again, m."""
 _CAP_M = 0.5
 """Maximum of a distance in the average, m."""
 _LEAST = 12
-"""Minimum number of joints in a picture, and of detections, from which distances are computed: half a person."""
+"""Minimum number of joints in a picture, and of detections, from which distances are computed: half
+a person."""
 
 
 class CameraState(IntEnum):
@@ -51,8 +54,8 @@ class CameraWatch:
     """Statuses and statistics of V cameras."""
 
     apart_m: Array
-    """(V,) distance of people's joints from the nearest detection, averaged over a second, m; NaN where
-    unknown."""
+    """(V,) distance of people's joints from the nearest detection, averaged over a second, m; NaN
+    where unknown."""
     heard_s: Array
     """(V,) times of the last detections of each camera, s."""
     state: Whole
@@ -74,7 +77,11 @@ class CameraWatch:
         """
         views = len(rig)
         there = np.bincount(given.view, minlength=views) > 0
-        frozen = repeated_views(before, given, views) if before is not None else np.zeros(views, dtype=bool)
+        frozen = (
+            repeated_views(before, given, views)
+            if before is not None
+            else np.zeros(views, dtype=bool)
+        )
         heard_s = np.where(there, time_s, np.where(np.isinf(self.heard_s), time_s, self.heard_s))
         silent = time_s - heard_s > SILENT_S
         state = self._judged()
@@ -91,8 +98,8 @@ class CameraWatch:
         return replace(rig, dark=tuple(np.flatnonzero(out).tolist()), doubted=tuple(doubted))
 
     def compared(self, given: Detections, places: Array, rig: Rig, lasts_s: float) -> "CameraWatch":
-        """Update with the distances of the detections from people at `places` (A, J, 3), metres, NaN where
-        unknown.
+        """Update with the distances of the detections from people at `places` (A, J, 3), metres,
+        NaN where unknown.
         """
         if len(places) == 0 or len(given) == 0:
             return self
@@ -107,7 +114,9 @@ class CameraWatch:
         metres, of_detections = nearest.swapaxes(1, 2), np.minimum(away.min(axis=1), _CAP_M)
         apart_m, fresh = self.apart_m.copy(), min(lasts_s / _OVER_S, 1.0)
         counts = np.bincount(given.view, minlength=len(rig))
-        for view in np.flatnonzero((inside.sum(axis=(1, 2)) >= _LEAST) & (counts >= _LEAST)).tolist():
+        for view in np.flatnonzero(
+            (inside.sum(axis=(1, 2)) >= _LEAST) & (counts >= _LEAST)
+        ).tolist():
             if self.state[view] != CameraState.FROZEN:
                 both = metres[view][inside[view]], of_detections[given.view == view]
                 now, last = min(float(np.quantile(each, _NEAREST)) for each in both), apart_m[view]
@@ -115,15 +124,17 @@ class CameraWatch:
         return replace(self, apart_m=apart_m)
 
     def _judged(self) -> Whole:
-        """(V,) codes of `CameraState`: cameras that contradict the others; all are doubted unless at least two
-        agree, and more agree than contradict.
+        """(V,) codes of `CameraState`: cameras that contradict the others; all are doubted unless
+        at least two agree, and more agree than contradict.
         """
         known = np.isfinite(self.apart_m)
         was = self.state == CameraState.CONTRADICTS
         if not known.any():
             return np.zeros(len(known), dtype=np.int64)
         most = (
-            max(_OFF_M, _TIMES * float(np.median(self.apart_m[known & ~was]))) if (known & ~was).any() else _OFF_M
+            max(_OFF_M, _TIMES * float(np.median(self.apart_m[known & ~was])))
+            if (known & ~was).any()
+            else _OFF_M
         )
         off: Mask = known & (np.nan_to_num(self.apart_m) > np.where(was, _BACK_M, most))
         agree = known & ~off

@@ -39,7 +39,9 @@ class CommonClock(Generic[Given]):
     _recent: deque[int] = field(default_factory=deque)
     """The cameras of the last views."""
 
-    def admit(self, camera: int, time_s: float, now_s: float, given: Given) -> tuple[list[Given], bool]:
+    def admit(
+        self, camera: int, time_s: float, now_s: float, given: Given
+    ) -> tuple[list[Given], bool]:
         """The views to process now, in order of time, and whether the clock jumps with them.
 
         `given` is the content of the view of `camera` at `time_s`; `now_s` is the time of the
@@ -64,7 +66,10 @@ class CommonClock(Generic[Given]):
         waited = self._passed >= _PATIENCE * self.cameras or set(self._recent) <= set(agree)
         if len(agree) < 2 or len(agree) <= len(self._stay) or not waited:
             return [], False
-        taken = [given for _, given in sorted((self._held[each] for each in agree), key=lambda each: each[0])]
+        taken = [
+            given
+            for _, given in sorted((self._held[each] for each in agree), key=lambda each: each[0])
+        ]
         self._held.clear()
         self.off.clear()
         return taken, True

@@ -1,7 +1,7 @@
 """Online tracking, one frame after the other: a pure function of the state and the frame.
 
-Tracking, searching and measuring are those of recordings (`tracking/`). Without the future, track births and
-deaths are decided by the same evidence as it comes in.
+Tracking, searching and measuring are those of recordings (`tracking/`). Without the future, track
+births and deaths are decided by the same evidence as it comes in.
 """
 
 from dataclasses import dataclass, replace
@@ -31,7 +31,8 @@ _SURE = 0.3
 """Evidence per second above which a new person is reported at once: probability 0.97
 (`presence.probability`)."""
 _WAITS_S = 1.0
-"""Longest time for which a new track that may be a re-identification waits for its bone lengths, s."""
+"""Longest time for which a new track that may be a re-identification waits for its bone lengths,
+s."""
 _MOST_GONE = 256
 """Maximum number of ended tracks that are remembered."""
 _LONGEST_S = 0.1
@@ -54,7 +55,9 @@ class Gone(Rows):
 
 @dataclass(frozen=True)
 class Moment:
-    """The state after a frame: A tracks, and ended ones. Arrays and numbers only, so that it can be saved."""
+    """The state after a frame: A tracks, and ended ones. Arrays and numbers only, so that it can be
+    saved.
+    """
 
     tracks: Tracks
     """States of the tracks' joints."""
@@ -63,7 +66,8 @@ class Moment:
     identity: Whole
     """(A,) permanent identities; `ON_TRIAL` for tracks with insufficient evidence."""
     running_s: Array
-    """(A,) evidence since the birth of each track, as seconds in which a whole person is seen by all views."""
+    """(A,) evidence since the birth of each track, as seconds in which a whole person is seen by
+    all views."""
     peak_s: Array
     """(A,) maximum of `running_s` so far."""
     born_s: Array
@@ -110,7 +114,10 @@ class Filter:
     @cached_property
     def nobody(self) -> Moment:
         """The state before the first frame."""
-        J, B = len(self.tracker.skeleton), self._trace(np.zeros((0, len(self.tracker.skeleton), 3))).bones.shape[1]
+        J, B = (
+            len(self.tracker.skeleton),
+            self._trace(np.zeros((0, len(self.tracker.skeleton), 3))).bones.shape[1],
+        )
         whole, real = np.zeros(0, np.int64), np.zeros(0)
         gone = Gone(whole, real, np.zeros((0, 3)), np.zeros((0, B)))
         per_bone = np.zeros((0, B)), np.zeros((0, B))
@@ -118,17 +125,19 @@ class Filter:
         return Moment(self.tracker.nobody(), *own, gone)
 
     def step(self, before: Moment, given: Input) -> tuple[Moment, Index, Input]:
-        """Process the next frame; returns the state, the detections (A, J, V) of its tracks, -1 for none, and the
-        frame with left and right corrected.
+        """Process the next frame; returns the state, the detections (A, J, V) of its tracks, -1 for
+        none, and the frame with left and right corrected.
 
-        Tracks are predicted, detections assigned to them and their states updated; ten times a second new people
-        are searched for in the unassigned detections.
+        Tracks are predicted, detections assigned to them and their states updated; ten times a
+        second new people are searched for in the unassigned detections.
         """
         time_s, last_s, tracker = float(given.time_s.mean()), before.tracks.time_s, self.tracker
         tracks, given = hold_now(tracker, before.tracks, given)
         tracks, candidate = tracker.step(tracks, given.detections, given.rig, time_s)
         now = replace(before, tracks=replace(tracks, time_s=time_s))
-        now, candidate = self._weighed(now, candidate, given, min(max(time_s - last_s, 0.0), _LONGEST_S))
+        now, candidate = self._weighed(
+            now, candidate, given, min(max(time_s - last_s, 0.0), _LONGEST_S)
+        )
         now, candidate = self._without_ended(now, candidate)
         if not abs(time_s - now.sought_s) < _SEARCH_S:
             now, candidate = self._with_newcomers(now, candidate, given)
@@ -143,7 +152,9 @@ class Filter:
         """The rows of a frame for stage II: its tracks and their detections."""
         return observed(given, candidate, self.placed(now), now.tracks.ids)
 
-    def _weighed(self, now: Moment, candidate: Index, given: Input, lasts_s: float) -> tuple[Moment, Index]:
+    def _weighed(
+        self, now: Moment, candidate: Index, given: Input, lasts_s: float
+    ) -> tuple[Moment, Index]:
         """Update the evidence for each track, and the lengths of its bones, with a frame."""
         if len(now.tracks) == 0:
             return now, candidate
@@ -165,7 +176,9 @@ class Filter:
         ), candidate
 
     def _without_ended(self, now: Moment, candidate: Index) -> tuple[Moment, Index]:
-        """Remove tracks without recent evidence, and those whose missing evidence costs more than a new birth."""
+        """Remove tracks without recent evidence, and those whose missing evidence costs more than a
+        new birth.
+        """
         stays = self.tracker.alive(now.tracks) & (now.running_s >= now.peak_s - 2 * APPEARS_S)
         if stays.all():
             return now, candidate
@@ -191,7 +204,10 @@ class Filter:
         trace = self._trace(places)
         blank = np.zeros((count, trace.bones.shape[1]))
         # A person whom one frame makes certain has sufficient evidence at once.
-        sight, world = Sight.of(given.detections, given.rig, tracker.skeleton), np.zeros(count, dtype=np.intp)
+        sight, world = (
+            Sight.of(given.detections, given.rig, tracker.skeleton),
+            np.zeros(count, dtype=np.intp),
+        )
         evidence = own_evidence(own, *weighed(own, places, sight, tracker.skeleton, world))
         running_s = np.where(evidence >= _SURE, LEAST_S, 0.0)
         columns: dict[str, Any] = {
@@ -205,12 +221,14 @@ class Filter:
             "count": blank,
         }
         both = {name: np.concatenate([getattr(now, name), columns[name]]) for name in OF_TRACKS}
-        now = replace(now, tracks=Tracks.concatenate([tracks, new]), next_track=now.next_track + count, **both)
+        now = replace(
+            now, tracks=Tracks.concatenate([tracks, new]), next_track=now.next_track + count, **both
+        )
         return now, np.concatenate([candidate, own])
 
     def _with_names(self, now: Moment) -> Moment:
-        """Give identities to tracks with sufficient evidence: that of an ended track that fits in place, time and
-        build, or a new one.
+        """Give identities to tracks with sufficient evidence: that of an ended track that fits in
+        place, time and build, or a new one.
 
         A track that may be a re-identification waits until enough bones are measured.
         """
@@ -231,7 +249,10 @@ class Filter:
 
     def _may_be_back(self, now: Moment, row: int) -> bool:
         """Whether too few bones are measured to distinguish the track from ended tracks nearby."""
-        if now.tracks.time_s - now.born_s[row] > _WAITS_S or (now.count[row] >= LEAST_ROWS).mean() >= 0.5:
+        if (
+            now.tracks.time_s - now.born_s[row] > _WAITS_S
+            or (now.count[row] >= LEAST_ROWS).mean() >= 0.5
+        ):
             return False
         gap_s = now.born_s[row] - now.gone.time_s
         apart_m = np.linalg.norm(now.gone.place - now.place[row], axis=1)
@@ -244,7 +265,9 @@ class Filter:
         """
         gone, G, R = now.gone, len(now.gone.identity), len(ready)
         bones = np.where(
-            now.count[ready] >= LEAST_ROWS, now.length_m[ready] / np.maximum(now.count[ready], 1), np.nan
+            now.count[ready] >= LEAST_ROWS,
+            now.length_m[ready] / np.maximum(now.count[ready], 1),
+            np.nan,
         )
         begin = np.column_stack([now.born_s[ready], np.full(R, now.tracks.time_s)])
         ends = Ends(
@@ -254,7 +277,11 @@ class Filter:
             np.concatenate([gone.bones, bones]),
         )
         names = stitch(ends, self.stitching)
-        return {int(row): int(gone.identity[names[G + n]]) for n, row in enumerate(ready) if names[G + n] < G}
+        return {
+            int(row): int(gone.identity[names[G + n]])
+            for n, row in enumerate(ready)
+            if names[G + n] < G
+        }
 
     def _trace(self, places: Array) -> Trace:
         """Centres and bone lengths of people at `places` (A, J, 3)."""

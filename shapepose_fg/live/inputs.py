@@ -130,11 +130,15 @@ class _Sender:
 
     def _read(self, line: bytes | None, place: str) -> tuple[Any, ...] | None:
         if line is None:
-            raise InputError(f"{place}: the line is longer than {SMALL} bytes; write a line for each picture")
+            raise InputError(
+                f"{place}: the line is longer than {SMALL} bytes; write a line for each picture"
+            )
         try:
             text = line.decode()
         except UnicodeDecodeError as error:
-            raise InputError(f"{place}: byte {error.start} is not UTF-8 text; write JSON in UTF-8") from None
+            raise InputError(
+                f"{place}: byte {error.start} is not UTF-8 text; write JSON in UTF-8"
+            ) from None
         return read_view_line(text, place, self.given.rig, self.given.skeleton)
 
 
@@ -206,19 +210,25 @@ def _from_socket(where: str, given: _Given) -> None:
             if found is None:
                 return
             connection, name = found
-            client = _Client(connection, _Sender(f"{where}, {name}", given), _Lines(), time.monotonic())
+            client = _Client(
+                connection, _Sender(f"{where}, {name}", given), _Lines(), time.monotonic()
+            )
             if len(clients) >= MOST_CLIENTS:
                 # The first to go is one without any accepted line, then the longest silent.
                 first = min(clients, key=lambda each: (each.sender.good > 0, each.heard_s))
                 if first.sender.good > 0 and client.heard_s - first.heard_s < _SILENT_S:
                     connection.close()
                     given.note(
-                        f"{where}: {name} is rejected, because {MOST_CLIENTS} clients are connected already"
+                        f"{where}: {name} is rejected, because {MOST_CLIENTS} clients are "
+                        "connected already"
                     )
                     return
                 cut_off(
                     first,
-                    f"at most {MOST_CLIENTS} clients are served, and this one was silent for the longest time",
+                    (
+                        f"at most {MOST_CLIENTS} clients are served, and this one was silent for "
+                        "the longest time"
+                    ),
                 )
             clients.append(client)
             ready.register(connection, selectors.EVENT_READ, client)

@@ -1,4 +1,6 @@
-"""The people of the newest frame, and predictions beyond it: joints with covariances, velocities, bodies."""
+"""The people of the newest frame, and predictions beyond it: joints with covariances, velocities,
+bodies.
+"""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -23,24 +25,28 @@ from shapepose_fg.tracking.motion_filter import JointStates
 from shapepose_fg.tracking.tracker import Tracker
 
 _OWN_S, _TOGETHER_S = 0.3, 0.7
-"""Time constants with which the velocity of a joint relative to its person, and that of the person, decay, s:
-0.3 and 1 s ahead errors are 11 and 39 % smaller than with constant velocity (simulated, split tune and
-crossing)."""
+"""Time constants with which the velocity of a joint relative to its person, and that of the person,
+decay, s: 0.3 and 1 s ahead errors are 11 and 39 % smaller than with constant velocity (simulated,
+split tune and crossing)."""
 _LATER, _FADES_S = 3.5, 0.25
-"""Factor on the power spectral density of accelerations (`MotionModel.acceleration`) in predictions, and the
-time constant with which accelerations decay, s."""
+"""Factor on the power spectral density of accelerations (`MotionModel.acceleration`) in
+predictions, and the time constant with which accelerations decay, s."""
 _PACE, _PACE_UNSEEN = 0.1, 0.4
-"""Factors on the filter's variances of velocities, for joints that two views see and for others: the filter
-assumes fast joints (`pipeline.setup.FAST_M_S`). With these 95 % regions hold 94 to 97 % of joints 0.1 to 1 s
-ahead (four stretches of split `tune`, six cameras, on which they were chosen)."""
+"""Factors on the filter's variances of velocities, for joints that two views see and for others:
+the filter assumes fast joints (`pipeline.setup.FAST_M_S`). With these 95 % regions hold 94 to 97 %
+of joints 0.1 to 1 s ahead (four stretches of split `tune`, six cameras, on which they were
+chosen)."""
 _FORGOTTEN = 0.1
-"""Share of the filter's variance, which grows while no two views see a joint, that is added to the variance
-from the body: a hidden head may have turned. Regions of 95 % then hold 98 to 100 % of unseen joints in three
-stretches of split `tune`, and 92 and 86 % in crowds, where they held 91 to 95, 75 and 57 %."""
+"""Share of the filter's variance, which grows while no two views see a joint, that is added to the
+variance from the body: a hidden head may have turned. Regions of 95 % then hold 98 to 100 % of
+unseen joints in three stretches of split `tune`, and 92 and 86 % in crowds, where they held 91 to
+95, 75 and 57 %."""
 
 
 def fed_back(tracker: Tracker, now: Moment, refined: Reconstruction) -> Moment:
-    """The state after a frame, with joints replaced by those of its `refined` rows where these are known."""
+    """The state after a frame, with joints replaced by those of its `refined` rows where these are
+    known.
+    """
     _, rows, which = np.intersect1d(now.identity, refined.person, return_indices=True)
     by, known = _states(tracker, refined.rows(which))
     mean, covariance = now.tracks.joints.mean.copy(), now.tracks.joints.covariance.copy()
@@ -75,8 +81,8 @@ class Newest:
     doubted: bool = False
     """Whether cameras contradict each other and it is unknown which are wrong."""
     doubt: Array | None = None
-    """(A, J, 3, 3) added to covariances, m², for moving cameras (`of_poses`) and ambiguous sides; None for
-    nothing."""
+    """(A, J, 3, 3) added to covariances, m², for moving cameras (`of_poses`) and ambiguous sides;
+    None for nothing."""
 
     @cached_property
     def people(self) -> tuple[Moment, Array, Array, BodyFit]:
@@ -87,16 +93,22 @@ class Newest:
         the body if its covariance is smaller and two views see another joint; otherwise the body
         follows from motion and the prior. Tracks without a known joint are left out.
         """
-        named = np.flatnonzero(self.moment.named & (self.moment.tracks.joints.sigma_m < PLACED_M).any(axis=1))
+        named = np.flatnonzero(
+            self.moment.named & (self.moment.tracks.joints.sigma_m < PLACED_M).any(axis=1)
+        )
         order = named[np.argsort(self.moment.identity[named], kind="stable")]
         now = self.moment.rows(order)
         joints, known = now.tracks.joints, now.tracks.joints.sigma_m < PLACED_M
         covariance = joints.covariance[..., :3, :3].copy()
         information = np.zeros_like(covariance)
         information[known] = np.linalg.inv(covariance[known])
-        fit = self.fitter.fit_whole(JointTargets(np.where(known[..., None], joints.position, 0.0), information))
+        fit = self.fitter.fit_whole(
+            JointTargets(np.where(known[..., None], joints.position, 0.0), information)
+        )
         of_body = fit.covariance + MODEL_SIGMA_M**2 * np.eye(3) + _FORGOTTEN * covariance
-        surer = np.trace(of_body, axis1=2, axis2=3) < np.trace(covariance, axis1=2, axis2=3)  # false for NaN
+        surer = np.trace(of_body, axis1=2, axis2=3) < np.trace(
+            covariance, axis1=2, axis2=3
+        )  # false for NaN
         seen = now.views >= 2
         surer &= ~seen & seen.any(axis=1, keepdims=True)
         mean = joints.mean.copy()
@@ -115,7 +127,9 @@ class Newest:
         )
 
 
-def people_at(newest: Newest, skeleton: Skeleton, motion: MotionModel, ahead_s: float) -> Reconstruction:
+def people_at(
+    newest: Newest, skeleton: Skeleton, motion: MotionModel, ahead_s: float
+) -> Reconstruction:
     """Rows of all people, predicted `ahead_s` after the newest frame, with its frame number."""
     now, surely, code, fit = newest.people
     P, J = now.views.shape
@@ -125,7 +139,9 @@ def people_at(newest: Newest, skeleton: Skeleton, motion: MotionModel, ahead_s: 
     body = {name: getattr(fit, name).copy() for name in BODY}
     for each in body.values():
         each[~fit.ok] = np.nan
-    status = np.where(fit.ok, Status.CONTRADICTED if newest.doubted else Status.OK, Status.BODY_UNDETERMINED)
+    status = np.where(
+        fit.ok, Status.CONTRADICTED if newest.doubted else Status.OK, Status.BODY_UNDETERMINED
+    )
     return Reconstruction(
         frame=np.full(P, newest.frame),
         person=now.identity,
@@ -165,7 +181,10 @@ def later(
     tau, a = _FADES_S, ahead_s / _FADES_S
     fades = -np.expm1(-2 * a) / 2
     covariance, eye = np.zeros((*x.shape[:2], 6, 6)), np.eye(3)
-    moves = np.where(now.views >= 2, _PACE, _PACE_UNSEEN)[..., None, None] * joints.covariance[..., 3:6, 3:6]
+    moves = (
+        np.where(now.views >= 2, _PACE, _PACE_UNSEEN)[..., None, None]
+        * joints.covariance[..., 3:6, 3:6]
+    )
     grows = (density * tau**3 * (a + 2 * np.expm1(-a) + fades))[..., None, None]
     covariance[..., :3, :3] = surely + own**2 * moves + grows * eye
     covariance[..., 3:, 3:] = moves + (density * tau * fades)[..., None, None] * eye
@@ -175,8 +194,12 @@ def later(
 def _states(tracker: Tracker, rows: Reconstruction) -> tuple[JointStates, Mask]:
     """Refined joints as states of the filter, and which of them (P, J) are known."""
     start = tracker.scale.motion.start
-    known = np.asarray(np.isfinite(rows.joints).all(axis=-1)) & np.isfinite(rows.covariance).all(axis=(-2, -1))
-    states = JointStates.at(np.where(known[..., None], rows.joints, 0.0), np.ones(known.shape), start)
+    known = np.asarray(np.isfinite(rows.joints).all(axis=-1)) & np.isfinite(rows.covariance).all(
+        axis=(-2, -1)
+    )
+    states = JointStates.at(
+        np.where(known[..., None], rows.joints, 0.0), np.ones(known.shape), start
+    )
     moving = known & np.isfinite(rows.velocity).all(axis=-1)
     moving &= np.isfinite(rows.velocity_covariance).all(axis=(-2, -1))
     mean, covariance = states.mean, states.covariance

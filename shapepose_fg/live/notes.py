@@ -18,7 +18,12 @@ class SparingNotes(AbstractContextManager["SparingNotes"]):
     """
 
     def __init__(self, note: Callable[[str], None]) -> None:
-        self._note, self._said_s, self._more, self._left = note, time.monotonic(), 0, float(_AT_ONCE)
+        self._note, self._said_s, self._more, self._left = (
+            note,
+            time.monotonic(),
+            0,
+            float(_AT_ONCE),
+        )
 
     def __call__(self, text: str) -> None:
         now_s = time.monotonic()
@@ -32,7 +37,10 @@ class SparingNotes(AbstractContextManager["SparingNotes"]):
         self._note(text)
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self._count()
 

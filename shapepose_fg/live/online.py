@@ -1,4 +1,6 @@
-"""Online reconstruction: `push` detections, read `people` at any time, and collect `settled` rows."""
+"""Online reconstruction: `push` detections, read `people` at any time, and collect `settled`
+rows.
+"""
 
 import threading
 from bisect import bisect_left
@@ -40,24 +42,26 @@ from shapepose_fg.proposal.thinning import thinned
 AHEAD_S = 1.0
 """Longest prediction after the newest frame, s."""
 _ROUNDS = 1
-"""Maximum rounds of reassociation in a window: the filter has assigned detections already, and two rounds take
-a seventh to a fifth more time for the same figures (Shelf, crossing)."""
+"""Maximum rounds of reassociation in a window: the filter has assigned detections already, and two
+rounds take a seventh to a fifth more time for the same figures (Shelf, crossing)."""
 _KEPT_S = 10.0
 """Time for which settled rows are kept if they are not collected, s."""
 _SETTLES = 2 / 3
 """Share of the lag that a window settles at least, where the lag has several frames."""
 _BEFORE = 7.0
-"""Duration that a window includes before the settled frames: the lag over this, a frame or two. With a third of
-the lag it takes an eighth more time, and errors are 0.04 mm smaller (two stretches of split `tune`)."""
+"""Duration that a window includes before the settled frames: the lag over this, a frame or two.
+With a third of the lag it takes an eighth more time, and errors are 0.04 mm smaller (two stretches
+of split `tune`)."""
 _BEHIND = 3.0
-"""Age of a frame, in lags, at which it is settled without refinement, because solving does not keep up."""
+"""Age of a frame, in lags, at which it is settled without refinement, because solving does not keep
+up."""
 _MOST_SAID = 1000
 _OFF_CLOCK = 10
-"""Number of consecutive views with a wrong time after which the camera is reported, and frames from `push` are
-accepted."""
+"""Number of consecutive views with a wrong time after which the camera is reported, and frames from
+`push` are accepted."""
 _STANDS = 30
-"""Excess of views without a pose over views with one, after which a camera is taken to stand where the rig has
-it."""
+"""Excess of views without a pose over views with one, after which a camera is taken to stand where
+the rig has it."""
 _BACK_S = 1.0
 """Additional time for which poses of moving cameras are kept, beyond the longest wait of a frame,
 s."""
@@ -84,8 +88,8 @@ class LiveReport:
     late: int
     """Number of processed frames that arrived after a later frame."""
     dropped: int
-    """Number of frames, or detections of one camera, that were left out because they arrived too late
-    or twice."""
+    """Number of frames, or detections of one camera, that were left out because they arrived too
+    late or twice."""
     unrefined: int
     """Number of frames that were settled without refinement, because solving did not keep up."""
     not_taken: int
@@ -127,14 +131,18 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
         if not 0.1 <= lag_s <= 2.0:
             raise ValueError(f"lag_s must be 0.1 to 2 seconds, got {lag_s}")
         if not config.temporal:
-            raise ValueError("live reconstruction tracks people over time; leave config.temporal at true")
+            raise ValueError(
+                "live reconstruction tracks people over time; leave config.temporal at true"
+            )
         rounds = min(config.windows.again_over_time, _ROUNDS)
         config = replace(config, windows=replace(config.windows, again_over_time=rounds))
         source, noise = config.offsets.source, NoiseLaw.shipped()
         if source not in ("none", "recording"):
             noise = NoiseLaw.load(source)
         if fitter is None:
-            fitter = make_fitter(config.body, BodyModel.default().with_keypoints(skeleton.joints), config.law)
+            fitter = make_fitter(
+                config.body, BodyModel.default().with_keypoints(skeleton.joints), config.law
+            )
             if source not in ("none", "recording"):
                 fitter = fitter.with_keypoint_offsets(KeypointOffsets.load(source))
         check_fitter(fitter)
@@ -148,7 +156,12 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
         pool = self._open.enter_context(worker_processes(workers, setup))
         self._most_waiting = 1 if workers == 1 else 2 * workers
         self._refinery = Refinery(pool, self._filter)
-        start = CameraWatch.of(len(rig)), ViewsInStep(len(rig)), CommonClock(len(rig)), self._filter.nobody
+        start = (
+            CameraWatch.of(len(rig)),
+            ViewsInStep(len(rig)),
+            CommonClock(len(rig)),
+            self._filter.nobody,
+        )
         self._state = LiveState(rig, *start)
         self._behind = 0
         self._said = deque[Said](maxlen=_MOST_SAID)
@@ -179,7 +192,10 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
         return found
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self.close()
 
@@ -202,7 +218,9 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
         times = np.broadcast_to(np.asarray(time_s, dtype=np.float64), (len(self.rig),)).copy()
         self._check_time(times)
         if np.ptp(times) > JUMP_S:
-            raise ValueError(f"the times of one frame must be within {JUMP_S:g} s, got {np.ptp(times):g} s")
+            raise ValueError(
+                f"the times of one frame must be within {JUMP_S:g} s, got {np.ptp(times):g} s"
+            )
         self._check(detections)
         with self._lock:
             slots = self._state.slots
@@ -250,7 +268,10 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
             state = self._state
             rig = self._placed(view, time_s, pose, pose_covariance)
             self._check_places(own, np.full(len(self.rig), time_s), rig)
-            was_off, given = state.clock.off.get(view, 0), (view, own, time_s, pose, pose_covariance)
+            was_off, given = (
+                state.clock.off.get(view, 0),
+                (view, own, time_s, pose, pose_covariance),
+            )
             taken, jumps = state.clock.admit(view, time_s, state.views.done_s, given)
             self._say_clock(view, was_off, state.clock.off.get(view, 0))
             if jumps:
@@ -264,7 +285,9 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
             if refused is not None:
                 raise refused
 
-    def _placed(self, view: int, time_s: float, pose: Array | None, covariance: Array | None) -> Rig:
+    def _placed(
+        self, view: int, time_s: float, pose: Array | None, covariance: Array | None
+    ) -> Rig:
         """The rig with the checked pose of a view. Raises ValueError without changing the state."""
         state, name = self._state, self.rig.names[view]
         moves, alone = bool(state.rig.cameras[view].carrier), not self.rig.cameras[view].carrier
@@ -273,18 +296,27 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
             if moves and alone and state.without_pose[view] >= _STANDS:
                 stands = replace(state.rig.cameras[view], carrier="", bTc=np.eye(4))
                 others = tuple(each for each in state.rig.trajectories if each.name != name)
-                cameras = tuple(stands if n == view else each for n, each in enumerate(state.rig.cameras))
+                cameras = tuple(
+                    stands if n == view else each for n, each in enumerate(state.rig.cameras)
+                )
                 state.rig = replace(state.rig, cameras=cameras, trajectories=others)
             return state.rig
         if alone and not moves and state.without_pose[view] > 0:
-            raise ValueError(f"camera {name} is fixed, because its earlier views had no pose; leave out its pose")
+            raise ValueError(
+                f"camera {name} is fixed, because its earlier views had no pose; leave out its pose"
+            )
         since_s = max(state.views.done_s, time_s) - (1 + _BEHIND) * self.lag_s - _BACK_S
         rig = with_pose(state.rig, view, time_s, pose, covariance, since_s)
         rig.at(np.full(len(rig), time_s))
         return rig
 
     def _take_view(
-        self, view: int, own: Detections, time_s: float, pose: Array | None, covariance: Array | None
+        self,
+        view: int,
+        own: Detections,
+        time_s: float,
+        pose: Array | None,
+        covariance: Array | None,
     ) -> None:
         """Add a view to the frame its time belongs to."""
         if pose is not None:
@@ -301,7 +333,11 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
         """Count a view that is ignored for its time, and report its camera after several."""
         self._state.dropped += int(off > 1)
         if off == _OFF_CLOCK or (off == 0 and was_off >= _OFF_CLOCK):
-            code = CameraState.OFF_CLOCK if off > 0 else CameraState(int(self._state.watch.state[view]))
+            code = (
+                CameraState.OFF_CLOCK
+                if off > 0
+                else CameraState(int(self._state.watch.state[view]))
+            )
             self._said.append(Said(self._state.views.done_s, self.rig.names[view], code))
 
     def _jump(self, time_s: float) -> None:
@@ -340,15 +376,15 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
         ahead_s = 0.0 if time_s is None or not np.isfinite(newest_s) else time_s - newest_s
         if not -1e-9 <= ahead_s <= AHEAD_S + 1e-9:
             raise ValueError(
-                f"people are known from {newest_s:g} s (the newest frame) to {AHEAD_S:g} s later, but not at"
-                f" {time_s:g} s; earlier people are in settled()"
+                f"people are known from {newest_s:g} s (the newest frame) to {AHEAD_S:g} s "
+                f"later, but not at {time_s:g} s; earlier people are in settled()"
             )
         return people_at(newest, self._setup.skeleton, self._motion, max(ahead_s, 0.0))
 
     def settled(self, *, wait: bool = False) -> Reconstruction:
-        """The refined rows of all frames that have settled since the last call; with `wait`, also those of
-        windows that are still being solved. Rows that are not collected within ten seconds are counted and
-        dropped.
+        """The refined rows of all frames that have settled since the last call; with `wait`, also
+        those of windows that are still being solved. Rows that are not collected within ten seconds
+        are counted and dropped.
         """
         with self._lock:
             self._collect(wait=wait)
@@ -366,8 +402,8 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
             return self.settled(wait=True)
 
     def save(self, path: Path | str) -> None:
-        """Write the state for `load`, after waiting for windows in progress. The same state gives the same
-        bytes. Changes of cameras' statuses (`said`) are left out.
+        """Write the state for `load`, after waiting for windows in progress. The same state gives
+        the same bytes. Changes of cameras' statuses (`said`) are left out.
         """
         with self._lock:
             self._collect(wait=True)
@@ -377,7 +413,8 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
     def report(self) -> LiveReport:
         """Counts, and the status of each camera."""
         cameras = {
-            name: CameraState(code) for name, code in zip(self.rig.names, self._state.watch.state, strict=True)
+            name: CameraState(code)
+            for name, code in zip(self.rig.names, self._state.watch.state, strict=True)
         }
         counts = (
             self._state.frames,
@@ -403,7 +440,9 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
             ("joint", detections.joint, len(self._setup.skeleton)),
         ):
             if len(values) > 0 and (values.min() < 0 or values.max() >= count):
-                raise ValueError(f"{name} must be 0 to {count - 1}, got {values.min()} to {values.max()}")
+                raise ValueError(
+                    f"{name} must be 0 to {count - 1}, got {values.min()} to {values.max()}"
+                )
         if not (np.isfinite(detections.xy).all() and np.isfinite(detections.confidence).all()):
             raise ValueError("xy and confidence must be finite")
 
@@ -411,8 +450,13 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
         """Raise ValueError if a moving camera has detections without a known pose."""
         rig = self._state.rig if rig is None else rig
         for view in np.flatnonzero(rig.carrier >= 0).tolist():
-            if (detections.view == view).any() and not rig.trajectories[rig.carrier[view]].covers(times[view]):
-                raise ValueError(f"camera {rig.names[view]} moves; give a pose with its view at {times[view]:g} s")
+            if (detections.view == view).any() and not rig.trajectories[rig.carrier[view]].covers(
+                times[view]
+            ):
+                raise ValueError(
+                    f"camera {rig.names[view]} moves; give a pose with its view at "
+                    f"{times[view]:g} s"
+                )
 
     def _take(self, detections: Detections, times: Array) -> None:
         """Insert a frame among the others by its time."""
@@ -442,13 +486,17 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
         """Insert a frame that came after later ones, which are tracked again."""
         slots = self._state.slots
         at = bisect_left([slot.time_s for slot in slots], time_s)
-        twice = any(abs(slot.time_s - time_s) <= LEAST_STEP_S for slot in slots[max(at - 1, 0) : at + 1])
+        twice = any(
+            abs(slot.time_s - time_s) <= LEAST_STEP_S for slot in slots[max(at - 1, 0) : at + 1]
+        )
         if at == 0 or twice or slots[-1].time_s - time_s > self.lag_s:
             self._state.dropped += 1
             return
         rig = self._state.watch.believed(detections, self._state.rig.at(times))
         given = Input(self._state.frames, times, _without(detections, rig), rig)
-        slots.insert(at, Slot(given, slots[at].moment, slots[at].candidate, settled=slots[at].settled))
+        slots.insert(
+            at, Slot(given, slots[at].moment, slots[at].candidate, settled=slots[at].settled)
+        )
         self._state.frames, self._state.late = self._state.frames + 1, self._state.late + 1
         self._again(at)
 
@@ -500,8 +548,8 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
     def _refine(self, *, last: bool = False) -> None:
         """Submit windows that are due, and drop frames that are no longer needed.
 
-        A window settles what is older than a third of the lag as soon as a frame is as old as the lag, with the
-        third after it and a little before it.
+        A window settles what is older than a third of the lag as soon as a frame is as old as the
+        lag, with the third after it and a little before it.
         """
         slots, around_s = self._state.slots, self.lag_s / 3
         if len(slots) == 0:
@@ -547,7 +595,9 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
                 added = mirrored_spread(joints.position, rows.mirrored, setup.skeleton.joints)
                 added += of_poses(rows, joints, rig, setup.estimator) if rig.moves else 0.0
             doubted = len(newest.given.rig.doubted) > 0
-            self._now = Newest(newest.given.frame, newest.moment, self._setup.fitter, doubted, added)
+            self._now = Newest(
+                newest.given.frame, newest.moment, self._setup.fitter, doubted, added
+            )
 
 
 def _without(detections: Detections, rig: Rig) -> Detections:

@@ -1,8 +1,8 @@
 """Online outputs of people: lines of JSON, a socket, MCAP, or rerun for display.
 
-`-` or nothing is standard output; `tcp://:5000` listens on this machine only, `tcp://0.0.0.0:5000` for everybody;
-a name that ends in `.mcap` or `.rrd` is such a file, `rerun` a viewer that is started, `rerun+http://...` a
-running one; any other is a file or a pipe of lines.
+`-` or nothing is standard output; `tcp://:5000` listens on this machine only, `tcp://0.0.0.0:5000`
+for everybody; a name that ends in `.mcap` or `.rrd` is such a file, `rerun` a viewer that is
+started, `rerun+http://...` a running one; any other is a file or a pipe of lines.
 """
 
 import json
@@ -54,11 +54,18 @@ def published(where: Sequence[str], rig: Rig, note: Callable[[str], None]) -> It
 def _target(where: str, rig: Rig, note: Callable[[str], None]) -> Iterator[Publish]:
     with ExitStack() as files:
         if where.endswith(".mcap"):
-            written = files.enter_context(McapWriter(files.enter_context(Path(where).open("wb")), rig))
-            yield lambda kind, people: _by_time(people, lambda rows, time_s: written.frame(rows, time_s, kind))
+            written = files.enter_context(
+                McapWriter(files.enter_context(Path(where).open("wb")), rig)
+            )
+            yield lambda kind, people: _by_time(
+                people, lambda rows, time_s: written.frame(rows, time_s, kind)
+            )
             return
         if where == "rerun" or where.startswith("rerun+") or where.endswith(".rrd"):
-            from shapepose_fg.io.export import rerun_app, rerun_log  # with scipy.stats: half a second
+            from shapepose_fg.io.export import (
+                rerun_app,
+                rerun_log,
+            )  # with scipy.stats: half a second
 
             first = rerun_app.layout(rig.up, rig, rig.centres, ["world/people/**"])
             if where.endswith(".rrd"):
@@ -66,20 +73,28 @@ def _target(where: str, rig: Rig, note: Callable[[str], None]) -> Iterator[Publi
             else:
                 if where == "rerun":
                     note(*rerun_app.quiet_viewer())
-                stream = files.enter_context(rerun_app.shown(first, None if where == "rerun" else where))
+                stream = files.enter_context(
+                    rerun_app.shown(first, None if where == "rerun" else where)
+                )
             log = rerun_log.LiveLog(stream, rig, body_of({}, None))
             yield lambda kind, people: log.moment(people) if kind == "now" else None
             return
         if where.startswith("tcp:"):
             send = files.enter_context(_Listeners(listen(where), note)).send
         else:
-            sink = sys.stdout if where == "-" else files.enter_context(Path(where).open("w", encoding="utf-8"))
+            sink = (
+                sys.stdout
+                if where == "-"
+                else files.enter_context(Path(where).open("w", encoding="utf-8"))
+            )
 
             def send(line: str) -> None:
                 sink.write(line)
                 sink.flush()
 
-        yield lambda kind, people: _by_time(people, lambda rows, time_s: send(line_of(kind, rows, time_s)))
+        yield lambda kind, people: _by_time(
+            people, lambda rows, time_s: send(line_of(kind, rows, time_s))
+        )
 
 
 def line_of(kind: str, people: Reconstruction, time_s: float) -> str:
@@ -112,7 +127,9 @@ def _plain(values: np.ndarray) -> Any:
 
 
 class _Listeners:
-    """Sends lines to all connected clients; clients that read too slowly are disconnected, and none blocks."""
+    """Sends lines to all connected clients; clients that read too slowly are disconnected, and none
+    blocks.
+    """
 
     def __init__(self, listening: socket.socket, note: Callable[[str], None]) -> None:
         self._listening, self._note = listening, note
@@ -184,7 +201,10 @@ class _Listeners:
                         self._waiting[client] = deque()
                     else:
                         client.close()
-                        self._note(f"{name} is rejected, because {MOST_CLIENTS} readers are connected already")
+                        self._note(
+                            f"{name} is rejected, because {MOST_CLIENTS} readers are connected "
+                            "already"
+                        )
         except OSError as error:
             self._note(f"no further reader can be served ({error.strerror})")
             return False

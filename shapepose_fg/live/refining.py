@@ -1,4 +1,6 @@
-"""Refinement behind the newest frame: windows solved by stage II, in order, here or in other processes."""
+"""Refinement behind the newest frame: windows solved by stage II, in order, here or in other
+processes.
+"""
 
 from collections import Counter, deque
 from concurrent.futures import Future
@@ -137,7 +139,9 @@ class Refinery:
         self._sent.append(_Sent(part, frames, names, own, start))
 
     def came(self, *, wait: bool = False) -> list[Refined]:
-        """Windows that have been solved since the last call, oldest first; with `wait` all of them."""
+        """Windows that have been solved since the last call, oldest first; with `wait` all of
+        them.
+        """
         found = []
         while len(self._sent) > 0 and (wait or self._sent[0].part.done()):
             sent = self._sent.popleft()

@@ -1,4 +1,6 @@
-"""Saves the state of an online reconstruction as arrays, and restores it in another process or after a restart."""
+"""Saves the state of an online reconstruction as arrays, and restores it in another process or
+after a restart.
+"""
 
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -122,7 +124,9 @@ def slot_arrays(slots: Sequence[Slot]) -> dict[str, NDArray[Any]]:
     for name in OF_TRACKS:
         arrays[name] = np.concatenate([getattr(each, name) for each in moments])
     for each in fields(Gone):
-        arrays[f"gone.{each.name}"] = np.concatenate([getattr(moment.gone, each.name) for moment in moments])
+        arrays[f"gone.{each.name}"] = np.concatenate(
+            [getattr(moment.gone, each.name) for moment in moments]
+        )
     for name in _DETECTIONS:
         arrays[f"seen.{name}"] = np.concatenate([getattr(each, name) for each in seen])
     return arrays
@@ -138,7 +142,10 @@ def _carried(arrays: Mapping[str, NDArray[Any]], rig: Rig) -> Rig:
         time_s, wTb, covariance = (arrays[f"pose.{each}"][own] for each in _POSES)
         found.append(Trajectory(name, time_s, wTb, covariance))
     known = {each.name for each in found}
-    cameras = [replace(each, carrier=each.carrier or each.name * (each.name in known)) for each in rig.cameras]
+    cameras = [
+        replace(each, carrier=each.carrier or each.name * (each.name in known))
+        for each in rig.cameras
+    ]
     return replace(rig, cameras=tuple(cameras), trajectories=tuple(found))
 
 
@@ -151,10 +158,13 @@ def slots_of(arrays: Mapping[str, NDArray[Any]], rig: Rig, nobody: Moment) -> li
     found = checked_columns(_COLUMNS, arrays, sizes)
     counts = found["slots"]
     if (counts < 0).any() or any(
-        counts[:, n].sum() != sizes.get(letter, 0) for n, letter in zip((4, 5, 6, 7), "ADEG", strict=True)
+        counts[:, n].sum() != sizes.get(letter, 0)
+        for n, letter in zip((4, 5, 6, 7), "ADEG", strict=True)
     ):
         raise ValueError("its rows are not of its frames")
-    if not all(np.isfinite(found[name]).all() for name in ("mean", "covariance", "time_s", "seen.xy")):
+    if not all(
+        np.isfinite(found[name]).all() for name in ("mean", "covariance", "time_s", "seen.xy")
+    ):
         raise ValueError("its tracks, times and detections must be finite")
     covariance = found["covariance"]
     small = 1e-6 * np.abs(covariance).max(axis=(-2, -1), initial=0.0)
@@ -179,7 +189,10 @@ def slots_of(arrays: Mapping[str, NDArray[Any]], rig: Rig, nobody: Moment) -> li
             affinity=found["seen.affinity"][e],
         )
         given = Input(
-            frame, found["time_s"][n], seen, replace(rig.at(found["time_s"][n]), dark=dark, doubted=doubted)
+            frame,
+            found["time_s"][n],
+            seen,
+            replace(rig.at(found["time_s"][n]), dark=dark, doubted=doubted),
         )
         candidate = found["candidate"][a].astype(np.intp)
         _check(seen, candidate, len(rig), J)
@@ -193,7 +206,9 @@ def slots_of(arrays: Mapping[str, NDArray[Any]], rig: Rig, nobody: Moment) -> li
         tracks = Tracks(time_s, found["ids"][a], found["world"][a], joints, found["evident_s"][a])
         own = {name: found[name][a] for name in OF_TRACKS}
         gone = Gone(*(found[f"gone.{each.name}"][g] for each in fields(Gone)))
-        moment = Moment(tracks, **own, gone=gone, sought_s=sought_s, next_track=track, next_identity=identity)
+        moment = Moment(
+            tracks, **own, gone=gone, sought_s=sought_s, next_track=track, next_identity=identity
+        )
         slots.append(Slot(given, moment, candidate, bool(settled)))
     return slots
 
@@ -207,16 +222,21 @@ def _check(seen: Detections, candidate: Whole, views: int, joints: int) -> None:
     for each, most in ((seen.confidence, 1), (seen.mirrored, 1), (seen.affinity, _MOST_AFFINITY)):
         if not ((each >= 0) & (each <= most)).all():
             raise ValueError(
-                f"confidences and probabilities of its detections must be 0 to 1, affinities 0 to {_MOST_AFFINITY}"
+                "confidences and probabilities of its detections must be 0 to 1, affinities 0 to "
+                f"{_MOST_AFFINITY}"
             )
     within = all(
         len(values) == 0 or (values.min() >= 0 and values.max() < most)
         for values, most in ((seen.view, views), (seen.joint, joints), (seen.pairs, len(seen)))
     )
-    if not within or (candidate.size > 0 and (candidate.min() < -1 or candidate.max() >= len(seen))):
+    if not within or (
+        candidate.size > 0 and (candidate.min() < -1 or candidate.max() >= len(seen))
+    ):
         raise ValueError("its detections are of other cameras, joints or people")
     first, second = seen.pairs.T
-    if (seen.view[first] != seen.view[second]).any() or len(np.unique(seen.pairs, axis=0)) < len(seen.pairs):
+    if (seen.view[first] != seen.view[second]).any() or len(np.unique(seen.pairs, axis=0)) < len(
+        seen.pairs
+    ):
         raise ValueError("its affinities must be of two detections of a camera, each pair once")
     person, joint, view = np.nonzero(candidate >= 0)
     own = candidate[person, joint, view]
@@ -232,22 +252,33 @@ def state_arrays(state: LiveState) -> dict[str, NDArray[Any]]:
         waiting_s[view] = time_s
     arrays: dict[str, NDArray[Any]] = {
         "counts": np.array([getattr(state, name) for name in _COUNTS]),
-        "cameras": np.array([state.watch.apart_m, state.watch.heard_s, state.watch.state, state.views.heard_s]),
+        "cameras": np.array(
+            [state.watch.apart_m, state.watch.heard_s, state.watch.state, state.views.heard_s]
+        ),
         "clock": np.array([state.views.done_s, state.views.period_s]),
         "waiting_s": waiting_s,
     }
-    waiting = Detections.joined([each for each, _ in state.views.waiting.values()] or [Detections.empty()])
+    waiting = Detections.joined(
+        [each for each, _ in state.views.waiting.values()] or [Detections.empty()]
+    )
     for name, seen in (("waiting", waiting), ("before", state.before or Detections.empty())):
         arrays |= {f"{name}.{each}": getattr(seen, each) for each in _DETECTIONS}
     for each in sorted(state.rig.trajectories, key=lambda each: each.name):
-        known = np.full(len(each), each.name), each.time_s, each.wTb, each.covariance_at(each.time_s)
+        known = (
+            np.full(len(each), each.name),
+            each.time_s,
+            each.wTb,
+            each.covariance_at(each.time_s),
+        )
         for name, values in zip(("carrier", *_POSES), known, strict=True):
             before = [arrays[f"pose.{name}"]] if f"pose.{name}" in arrays else []
             arrays[f"pose.{name}"] = np.concatenate([*before, values])
     if len(state.settled) > 0:
         settled = Reconstruction.concatenate(list(state.settled))
         arrays |= {f"settled.{each}": getattr(settled, each) for each in Reconstruction.ROWS}
-    return arrays | (slot_arrays(state.slots) if len(state.slots) > 0 else {"slots": np.zeros((0, 8), np.int64)})
+    return arrays | (
+        slot_arrays(state.slots) if len(state.slots) > 0 else {"slots": np.zeros((0, 8), np.int64)}
+    )
 
 
 def write_state(path: Path, arrays: Mapping[str, NDArray[Any]], setup: str) -> None:
@@ -258,7 +289,10 @@ def write_state(path: Path, arrays: Mapping[str, NDArray[Any]], setup: str) -> N
 
 def read_state(path: Path, setup: str, rig: Rig, following: Filter) -> LiveState:
     """Read a state. Raises InputError if the file is not a state, or of another set-up."""
-    names = [*_CAMERAS, *(f"{name}.{each}" for name in ("waiting", "before") for each in _DETECTIONS)]
+    names = [
+        *_CAMERAS,
+        *(f"{name}.{each}" for name in ("waiting", "before") for each in _DETECTIONS),
+    ]
     optional = [f"settled.{each}" for each in Reconstruction.ROWS]
     optional += [f"pose.{each}" for each in ("carrier", *_POSES)]
     arrays = read_npz(path, ("format", "setup", *_COLUMNS, *names, *optional), _CURE)
@@ -266,7 +300,8 @@ def read_state(path: Path, setup: str, rig: Rig, following: Filter) -> LiveState
         raise InputError(f"{path}: this is not a saved state of a live reconstruction; {_CURE}")
     if str(arrays.get("setup", "")) != setup:
         raise InputError(
-            f"{path}: the state was saved with other cameras, joints, settings or lag; give those, or {_CURE}"
+            f"{path}: the state was saved with other cameras, joints, settings or lag; give "
+            f"those, or {_CURE}"
         )
     missing = {*names, *(_COLUMNS if len(arrays.get("slots", ())) > 0 else ())} - arrays.keys()
     if missing:
@@ -285,7 +320,10 @@ def _state_of(arrays: Mapping[str, NDArray[Any]], rig: Rig, following: Filter) -
     seen = {}
     for name in ("waiting", "before"):
         sizes, own = dict[str, int](), {each: arrays[f"{name}.{each}"] for each in _DETECTIONS}
-        own = {each: _COLUMNS[f"seen.{each}"].checked(f"{name}.{each}", own[each], sizes) for each in own}
+        own = {
+            each: _COLUMNS[f"seen.{each}"].checked(f"{name}.{each}", own[each], sizes)
+            for each in own
+        }
         seen[name] = Detections(**own)
         _check(seen[name], np.zeros((0, len(skeleton), V), dtype=np.int64), V, len(skeleton))
     waiting = {
@@ -294,11 +332,18 @@ def _state_of(arrays: Mapping[str, NDArray[Any]], rig: Rig, following: Filter) -
     }
     done_s, period_s = told["clock"].tolist()
     late = np.concatenate([told["waiting_s"], last_s, heard_s, [done_s]])
-    if (np.abs(late[np.isfinite(late)]) > MOST_S).any() or np.isposinf(late).any() or np.isnan(last_s).any():
+    if (
+        (np.abs(late[np.isfinite(late)]) > MOST_S).any()
+        or np.isposinf(late).any()
+        or np.isnan(last_s).any()
+    ):
         raise ValueError(f"times must be at most {MOST_S:g} s")
     if np.isnan(done_s) or not SHORTEST_S <= period_s <= 2 * MOST_S:
         raise ValueError(f"clock must hold a time, and a period of {SHORTEST_S:g} s at least")
-    if not (np.isnan(apart_m) | ((apart_m >= 0) & (apart_m < _MOST_APART_M))).all() or np.isnan(heard_s).any():
+    if (
+        not (np.isnan(apart_m) | ((apart_m >= 0) & (apart_m < _MOST_APART_M))).all()
+        or np.isnan(heard_s).any()
+    ):
         raise ValueError("cameras must hold distances, and times")
     if not np.isin(code, list(CameraState)).all():
         raise ValueError("cameras must have states that there are")

@@ -21,7 +21,9 @@ def listen(where: str) -> socket.socket:
             raise ValueError("no port")
         listening = socket.create_server((host, port))
     except (ValueError, OSError) as error:
-        raise InputError(f"{where}: cannot be opened ({error}); give tcp://:PORT or tcp://HOST:PORT") from None
+        raise InputError(
+            f"{where}: cannot be opened ({error}); give tcp://:PORT or tcp://HOST:PORT"
+        ) from None
     listening.setblocking(False)
     return listening
 

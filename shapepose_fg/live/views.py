@@ -61,7 +61,9 @@ class ViewsInStep:
         found = self.rest() if view in self.waiting else []
         step_s = time_s - float(self.heard_s[view])
         if np.isfinite(step_s):
-            self.period_s += _FRESH * (min(max(step_s, SHORTEST_S), 3 * self.period_s) - self.period_s)
+            self.period_s += _FRESH * (
+                min(max(step_s, SHORTEST_S), 3 * self.period_s) - self.period_s
+            )
         self.heard_s[view] = time_s
         self.waiting[view] = detections, time_s
         # The first frame waits for every camera, until one comes again.
@@ -76,7 +78,9 @@ class ViewsInStep:
         every = [time_s for _, time_s in self.waiting.values()]
         most = max(every, key=lambda time_s: sum(abs(other - time_s) <= JUMP_S for other in every))
         self.heard_s = np.where(np.abs(self.heard_s - most) <= JUMP_S, self.heard_s, -np.inf)
-        self.waiting = {view: each for view, each in self.waiting.items() if abs(each[1] - most) <= JUMP_S}
+        self.waiting = {
+            view: each for view, each in self.waiting.items() if abs(each[1] - most) <= JUMP_S
+        }
         mean = float(np.mean([time_s for _, time_s in self.waiting.values()]))
         times = np.full(self.views, mean)
         for view, (_, time_s) in self.waiting.items():
@@ -86,7 +90,9 @@ class ViewsInStep:
         return [(together, times)]
 
 
-def with_pose(rig: Rig, view: int, time_s: float, pose: Array, covariance: Array | None, since_s: float) -> Rig:
+def with_pose(
+    rig: Rig, view: int, time_s: float, pose: Array, covariance: Array | None, since_s: float
+) -> Rig:
     """The rig with one more pose (4, 4) of a camera, or its carrier, at `time_s`, with covariance
     (6, 6).
 
@@ -97,17 +103,27 @@ def with_pose(rig: Rig, view: int, time_s: float, pose: Array, covariance: Array
     others = tuple(each for each in rig.trajectories if each.name != name)
     known = [each for each in rig.trajectories if each.name == name]
     pose = np.asarray(pose, dtype=np.float64)
-    covariance = np.zeros((6, 6)) if covariance is None else np.asarray(covariance, dtype=np.float64)
+    covariance = (
+        np.zeros((6, 6)) if covariance is None else np.asarray(covariance, dtype=np.float64)
+    )
     if pose.shape != (4, 4) or covariance.shape != (6, 6):
         raise ValueError(
-            f"pose must be (4, 4) and pose_covariance (6, 6), got {pose.shape} and {covariance.shape}"
+            f"pose must be (4, 4) and pose_covariance (6, 6), got {pose.shape} and "
+            f"{covariance.shape}"
         )
     times, poses, surely = np.array([time_s - _BEFORE_S]), pose[None], covariance[None]
     if len(known) > 0:
-        times, poses, surely = known[0].time_s, known[0].wTb, known[0].covariance_at(known[0].time_s)
+        times, poses, surely = (
+            known[0].time_s,
+            known[0].wTb,
+            known[0].covariance_at(known[0].time_s),
+        )
     stays = (times != time_s) & (times >= times[times <= since_s].max(initial=-np.inf))
     times, poses = np.append(times[stays], time_s), np.append(poses[stays], pose[None], axis=0)
-    order, surely = np.argsort(times, kind="stable"), np.append(surely[stays], covariance[None], axis=0)
+    order, surely = (
+        np.argsort(times, kind="stable"),
+        np.append(surely[stays], covariance[None], axis=0),
+    )
     goes = Trajectory(name, times[order], poses[order], surely[order])
     cameras = [replace(each, carrier=name) if each is camera else each for each in rig.cameras]
     return replace(rig, cameras=tuple(cameras), trajectories=(*others, goes))

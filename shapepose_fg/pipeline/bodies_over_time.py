@@ -1,4 +1,6 @@
-"""One body per person over a recording: one shape, and a smooth motion, fitted to the solved joints."""
+"""One body per person over a recording: one shape, and a smooth motion, fitted to the solved
+joints.
+"""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -57,7 +59,9 @@ class Person:
 
     @classmethod
     def of(cls, number: int, joints: Array, covariance: Array, time_s: Array) -> "Person":
-        """Data of the solved rows of one person: `joints` (N, J, 3), `covariance` (N, J, 3, 3), `time_s` (N,)."""
+        """Data of the solved rows of one person: `joints` (N, J, 3), `covariance` (N, J, 3, 3),
+        `time_s` (N,).
+        """
         return cls(number, JointTargets.solved(joints, covariance), time_s)
 
     def fitted(self, fitter: BodyFitter) -> dict[str, NDArray[Any]]:
@@ -66,10 +70,19 @@ class Person:
         all rows.
         """
         rows = np.flatnonzero(spaced(self.time_s, self.keyframe_s))
-        targets, time_s, group = self.targets.rows(rows), self.time_s[rows], np.full(len(rows), self.number)
-        found = fitter.fit_sequence(targets, group, time_s, self.shapes, fixed_shapes=self.fixed_shapes)
+        targets, time_s, group = (
+            self.targets.rows(rows),
+            self.time_s[rows],
+            np.full(len(rows), self.number),
+        )
+        found = fitter.fit_sequence(
+            targets, group, time_s, self.shapes, fixed_shapes=self.fixed_shapes
+        )
         kept = range(len(self.time_s)) if self.kept is None else self.kept
-        first, last = np.searchsorted(rows, kept.start, side="right") - 1, np.searchsorted(rows, kept.stop - 1)
+        first, last = (
+            np.searchsorted(rows, kept.start, side="right") - 1,
+            np.searchsorted(rows, kept.stop - 1),
+        )
         around = np.arange(first, last + 1) if len(kept) > 0 else np.arange(0)
         fit = found.fit.rows(around)
         bodies = fit.betas, fit.global_orient, fit.body_pose, fit.transl
@@ -77,7 +90,9 @@ class Person:
             bodies = above_floor(fitter.model, bodies, self.floor.normal, self.floor.height_m)
         ok = fit.ok
         if len(rows) < len(self.time_s):
-            ok, bodies = bodies_between(ok, bodies, time_s[around], self.time_s[kept.start : kept.stop])
+            ok, bodies = bodies_between(
+                ok, bodies, time_s[around], self.time_s[kept.start : kept.stop]
+            )
         shape = {"mean": found.shapes.mean, "information": found.shapes.information}
         return {"ok": ok, **dict(zip(BODY, bodies, strict=True)), **shape}
 
@@ -104,7 +119,9 @@ class BodiesOverTime:
     shapes: SubjectShapes
     """The shapes of all people; recognised people keep their known names."""
 
-    def filled(self, column: str, values: NDArray[Any], person: Whole, before: Mapping[int, int]) -> NDArray[Any]:
+    def filled(
+        self, column: str, values: NDArray[Any], person: Whole, before: Mapping[int, int]
+    ) -> NDArray[Any]:
         """Rows of a column of a result with these bodies, where available; `status` changes to that
         of a row with a body.
 
@@ -132,7 +149,9 @@ class BodiesOverTime:
         for name, own in self.places[number].items():
             first, last = max(rows.start, own.start), min(rows.stop, own.stop)
             if first < last:
-                pieces.append(self.kept.array(name, column, slice(first - own.start, last - own.start)))
+                pieces.append(
+                    self.kept.array(name, column, slice(first - own.start, last - own.start))
+                )
         return np.concatenate(pieces)
 
 
@@ -179,9 +198,17 @@ def fit_everybody(
         """Shapes of some people, and for short tracks their bodies."""
         names = {number: f"{kind}-{number}" for number in prior}
         rows = {number: 0 if number in long else counts[number] for number in names}
-        fit({name: (rows[number], partial(whole, number, prior[number])) for number, name in names.items()})
+        fit(
+            {
+                name: (rows[number], partial(whole, number, prior[number]))
+                for number, name in names.items()
+            }
+        )
         places.update({number: {name: range(counts[number])} for number, name in names.items()})
-        return {n: Shapes(kept.array(name, "mean"), kept.array(name, "information")) for n, name in names.items()}
+        return {
+            n: Shapes(kept.array(name, "mean"), kept.array(name, "information"))
+            for n, name in names.items()
+        }
 
     shapes = found("bodies", dict.fromkeys(counts))
     whose = recognise(_subjects(shapes, known.body), known)
@@ -199,8 +226,15 @@ def fit_everybody(
         return replace(rows, shapes=shapes[number], fixed_shapes=True, kept=inside)
 
     for number in long:
-        edges = np.linspace(0, counts[number], 1 - (-counts[number] // most)).round().astype(int).tolist()
-        places[number] = {f"segment-{number}-{n:04d}": range(*ends) for n, ends in enumerate(pairwise(edges))}
+        edges = (
+            np.linspace(0, counts[number], 1 - (-counts[number] // most))
+            .round()
+            .astype(int)
+            .tolist()
+        )
+        places[number] = {
+            f"segment-{number}-{n:04d}": range(*ends) for n, ends in enumerate(pairwise(edges))
+        }
     fit(
         {
             name: (len(own), partial(segment, number, own))
@@ -213,8 +247,8 @@ def fit_everybody(
 
 
 def _spread(count: int, most: int, length: int) -> list[range]:
-    """Ranges of at most `most` of `count` rows, in pieces of equal `length`, spread evenly from the first to
-    the last.
+    """Ranges of at most `most` of `count` rows, in pieces of equal `length`, spread evenly from the
+    first to the last.
     """
     length = min(length, most)
     starts = np.linspace(0, count - length, most // length).round().astype(int).tolist()
@@ -257,19 +291,26 @@ def with_bodies_over_time(
         InMemory(),
         known,
     )
-    columns = {name: bodies.filled(name, getattr(people, name), people.person, {}) for name in (*BODY, "status")}
+    columns = {
+        name: bodies.filled(name, getattr(people, name), people.person, {})
+        for name in (*BODY, "status")
+    }
     return replace(people, shapes=bodies.shapes, **columns)
 
 
 def _subjects(shapes: Mapping[int, Shapes], body: str) -> SubjectShapes:
     """The shapes of all people, named by their numbers."""
-    mean, information = ([getattr(each, name) for each in shapes.values()] for name in ("mean", "information"))
+    mean, information = (
+        [getattr(each, name) for each in shapes.values()] for name in ("mean", "information")
+    )
     names = np.array([str(number) for number in shapes])
     return SubjectShapes(names, np.concatenate(mean), np.concatenate(information), body)
 
 
 def _names(numbers: Sequence[int], known: SubjectShapes, whose: Sequence[int]) -> list[str]:
-    """Names of people in the file of shapes: known names; new people get their number, or the next free one."""
+    """Names of people in the file of shapes: known names; new people get their number, or the next
+    free one.
+    """
     names, taken = [], set(known.names.tolist())
     for number, subject in zip(numbers, whose, strict=True):
         name = str(number) if subject < 0 else str(known.names[subject])

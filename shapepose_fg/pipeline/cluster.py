@@ -1,4 +1,6 @@
-"""Run one function on many items in the processes of a Dask cluster, on this machine or on many machines."""
+"""Run one function on many items in the processes of a Dask cluster, on this machine or on many
+machines.
+"""
 
 import multiprocessing
 import socket
@@ -68,8 +70,8 @@ def _naming_lost_work() -> Iterator[None]:
         yield
     except KilledWorker as error:
         raise WorkLost(
-            f"{error.allowed_failures + 1} processes of the cluster ended in turn before they finished; there"
-            " may be too little memory"
+            f"{error.allowed_failures + 1} processes of the cluster ended in turn before they "
+            "finished; there may be too little memory"
         ) from None
     except CancelledError:
         raise WorkLost("the scheduler of the cluster has ended") from None
@@ -111,9 +113,14 @@ def _local_cluster(count: int, dashboard: bool) -> Scheduler:
     import dask.config
     from distributed import LocalCluster
 
-    multiprocessing.set_start_method("spawn", force=True)  # loky's own start method is unknown to others
+    multiprocessing.set_start_method(
+        "spawn", force=True
+    )  # loky's own start method is unknown to others
     # One thread per process: GTSAM holds the GIL, and Dask gives linear algebra a single one.
-    with dask.config.set({"distributed.worker.multiprocessing-method": "spawn"}), warnings.catch_warnings():
+    with (
+        dask.config.set({"distributed.worker.multiprocessing-method": "spawn"}),
+        warnings.catch_warnings(),
+    ):
         warnings.simplefilter("ignore")  # the dashboard's usual port may be in use
         cluster = LocalCluster(
             n_workers=count,
@@ -124,7 +131,9 @@ def _local_cluster(count: int, dashboard: bool) -> Scheduler:
             silence_logs=50,
         )
     _running.append(cluster)
-    return Scheduler(cluster.scheduler_address, count, cluster.dashboard_link if dashboard else None)
+    return Scheduler(
+        cluster.scheduler_address, count, cluster.dashboard_link if dashboard else None
+    )
 
 
 def _end_local_cluster() -> None:
@@ -187,8 +196,8 @@ def _refuse_other(process: str, own: dict[str, str], theirs: dict[str, str]) -> 
     if other is not None:
         which = f" ({theirs.get(other)} there, {own[other]} here)" if other != _ITSELF else ""
         raise InputError(
-            f"{process} has another version of {other}{which}; install the same version there, because results"
-            " must not depend on the process"
+            f"{process} has another version of {other}{which}; install the same version there, "
+            "because results must not depend on the process"
         )
 
 
@@ -209,11 +218,15 @@ def _dask() -> Any:
     return Client
 
 
-def one_item(program: tuple[tuple[str, str], ...], shared: Any, work: Callable[[Any, Any], Any], item: Any) -> Any:
+def one_item(
+    program: tuple[tuple[str, str], ...], shared: Any, work: Callable[[Any, Any], Any], item: Any
+) -> Any:
     """Process one item in a process of the cluster. Raises InputError if its `program` differs from
     the caller's.
 
     Processes may join at any time, after the others were checked.
     """
-    _refuse_other(f"--cluster: one of its processes, {socket.gethostname()},", dict(program), this_program())
+    _refuse_other(
+        f"--cluster: one of its processes, {socket.gethostname()},", dict(program), this_program()
+    )
     return work(shared, item)

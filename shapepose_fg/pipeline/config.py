@@ -9,9 +9,22 @@ from annotated_types import Interval
 
 from factors import MOTIONS, Motion
 from shapepose_fg.body.fitting.fitters import BodyConfig
-from shapepose_fg.core.bounds import Count, Factor, Metres, Repeats, RepeatsOrNone, Seconds, Settings, Share
+from shapepose_fg.core.bounds import (
+    Count,
+    Factor,
+    Metres,
+    Repeats,
+    RepeatsOrNone,
+    Seconds,
+    Settings,
+    Share,
+)
 from shapepose_fg.estimation.detector_offsets import OffsetConfig
-from shapepose_fg.estimation.estimator_config import EstimatorConfig, RefineConfig, WindowGraphConfig
+from shapepose_fg.estimation.estimator_config import (
+    EstimatorConfig,
+    RefineConfig,
+    WindowGraphConfig,
+)
 from shapepose_fg.estimation.linearisation import ObservationConfig
 from shapepose_fg.estimation.motion_model import MotionConfig
 from shapepose_fg.proposal.candidates import CandidateConfig
@@ -23,25 +36,29 @@ from shapepose_fg.tracking.tracker import TrackingConfig
 
 @dataclass(frozen=True)
 class PeopleConfig(Settings):
-    """Settings of the search for people, and of the time for which a person is tracked without detections."""
+    """Settings of the search for people, and of the time for which a person is tracked without
+    detections.
+    """
 
     gate_m: Metres = 0.07
     """Largest reprojection error of a point of two views, as a length at its depth, m: over three
     times the 2 cm of a detector's error. Increase it if calibration errors exceed a pixel or
     two."""
     most_pairs: Annotated[int, Interval(ge=1000, le=1_000_000)] = 150_000
-    """Maximum number of pairs of detections of one joint in a frame; beyond it, each view keeps its most
-    confident detections (18 a view of 30 cameras, 47 of 12, 122 of 5). Increase it for denser crowds, decrease
-    it for detectors with many false positives: time and memory grow with it."""
+    """Maximum number of pairs of detections of one joint in a frame; beyond it, each view keeps its
+    most confident detections (18 a view of 30 cameras, 47 of 12, 122 of 5). Increase it for denser
+    crowds, decrease it for detectors with many false positives: time and memory grow with it."""
     min_probability: Share = 0.3
-    """Minimum probability of a new person. A lower value finds people of whom little is seen, a higher one
-    leaves out more false positives; over time, 0.5 and 0.3 gave F1 95.2 and 95.7 before three and four cameras."""
+    """Minimum probability of a new person. A lower value finds people of whom little is seen, a
+    higher one leaves out more false positives; over time, 0.5 and 0.3 gave F1 95.2 and 95.7 before
+    three and four cameras."""
     min_new_joints: Count = 4
-    """Minimum number of core joints (trunk, arms, legs) that two views must see for a new person over time;
-    decrease it where furniture hides people. Frame by frame three are enough, because evidence decides."""
+    """Minimum number of core joints (trunk, arms, legs) that two views must see for a new person
+    over time; decrease it where furniture hides people. Frame by frame three are enough, because
+    evidence decides."""
     patience_s: Seconds = 0.5
-    """Time without evidence after which a track ends, s. Increase it for people who are often hidden; a person
-    who comes back later is re-identified by `stitching`."""
+    """Time without evidence after which a track ends, s. Increase it for people who are often
+    hidden; a person who comes back later is re-identified by `stitching`."""
 
 
 @dataclass(frozen=True)
@@ -49,21 +66,22 @@ class WindowConfig(Settings):
     """How frames are divided into windows."""
 
     overlap_s: Annotated[float, Interval(ge=0, le=60)] = 0.4
-    """Duration of the frames before and after a window that it includes without returning them, s: smoothing
-    reaches a few frames. Windows of other lengths move joints by under 2 mm in the median
+    """Duration of the frames before and after a window that it includes without returning them, s:
+    smoothing reaches a few frames. Windows of other lengths move joints by under 2 mm in the median
     (tests/pipeline/test_windows.py)."""
     keyframe_s: Annotated[float, Interval(ge=0, le=0.5)] = 0.0
-    """Maximum time between keyframes, s; 0: every frame is one. People are tracked and solved in keyframes, and
-    interpolated by the motion model between them, where detections are used only if a joint deviates from its
-    curve by 3 cm. Errors of detectors last longer than a frame, so that little is lost. New people are searched
-    for in keyframes that are 0.3 s or more apart."""
+    """Maximum time between keyframes, s; 0: every frame is one. People are tracked and solved in
+    keyframes, and interpolated by the motion model between them, where detections are used only if
+    a joint deviates from its curve by 3 cm. Errors of detectors last longer than a frame, so that
+    little is lost. New people are searched for in keyframes that are 0.3 s or more apart."""
     again_over_time: RepeatsOrNone = 8
-    """Rounds of reassociation around the initial estimate of a window, at most; they end when hardly any detection
-    changes. Fewer rounds are faster; with 3, crowds before three cameras lose one to two points of F1."""
+    """Rounds of reassociation around the initial estimate of a window, at most; they end when
+    hardly any detection changes. Fewer rounds are faster; with 3, crowds before three cameras lose
+    one to two points of F1."""
     again_alone: RepeatsOrNone = 5
-    """Rounds of reassociation of a single frame, at most; 0 for none, as in the paper. Each round demands a higher
-    probability of people (`LEAST_PROBABILITY`): those that are removed leave their detections to others, so the
-    least probable is removed first. Fewer rounds are faster."""
+    """Rounds of reassociation of a single frame, at most; 0 for none, as in the paper. Each round
+    demands a higher probability of people (`LEAST_PROBABILITY`): those that are removed leave their
+    detections to others, so the least probable is removed first. Fewer rounds are faster."""
 
     @property
     def shared_s(self) -> float:
@@ -76,17 +94,18 @@ class SolvingConfig(Settings):
     """How bodies and joints alternate (Algorithm 1), and the weight of the body."""
 
     alternations: Repeats = 3
-    """N of Algorithm 1 frame by frame: maximum number of times that the body is fitted and the joints are
-    solved. Most frames converge after one or two; the paper has 10."""
+    """N of Algorithm 1 frame by frame: maximum number of times that the body is fitted and the
+    joints are solved. Most frames converge after one or two; the paper has 10."""
     window_alternations: Repeats = 1
-    """N of Algorithm 1 over time, where a window starts from initial estimates: a second round takes twice the
-    time and changed the mean error by 0.1 to 0.2 mm. Windows with factors of your own take `alternations`."""
+    """N of Algorithm 1 over time, where a window starts from initial estimates: a second round
+    takes twice the time and changed the mean error by 0.1 to 0.2 mm. Windows with factors of your
+    own take `alternations`."""
     weight_shape: Factor = 1.0
-    """w_shape of Eq. 5, multiplies the squared distances to the body model: decrease it for people whom it does
-    not fit, in wide clothes or with a load."""
+    """w_shape of Eq. 5, multiplies the squared distances to the body model: decrease it for people
+    whom it does not fit, in wide clothes or with a load."""
     motion: str = "constant velocity"
-    """Motion model of joints, a name in `factors.MOTIONS`: "constant velocity" (white noise on acceleration),
-    or "constant acceleration" (on jerk)."""
+    """Motion model of joints, a name in `factors.MOTIONS`: "constant velocity" (white noise on
+    acceleration), or "constant acceleration" (on jerk)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -103,13 +122,13 @@ class PipelineConfig(Settings):
     """The settings of every step, and the size of batches."""
 
     method: Literal["default", "paper"] = "default"
-    """"paper": the steps as section 3 of the paper has them. `PipelineConfig.paper()` and `config --preset paper`
-    set its numbers, too."""
+    """"paper": the steps as section 3 of the paper has them. `PipelineConfig.paper()` and `config
+    --preset paper` set its numbers, too."""
     people: PeopleConfig = field(default_factory=PeopleConfig)
     """Stage I and tracking: the search for people."""
     observations: ObservationConfig = field(default_factory=ObservationConfig)
-    """Accuracy of 2D observations, as measured for OpenPose: for a detector with twice its errors double
-    `sigma_m`."""
+    """Accuracy of 2D observations, as measured for OpenPose: for a detector with twice its errors
+    double `sigma_m`."""
     following: FollowingConfig = field(default_factory=FollowingConfig)
     """Tracking: how long tracks live."""
     stitching: StitchingConfig = field(default_factory=StitchingConfig)
@@ -125,16 +144,19 @@ class PipelineConfig(Settings):
     offsets: OffsetConfig = field(default_factory=OffsetConfig)
     """Stage II: offsets of the detector's joints from the body's, and the detector's errors."""
     temporal: bool = True
-    """Whether people are tracked over time: identities, motion, one shape a person. If not, every frame is
-    independent."""
+    """Whether people are tracked over time: identities, motion, one shape a person. If not, every
+    frame is independent."""
     batch_frames: Annotated[int, Interval(ge=1, le=10000)] = 128
-    """Number of frames that are solved together and returned: bodies are fitted fastest by the hundred. Fewer
-    need less memory."""
+    """Number of frames that are solved together and returned: bodies are fitted fastest by the
+    hundred. Fewer need less memory."""
 
     replaced: ClassVar[dict[str, str]] = {
         "threads": "was removed: bodies are fitted by one thread",
         "candidates": f"{_CONSTANT}; gate_m and most_pairs are in [people]",
-        "proposals": f"{_CONSTANT}; min_probability is in [people], and method chooses between evidence and hips",
+        "proposals": (
+            f"{_CONSTANT}; min_probability is in [people], and method chooses between evidence "
+            "and hips"
+        ),
         "association": _CONSTANT,
         "tracking": f"{_CONSTANT}; min_new_joints and patience_s are in [people]",
         "window_graph": f"{_CONSTANT}; weight_shape is in [solving]",
@@ -158,7 +180,9 @@ class PipelineConfig(Settings):
 
     @classmethod
     def fast(cls) -> "PipelineConfig":
-        """Keyframes only, eight to ten a second: half the time or less (docs/evaluation.md, "Presets")."""
+        """Keyframes only, eight to ten a second: half the time or less (docs/evaluation.md,
+        "Presets").
+        """
         return cls(
             windows=WindowConfig(keyframe_s=0.12),
             offsets=OffsetConfig(frames=10),
@@ -205,4 +229,6 @@ class PipelineConfig(Settings):
     @property
     def estimator(self) -> EstimatorConfig:
         """Stage II."""
-        return EstimatorConfig(self.observations, self.window_graph, self.refine, self.motion, self.law)
+        return EstimatorConfig(
+            self.observations, self.window_graph, self.refine, self.motion, self.law
+        )

@@ -38,7 +38,11 @@ class Execution:
         """Return a copy with a suitable number of workers for this many frames, if none
         is given.
         """
-        count = suitable_workers(frames, _FRAMES_WORTH_A_WORKER) if self.workers is None else self.workers
+        count = (
+            suitable_workers(frames, _FRAMES_WORTH_A_WORKER)
+            if self.workers is None
+            else self.workers
+        )
         return replace(self, workers=count)
 
     def pool(self, shared: Shared, frames: int) -> AbstractContextManager[Pool[Shared]]:
@@ -46,4 +50,6 @@ class Execution:
         count = self.worth(frames).workers or 0
         if self.cluster is None:
             return workers(count, shared)
-        return cluster(None if self.cluster == "local" else self.cluster, count, shared, sharing=self.sharing)
+        return cluster(
+            None if self.cluster == "local" else self.cluster, count, shared, sharing=self.sharing
+        )

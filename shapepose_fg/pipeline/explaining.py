@@ -25,7 +25,14 @@ from shapepose_fg.estimation.window_solution import PersonGraph
 from shapepose_fg.estimation.wrong_views import Seen, WrongView, wrong_view
 from shapepose_fg.io.validation import validated
 from shapepose_fg.pipeline.config import PipelineConfig
-from shapepose_fg.pipeline.explanation import GATES, Cause, Explanation, FactorReason, Finding, ViewReason
+from shapepose_fg.pipeline.explanation import (
+    GATES,
+    Cause,
+    Explanation,
+    FactorReason,
+    Finding,
+    ViewReason,
+)
 from shapepose_fg.pipeline.solving import Solver, solved_around
 
 OFF_SIGMA = 3.0
@@ -112,14 +119,20 @@ def explain(
     """
     table = people.observations
     if table is None:
-        raise InputError("the result has no observations.npz, which contains its detections; reconstruct again")
+        raise InputError(
+            "the result has no observations.npz, which contains its detections; reconstruct again"
+        )
     if tuple(table.view_names.tolist()) != rig.names:
-        raise InputError("the cameras are not those of observations.npz; give the cameras of the reconstruction")
+        raise InputError(
+            "the cameras are not those of observations.npz; give the cameras of the reconstruction"
+        )
     told = validated(_Run, people.run, "run.json", "restore it or reconstruct the recording again")
     row = _row_of(people, person, frame, time_s)
     names, frame = people.joint_names.tolist(), int(people.frame[row])
     if joint not in names:
-        raise InputError(f"joint {joint}: the result has no joint of this name; it has {' '.join(names)}")
+        raise InputError(
+            f"joint {joint}: the result has no joint of this name; it has {' '.join(names)}"
+        )
     number = names.index(joint)
     solver = Solver.of(people, rig)
     graph = solved_around(people, solver, person, frame, extra_factors)
@@ -129,7 +142,9 @@ def explain(
     views, factors, shares = _view_reasons(around, graph, at, number, solver.config)
     here, known = people.joints[row, number], np.isfinite(people.joints[row, number]).all()
     sigma, when = float(sigma_m(people.covariance[row, number])), float(people.time_s[row])
-    wrong = wrong_view(around.seen, around.people.joints, around.views, solver.config.estimator.observations)
+    wrong = wrong_view(
+        around.seen, around.people.joints, around.views, solver.config.estimator.observations
+    )
     refused = _refused(around, at, number, detections)
     findings = _findings(people, told, row, number, views, factors, shares, wrong, refused)
     given = {name_of(function) for function in functions_of(extra_factors)}
@@ -137,8 +152,8 @@ def explain(
     return Explanation(
         person, joint, frame, when if np.isfinite(when) else None,
         tuple(here.tolist()) if known else None, sigma if known and np.isfinite(sigma) else None,
-        Known(people.known[row, number]).name.lower(), str(people.status[row]), views, *shares, findings,
-        factors, missing,
+        Known(people.known[row, number]).name.lower(), str(people.status[row]), views, *shares,
+        findings, factors, missing,
     )  # fmt: skip
 
 
@@ -160,7 +175,9 @@ def _row_of(people: Reconstruction, person: int, frame: int | None, time_s: floa
     row = mine[people.frame[mine] == frame]
     if len(row) == 0:
         first, last = people.frame[mine].min(), people.frame[mine].max()
-        raise InputError(f"person {person} is not in frame {frame}, only in some frames from {first} to {last}")
+        raise InputError(
+            f"person {person} is not in frame {frame}, only in some frames from {first} to {last}"
+        )
     return int(row[0])
 
 
@@ -178,7 +195,11 @@ class _Detections:
 
     @classmethod
     def of(
-        cls, people: Reconstruction, rig: Rig, config: PipelineConfig, detections: DetectionSequence | None
+        cls,
+        people: Reconstruction,
+        rig: Rig,
+        config: PipelineConfig,
+        detections: DetectionSequence | None,
     ) -> "_Detections":
         table = people.observations
         assert table is not None
@@ -187,21 +208,32 @@ class _Detections:
         pixels = views.pixels(people.joints)[0]
         if detections is not None:
             rows = _with_strays(rows, table, views, pixels, detections)
-        sigmas = observation_sigmas(rows, people.joints, views, config.estimator.observations, names)
+        sigmas = observation_sigmas(
+            rows, people.joints, views, config.estimator.observations, names
+        )
         placed = np.asarray(np.isfinite(people.joints).all(axis=-1))[..., None]
         seen = Seen(pixels - rows.xy, sigmas, np.asarray(rows.seen & placed), table.used)
         return cls(people, table, views, seen)
 
 
 def _with_strays(
-    rows: Observations, table: ObservationTable, views: Views, pixels: Array, detections: DetectionSequence
+    rows: Observations,
+    table: ObservationTable,
+    views: Views,
+    pixels: Array,
+    detections: DetectionSequence,
 ) -> Observations:
     """The rows with unassigned detections added for cameras without one: of the same joint, nearest
     to its position after the most frequent shift in this camera. A misaligned camera has few or no
     assigned detections.
     """
-    parts, focal = list[tuple[Array | Index, ...]](), np.broadcast_to(views.focal, (len(table), len(views)))
-    for frame in np.unique(table.frame[(table.frame >= 0) & (table.frame < len(detections))]).tolist():
+    parts, focal = (
+        list[tuple[Array | Index, ...]](),
+        np.broadcast_to(views.focal, (len(table), len(views))),
+    )
+    for frame in np.unique(
+        table.frame[(table.frame >= 0) & (table.frame < len(detections))]
+    ).tolist():
         seen, here = detections[frame], np.flatnonzero(table.frame == frame)
         free = np.flatnonzero(_owner(seen, table, here) < 0)
         n, k = np.nonzero(table.gate[here][:, seen.joint[free], seen.view[free]] == Gate.NOT_SEEN)
@@ -209,10 +241,14 @@ def _with_strays(
         place = row, seen.joint[free], seen.view[free]
         away = (seen.xy[free] - pixels[place]) / focal[row, seen.view[free]][:, None]
         near = np.linalg.norm(away, axis=-1) < _ASTRAY_RAD
-        parts.append(tuple(column[near] for column in (*place, away, seen.xy[free], seen.confidence[free])))
+        parts.append(
+            tuple(column[near] for column in (*place, away, seen.xy[free], seen.confidence[free]))
+        )
     if len(parts) == 0:
         return rows
-    row, joint, view, away, at, score = (np.concatenate(column) for column in zip(*parts, strict=True))
+    row, joint, view, away, at, score = (
+        np.concatenate(column) for column in zip(*parts, strict=True)
+    )
     xy, confidence = rows.xy.copy(), rows.confidence.copy()
     for v in np.unique(view).tolist():
         mine = np.flatnonzero(view == v)
@@ -266,7 +302,11 @@ def _view_reasons(
     place, whole, of_body = people.joints[row, joint], None, np.zeros((3, 3))
     evidence = list[FactorEvidence]()
     solved = [] if graph is None else np.flatnonzero(graph.frames == people.frame[row]).tolist()
-    if graph is not None and solved and np.isfinite(graph.solved_covariance[solved[0], joint]).all():
+    if (
+        graph is not None
+        and solved
+        and np.isfinite(graph.solved_covariance[solved[0], joint]).all()
+    ):
         t, estimator = solved[0], config.estimator
         place, whole = graph.solved[t, joint], np.linalg.inv(graph.solved_covariance[t, joint])
         of_body = estimator.graph.weight_shape * graph.body.information[t, joint]
@@ -277,9 +317,20 @@ def _view_reasons(
     used = (gates == Gate.USED) & np.isfinite(residual).all(axis=-1) & (sigma > 0)
     observed = config.estimator.observations
     for v in np.flatnonzero(used).tolist():
-        weight = kernel_weight(observed.robust_kernel, np.linalg.norm(residual[v]) / sigma[v]) / sigma[v] ** 2
-        information[v], gradient[v] = weight * slope[v].T @ slope[v], weight * slope[v].T @ residual[v]
-    if whole is not None and graph is not None and graph.window.temporal and not graph.window.touched[joint]:
+        weight = (
+            kernel_weight(observed.robust_kernel, np.linalg.norm(residual[v]) / sigma[v])
+            / sigma[v] ** 2
+        )
+        information[v], gradient[v] = (
+            weight * slope[v].T @ slope[v],
+            weight * slope[v].T @ residual[v],
+        )
+    if (
+        whole is not None
+        and graph is not None
+        and graph.window.temporal
+        and not graph.window.touched[joint]
+    ):
         # In the solver's graph, detections have only the white share of their variance.
         seen_well = weakest_sigma(information.sum(axis=0)) <= LOST_M
         whole *= graph.lasting.white_share if seen_well else 1.0
@@ -303,7 +354,9 @@ def _view_reasons(
             off_px = float(np.linalg.norm(away))
             off_sigma = float(np.sqrt(away @ np.linalg.solve(spread, away)))
             if off_sigma > OFF_SIGMA:
-                like = _looks_like(all_of_it, row, joint, v, table.xy[row, joint, v], float(sigma[v]), off_px)
+                like = _looks_like(
+                    all_of_it, row, joint, v, table.xy[row, joint, v], float(sigma[v]), off_px
+                )
         reason = ViewReason(
             camera=name,
             gate=GATES[Gate(gates[v])],
@@ -322,7 +375,11 @@ def _view_reasons(
     for each, share in zip(evidence, known[len(gates) :], strict=False):
         tied = ((who, people.joint_names[number]) for who, number, _ in each.others)
         mine = int(people.person[row])
-        others = tuple(dict.fromkeys(str(name) if who == mine else f"person {who}'s {name}" for who, name in tied))
+        others = tuple(
+            dict.fromkeys(
+                str(name) if who == mine else f"person {who}'s {name}" for who, name in tied
+            )
+        )
         told[each.name, others] = told.get((each.name, others), 0.0) + share
     factors = tuple(FactorReason(*which, share) for which, share in told.items())
     return tuple(reasons), factors, (known[-2], known[-1])
@@ -337,7 +394,9 @@ def _looks_like(
     """
     people, names = all_of_it.people, all_of_it.people.joint_names.tolist()
     here = np.flatnonzero(people.frame == people.frame[row])
-    alike = np.array([j for j, name in enumerate(names) if name in (names[joint], mirrored(names[joint]))])
+    alike = np.array(
+        [j for j, name in enumerate(names) if name in (names[joint], mirrored(names[joint]))]
+    )
     points, covariance = people.joints[here][:, alike], people.covariance[here][:, alike]
     xy, _, slope = (each[:, :, view] for each in all_of_it.views.rows(here).project(points))
     away, spread = (xy - at)[..., None], sigma**2 * np.eye(2) + slope @ covariance @ slope.mT
@@ -347,10 +406,16 @@ def _looks_like(
     squared[known] = (away[known].mT @ np.linalg.solve(spread[known], away[known]))[..., 0, 0]
     squared[np.linalg.norm(away[..., 0], axis=-1) >= _APART * off] = np.inf
     n, j = np.unravel_index(squared.argmin(), squared.shape)
-    return f"person {people.person[here[n]]}'s {names[alike[j]]}" if squared[n, j] < OFF_SIGMA**2 else ""
+    return (
+        f"person {people.person[here[n]]}'s {names[alike[j]]}"
+        if squared[n, j] < OFF_SIGMA**2
+        else ""
+    )
 
 
-def _refused(all_of_it: _Detections, row: int, joint: int, detections: DetectionSequence | None) -> list[Finding]:
+def _refused(
+    all_of_it: _Detections, row: int, joint: int, detections: DetectionSequence | None
+) -> list[Finding]:
     """Detections of a joint in cameras where the person has none, near the joint or with affinities
     to the person's: assigned to another person, or unassigned.
     """
@@ -377,8 +442,8 @@ def _refused(all_of_it: _Detections, row: int, joint: int, detections: Detection
         cause = Cause.FOREIGN if whose else Cause.GATED
         if theirs > others:
             words = (
-                f"connects a detection with this person's that is {whose or 'unassigned'}, {off:.0f} px"
-                " off. It was not used."
+                f"connects a detection with this person's that is {whose or 'unassigned'}, "
+                f"{off:.0f} px off. It was not used."
             )
             joined.append(Finding(cause, (name,), f"Camera {name} {words}"))
         elif not whose and off * depth[view] < _NEAR_M * views.focal[0, view]:
@@ -409,18 +474,22 @@ def _findings(
         name = views[wrong.view].camera
         (turn, turn_sigma), (shift, shift_sigma) = wrong.turn_deg, wrong.shift_m
         words = (
-            f"Camera {name} disagrees in everything that it sees around this time: rotated by {turn:.1f} ±"
-            f" {turn_sigma:.1f} degrees and moved by {100 * shift:.0f} ± {100 * shift_sigma:.0f} cm it"
-            " would fit the others. Check its pose, lens and clock."
+            f"Camera {name} disagrees in everything that it sees around this time: rotated by "
+            f"{turn:.1f} ± {turn_sigma:.1f} degrees and moved by {100 * shift:.0f} ± "
+            f"{100 * shift_sigma:.0f} cm it would fit the others. Check its pose, lens and clock."
         )
         found.append(Finding(Cause.WRONG_CAMERA, (name,), words))
     left = [view for view in views if view.gate not in (GATES[Gate.USED], GATES[Gate.NOT_SEEN])]
-    suspects = [view for view in (*left, *used) if view.camera not in {n for each in found for n in each.cameras}]
+    suspects = [
+        view
+        for view in (*left, *used)
+        if view.camera not in {n for each in found for n in each.cameras}
+    ]
     for view in suspects:
         if view.looks_like:
             words = (
-                f"Camera {view.camera}'s detection probably belongs to {view.looks_like}: it is {_off(view)}."
-                f" {_taken(view)}"
+                f"Camera {view.camera}'s detection probably belongs to {view.looks_like}: it is "
+                f"{_off(view)}. {_taken(view)}"
             )
             found.append(Finding(Cause.FOREIGN, (view.camera,), words))
     named = {name for each in found for name in each.cameras}
@@ -429,7 +498,9 @@ def _findings(
     against = [view for view in suspects if view.gate == GATES[Gate.CONTRADICTS_BODY]]
     doubted = [view for view in suspects if view in used and (view.off_sigma or 0.0) > OFF_SIGMA]
     agree = [view for view in used if view not in doubted]
-    if len(against) + len(doubted) == 1 and len(agree) > 0:  # a single one against all others is wrong
+    if (
+        len(against) + len(doubted) == 1 and len(agree) > 0
+    ):  # a single one against all others is wrong
         alone = [*against, *doubted]
     else:
         alone = []
@@ -443,14 +514,17 @@ def _findings(
                 found.append(Finding(Cause.CONTRADICTION, cameras, words))
     alone += [view for view in suspects if view.gate == GATES[Gate.TOO_FAR]]
     for view in sorted(alone, key=lambda view: -(view.off_sigma or 0.0)):
-        words = f"Camera {view.camera}'s detection is {_off(view)} and matches no known person. {_taken(view)}"
+        words = (
+            f"Camera {view.camera}'s detection is {_off(view)} and matches no known person. "
+            f"{_taken(view)}"
+        )
         found.append(Finding(Cause.GATED, (view.camera,), words))
     found += [each for each in refused if each.cameras[0] not in named]
     if len(used) == 0:
         words = (
             f"No camera's detection was used: the body contributes {shares[0]:.0%},"
-            f"{''.join(f' {each.name} {each.share:.0%},' for each in factors)} and and and motion from other"
-            " frames the rest."
+            f"{''.join(f' {each.name} {each.share:.0%},' for each in factors)} and and and "
+            "motion from other frames the rest."
         )
         found.append(Finding(Cause.PRIOR_ONLY, (), words))
     if len(used) == 1:
@@ -463,7 +537,9 @@ def _problem(people: Reconstruction, told: _Run, row: int, joint: int) -> str:
     """The problem with a joint as run.json states it; empty where there was none."""
     here = int(people.person[row]), int(people.frame[row]), str(people.joint_names[joint])
     problems = told.people.problems
-    return next((each.reason for each in problems if (each.person, each.frame, each.joint) == here), "")
+    return next(
+        (each.reason for each in problems if (each.person, each.frame, each.joint) == here), ""
+    )
 
 
 def _checked(people: Reconstruction, told: _Run, row: int) -> list[Finding]:
@@ -479,7 +555,8 @@ def _checked(people: Reconstruction, told: _Run, row: int) -> list[Finding]:
         says = "; ".join(each.says for each in told.setup.findings if {*each.cameras} & {*cameras})
         if cameras:
             words = (
-                f"In the set-up check, {_cameras(cameras)} {'were' if len(cameras) > 1 else 'was'} {fate}: {says}."
+                f"In the set-up check, {_cameras(cameras)} "
+                f"{'were' if len(cameras) > 1 else 'was'} {fate}: {says}."
             )
             found.append(Finding(cause, cameras, words))
     return found

@@ -110,8 +110,9 @@ class Explanation:
     findings: tuple[Finding, ...]
     """Problems, most serious first; empty if there are none."""
     factors: tuple[FactorReason, ...] = ()
-    """Contributions of your own factors to the joint in this frame, one entry for those of one function that
-    connect it to the same joints. Their contributions in other frames are in `motion_share`."""
+    """Contributions of your own factors to the joint in this frame, one entry for those of one
+    function that connect it to the same joints. Their contributions in other frames are in
+    `motion_share`."""
     missing_factors: tuple[str, ...] = ()
     """Functions with which the result was solved, and that were not given here: the shares exclude
     them."""
@@ -123,22 +124,32 @@ class Explanation:
     @property
     def words(self) -> tuple[str, ...]:
         """The explanation in sentences: position, problems, and contributions."""
-        when = f"frame {self.frame}" + (f" ({self.time_s:.3f} s)" if self.time_s is not None else "")
+        when = f"frame {self.frame}" + (
+            f" ({self.time_s:.3f} s)" if self.time_s is not None else ""
+        )
         who = f"{self.joint} of person {self.person} in {when}"
         if self.position_m is None or self.sigma_m is None:
             where = f"{who} has no position."
         else:
             x, y, z = self.position_m
-            where = f"{who} is at ({x:.3f}, {y:.3f}, {z:.3f}) m, within {1e3 * self.sigma_m:.0f} mm (one sigma)."
+            where = (
+                f"{who} is at ({x:.3f}, {y:.3f}, {z:.3f}) m, within {1e3 * self.sigma_m:.0f} mm "
+                "(one sigma)."
+            )
         used = [view for view in self.views if view.gate == GATES[Gate.USED]]
         told = [f"{view.camera} {view.share:.0%}" for view in used]
         told += [f"{each.name}{_with(each.others)} {each.share:.0%}" for each in self.factors]
-        parts = [*told, f"the body {self.body_share:.0%}", f"motion from other frames {self.motion_share:.0%}"]
+        parts = [
+            *told,
+            f"the body {self.body_share:.0%}",
+            f"motion from other frames {self.motion_share:.0%}",
+        ]
         shares = f"Its position comes from: {', '.join(parts)}."
         if self.missing_factors:
             shares += (
-                f" The shares do not include factors of {', '.join(self.missing_factors)}, with which the"
-                " result was solved: in Python, pass them to `explain(..., extra_factors=...)`."
+                f" The shares do not include factors of {', '.join(self.missing_factors)}, with "
+                "which the result was solved: in Python, pass them to `explain(..., "
+                "extra_factors=...)`."
             )
         matter = [finding.words for finding in self.findings]
         good = f"{len(used)} cameras agree on it, and nothing contradicts them."

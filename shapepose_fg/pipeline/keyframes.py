@@ -65,7 +65,9 @@ def with_rows_between(
     at = keys[number[pair]] + 1 + np.arange(len(pair)) - np.repeat(np.cumsum(count) - count, count)
     if len(at) == 0:
         return rows
-    between = _carried(rows.rows(order[pair]), rows.rows(order[pair + 1]), frame[at], time_s[at], motion)
+    between = _carried(
+        rows.rows(order[pair]), rows.rows(order[pair + 1]), frame[at], time_s[at], motion
+    )
     every = Reconstruction.concatenate([rows, between])
     return every.rows(np.lexsort((every.person, every.frame)))
 
@@ -79,15 +81,25 @@ def strays_m(joints: Array, velocity: Array, times_s: Array) -> Array:
     """
     lasts_s = np.diff(times_s)[:, None, None]
     moved, turned = np.diff(joints, axis=0) - lasts_s * velocity[:-1], np.diff(velocity, axis=0)
-    density = 12 * moved**2 / lasts_s**3 - 12 * moved * turned / lasts_s**2 + 4 * turned**2 / lasts_s
-    variance = density.sum(axis=2) / 2 * lasts_s[..., 0] ** 3 / 192  # a third of 6 numbers, on 3 axes
+    density = (
+        12 * moved**2 / lasts_s**3 - 12 * moved * turned / lasts_s**2 + 4 * turned**2 / lasts_s
+    )
+    variance = (
+        density.sum(axis=2) / 2 * lasts_s[..., 0] ** 3 / 192
+    )  # a third of 6 numbers, on 3 axes
     return np.sqrt(np.nan_to_num(variance).max(axis=1, initial=0.0))
 
 
 def looked_at(rows: Reconstruction) -> Mask:
-    """(N,) rows with a detection in any view, or before the first or after the last such row of their person."""
+    """(N,) rows with a detection in any view, or before the first or after the last such row of
+    their person.
+    """
     table = rows.observations
-    seen = np.ones(len(rows), dtype=bool) if table is None else (table.gate != Gate.NOT_SEEN).any(axis=(1, 2))
+    seen = (
+        np.ones(len(rows), dtype=bool)
+        if table is None
+        else (table.gate != Gate.NOT_SEEN).any(axis=(1, 2))
+    )
     order = np.lexsort((rows.frame, rows.person))
     inside = np.zeros(len(rows), dtype=bool)
     for mine in np.split(order, np.flatnonzero(np.diff(rows.person[order])) + 1):
@@ -95,8 +107,12 @@ def looked_at(rows: Reconstruction) -> Mask:
     return seen | ~inside
 
 
-def with_rows_like(solved: Reconstruction, rows: Reconstruction, motion: MotionModel) -> Reconstruction:
-    """The `solved` rows, and the interpolated rows between them that `rows` have of the same people."""
+def with_rows_like(
+    solved: Reconstruction, rows: Reconstruction, motion: MotionModel
+) -> Reconstruction:
+    """The `solved` rows, and the interpolated rows between them that `rows` have of the same
+    people.
+    """
     width = int(rows.frame.max(initial=0)) + 1
     order = np.lexsort((solved.frame, solved.person))
     known, asked = (each.person * width + each.frame for each in (solved.rows(order), rows))
@@ -107,7 +123,9 @@ def with_rows_like(solved: Reconstruction, rows: Reconstruction, motion: MotionM
     first, second, new = first[ours], second[ours], new[ours]
     if len(new) == 0:
         return solved
-    between = _carried(solved.rows(first), solved.rows(second), rows.frame[new], rows.time_s[new], motion)
+    between = _carried(
+        solved.rows(first), solved.rows(second), rows.frame[new], rows.time_s[new], motion
+    )
     every = Reconstruction.concatenate([solved, between])
     return every.rows(np.lexsort((every.person, every.frame)))
 
@@ -121,17 +139,26 @@ def _carried(
     lasts_s = (after.time_s - before.time_s)[:, None, None]
     share = (time_s - before.time_s)[:, None, None] / lasts_s
     chord = (after.joints - before.joints) / lasts_s
-    speeds = [np.where(np.isfinite(each.velocity), each.velocity, chord) for each in (before, after)]
+    speeds = [
+        np.where(np.isfinite(each.velocity), each.velocity, chord) for each in (before, after)
+    ]
     joints, velocity = cubic(share, lasts_s, (before.joints, after.joints), (speeds[0], speeds[1]))
 
     # White noise on acceleration with both ends given.
     density = motion.psd_still + motion.psd_speed * np.nan_to_num(np.square(chord).sum(axis=-1))
     inside, length = (share * (1 - share))[..., 0], lasts_s[..., 0]
-    of_place, of_speed = density * (length * inside) ** 3 / 3, density * length * inside * (1 - 3 * inside)
+    of_place, of_speed = (
+        density * (length * inside) ** 3 / 3,
+        density * length * inside * (1 - 3 * inside),
+    )
 
     def spread(name: str, unseen: Array) -> Array:
         ends = getattr(before, name), getattr(after, name)
-        return (1 - share[..., None]) * ends[0] + share[..., None] * ends[1] + unseen[..., None, None] * np.eye(3)
+        return (
+            (1 - share[..., None]) * ends[0]
+            + share[..., None] * ends[1]
+            + unseen[..., None, None] * np.eye(3)
+        )
 
     # The status is that of the first end unless it is good, else of the second; bodies are fitted
     # later.
@@ -150,7 +177,9 @@ def _carried(
         "status": np.where(status == Status.OK, Status.BODY_UNDETERMINED, status),
         "observations": None if before.observations is None else before.observations.unseen(frame),
     }
-    return replace(before, **columns, **{name: np.full_like(getattr(before, name), np.nan) for name in BODY})
+    return replace(
+        before, **columns, **{name: np.full_like(getattr(before, name), np.nan) for name in BODY}
+    )
 
 
 def cubic(
@@ -190,14 +219,21 @@ def bodies_between(
         at, lasts = (each.reshape(-1, *[1] * (values.ndim - 1)) for each in (share, lasts_s))
         return cubic(at, lasts, (values[first], values[second]), (slopes[first], slopes[second]))[0]
 
-    turned = _rotation_vectors(between(_quaternions(np.concatenate([orient[:, None], pose], axis=1))))
+    turned = _rotation_vectors(
+        between(_quaternions(np.concatenate([orient[:, None], pose], axis=1)))
+    )
 
     def filled(values: Array) -> Array:
         every = np.zeros((len(time_s), *values.shape[1:]))
         every[fine] = values
         return every
 
-    return fine, (filled(betas[first]), filled(turned[:, 0]), filled(turned[:, 1:]), filled(between(transl)))
+    return fine, (
+        filled(betas[first]),
+        filled(turned[:, 0]),
+        filled(turned[:, 1:]),
+        filled(between(transl)),
+    )
 
 
 def _quaternions(vectors: Array) -> Array:

@@ -42,11 +42,12 @@ def estimate_offsets(
     times: FrameTimes | None = None,
     fitter: BodyFitter | None = None,
 ) -> KeypointOffsets:
-    """Estimate the offsets of a recording's detector from the joints of the body, without ground truth.
+    """Estimate the offsets of a recording's detector from the joints of the body, without ground
+    truth.
 
-    Uses frames spread over the recording and joints that at least three views see well, as `reconstruct` does by
-    itself. `times` are needed where cameras move. `fitter` has the body, by default the shipped one.
-    `config.offsets.source` is ignored.
+    Uses frames spread over the recording and joints that at least three views see well, as
+    `reconstruct` does by itself. `times` are needed where cameras move. `fitter` has the body, by
+    default the shipped one. `config.offsets.source` is ignored.
     """
     config = config or PipelineConfig()
     fitter = fitter or make_fitter(config.body)
@@ -55,7 +56,9 @@ def estimate_offsets(
     times = FrameTimes.assumed(len(detections)) if times is None else times
     offsets = offsets_of(Setup(rig, thinned.skeleton, config, fitter), thinned, times, Notebook())
     if offsets is None:
-        raise ValueError(f"offsets are known for {BODY_25.name} only, not for {detections.skeleton.name}")
+        raise ValueError(
+            f"offsets are known for {BODY_25.name} only, not for {detections.skeleton.name}"
+        )
     return offsets
 
 
@@ -79,14 +82,18 @@ def kept_noise(
     """The noise law stored when the run began; `noise_of` if there is none yet."""
     if len(kept.names(_NOISE)) > 0:
         with naming(kept.place(_NOISE), ANEW):
-            return NoiseLaw.from_dict({name: kept.array(_NOISE, name).tolist() for name in NoiseLaw.COLUMNS})
+            return NoiseLaw.from_dict(
+                {name: kept.array(_NOISE, name).tolist() for name in NoiseLaw.COLUMNS}
+            )
     noise = noise_of(setup, frames, times, book)
     if noise != NoiseLaw.shipped():
         kept.keep(_NOISE, {name: np.array(getattr(noise, name)) for name in NoiseLaw.COLUMNS})
     return noise
 
 
-def noise_of(setup: Setup, detections: ThinnedFrames, times: FrameTimes, book: Notebook) -> NoiseLaw:
+def noise_of(
+    setup: Setup, detections: ThinnedFrames, times: FrameTimes, book: Notebook
+) -> NoiseLaw:
     """The detector's noise law, from the same source as the offsets.
 
     A recording of fewer than `NOISE_FRAMES` frames uses the shipped law.
@@ -105,7 +112,9 @@ def noise_of(setup: Setup, detections: ThinnedFrames, times: FrameTimes, book: N
         )
         frames, learnt = detections.first + np.array(spread_frames(count, NOISE_FRAMES)), 0
         # In golden-ratio order, frames are spread over the whole recording even if it ends early.
-        for frame in frames[np.argsort(np.arange(len(frames)) * _GOLDEN % 1.0, kind="stable")].tolist():
+        for frame in frames[
+            np.argsort(np.arange(len(frames)) * _GOLDEN % 1.0, kind="stable")
+        ].tolist():
             found = detections[frame]
             people = stage(found, setup.rig.at(time_s[frame]))
             people = replace(people, time_s=np.tile(time_s[frame], (len(people), 1)))
@@ -138,7 +147,8 @@ def offsets_of(
         return KeypointOffsets.load(source)
     with book.stage("offsets"):
         spread = spread_frames(len(detections) - detections.first, config.offsets.frames)
-        # Joints that three views see well are wanted: people whose hips they see are enough, and found faster.
+        # Joints that three views see well are wanted: people whose hips they see are enough, and
+        # found faster.
         hips = StageOne(setup.skeleton, config.candidates, config.proposals, Notebook()).of_few()
         people, time_s = list[Observations](), times.of_views(len(rig))
         for frame in (detections.first + t for t in spread):

@@ -1,4 +1,6 @@
-"""The pipeline: triangulate, propose and associate people; track them, solve windows, fit bodies; return rows."""
+"""The pipeline: triangulate, propose and associate people; track them, solve windows, fit bodies;
+return rows.
+"""
 
 import warnings
 from collections.abc import Sequence
@@ -82,7 +84,11 @@ def reconstruct(
     people = reconstruct_parts(kept, task, execution).reconstruction(consume=True)
     for name, told in people.run.get("extra_factors", {}).items():
         if told["made"] == told["inactive"]:
-            what = "is active, because joints that they need have no position" if told["made"] > 0 else "was made"
+            what = (
+                "is active, because joints that they need have no position"
+                if told["made"] > 0
+                else "was made"
+            )
             warnings.warn(f"extra_factors: {name}: none of its factors {what}", stacklevel=2)
     return replace(people, rig=kept_rig(kept, rig) or rig)
 
@@ -97,18 +103,23 @@ def refine_trajectories(
     cuts: Sequence[int] = (),
     camera_factors: CameraFactors | None = None,
 ) -> Rig:
-    """Refine the trajectories of moving cameras with the people that the cameras see; returns the rig, with
-    covariances.
+    """Refine the trajectories of moving cameras with the people that the cameras see; returns the
+    rig, with covariances.
 
-    `reconstruct` does this first where cameras move; given the rig that this returns, it uses the poses as they
-    are. People constrain a pose where two cameras see them that do not move together; elsewhere the odometry is
-    used. Where no camera stands still the world is that in which the first carrier starts. `camera_factors` are
-    your own on poses. Poses of separate frames (`config.temporal` false) are used as they are.
+    `reconstruct` does this first where cameras move; given the rig that this returns, it uses the
+    poses as they are. People constrain a pose where two cameras see them that do not move together;
+    elsewhere the odometry is used. Where no camera stands still the world is that in which the
+    first carrier starts. `camera_factors` are your own on poses. Poses of separate frames
+    (`config.temporal` false) are used as they are.
     """
     config = PipelineConfig() if config is None else config
     task = Task(detections, rig, config, frames, times, cuts, camera_factors=camera_factors)
-    fitter = make_fitter(config.body, BodyModel.default().with_keypoints(detections.skeleton.joints), config.law)
-    return _with_refined(InMemory(), task, Setup(rig, detections.skeleton, config, fitter), Notebook()).rig
+    fitter = make_fitter(
+        config.body, BodyModel.default().with_keypoints(detections.skeleton.joints), config.law
+    )
+    return _with_refined(
+        InMemory(), task, Setup(rig, detections.skeleton, config, fitter), Notebook()
+    ).rig
 
 
 @dataclass(frozen=True)
@@ -155,21 +166,30 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
     result is identical in every byte.
     """
     execution = Execution() if execution is None else execution
-    config, rig, skeleton, chunk = task.config, task.rig, task.detections.skeleton, execution.chunk_frames
+    config, rig, skeleton, chunk = (
+        task.config,
+        task.rig,
+        task.detections.skeleton,
+        execution.chunk_frames,
+    )
     frames, times, cuts = task.whole()
     if chunk is not None and not (config.temporal and chunk >= config.batch_frames):
         raise ValueError(
-            f"chunk_frames must be at least batch_frames ({config.batch_frames}), for people over time;"
-            f" got {chunk}"
+            f"chunk_frames must be at least batch_frames ({config.batch_frames}), for people "
+            f"over time; got {chunk}"
         )
     book, fitter = Notebook(), task.fitter
     pictures = WithoutRepeats(with_poses(task.detections, rig, times), len(rig))
     detections = ThinnedFrames(pictures, rig, config.candidates)
     with book.stage("load"):
         if fitter is None:
-            fitter = make_fitter(config.body, BodyModel.default().with_keypoints(skeleton.joints), config.law)
+            fitter = make_fitter(
+                config.body, BodyModel.default().with_keypoints(skeleton.joints), config.law
+            )
         check_fitter(fitter)
-    setup = _with_refined(kept, task, Setup(rig, skeleton, config, fitter, task.extra_factors), book)
+    setup = _with_refined(
+        kept, task, Setup(rig, skeleton, config, fitter, task.extra_factors), book
+    )
     offsets = kept_offsets(kept, setup, detections, times, book)
     if offsets is not None:
         setup = replace(setup, fitter=fitter.with_keypoint_offsets(offsets))
@@ -177,7 +197,9 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
     parts = Parts(kept)
     parts.check(skeleton.joints, rig.names, frames, times.frame_s)
     done = parts.notes().frames
-    windows = SolvedWindows(setup, detections, pictures, times, frames, cuts, task.keyframes(), book)
+    windows = SolvedWindows(
+        setup, detections, pictures, times, frames, cuts, task.keyframes(), book
+    )
     with execution.pool(setup, len(frames)) as pool:
         beginning = book.flush()
         nobody = setup.engine(book).tracker.nobody()
@@ -198,12 +220,16 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
             with book.stage("bodies over time"):
                 if config.motion.floor:
                     floor = result.floor(model, rig.up_vector)
-                known = SubjectShapes.empty(fingerprint(model)) if task.shapes is None else task.shapes
+                known = (
+                    SubjectShapes.empty(fingerprint(model)) if task.shapes is None else task.shapes
+                )
                 keyframe_s = config.windows.keyframe_s
                 ground = floor if isinstance(floor, Floor) else None
                 bodies = fit_everybody(
                     result.rows_of,
-                    lambda number, rows: replace(result.person(number, rows), floor=ground, keyframe_s=keyframe_s),
+                    lambda number, rows: replace(
+                        result.person(number, rows), floor=ground, keyframe_s=keyframe_s
+                    ),
                     lambda jobs: pool.map(_fit_person, jobs),
                     kept,
                     known,
@@ -213,11 +239,16 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
     for each in (parts.notes(), book.flush()):
         notes.add(each)
     more = {"time": times.as_dict(), "cuts": cuts}
-    more |= {"floor": floor.as_dict() if isinstance(floor, Floor) else {"found": False, "why": floor}}
+    more |= {
+        "floor": floor.as_dict() if isinstance(floor, Floor) else {"found": False, "why": floor}
+    }
     if rig.moves:
         more |= {"trajectories": about(rig, setup.rig)}
     if functions := functions_of(task.extra_factors):
-        made = {name_of(function): notes.factors.get(name_of(function), (0, 0)) for function in functions}
+        made = {
+            name_of(function): notes.factors.get(name_of(function), (0, 0))
+            for function in functions
+        }
         counts = {name: {"made": count, "inactive": idle} for name, (count, idle) in made.items()}
         more |= {"extra_factors": counts}
     more |= {
@@ -255,12 +286,16 @@ def _names(tracks: Assembly, setup: Setup, cuts_s: Sequence[float]) -> dict[int,
 
     def trace(track: int) -> Trace:
         pieces = tracks.own_pieces(track, ("time_s", "joints"))
-        return Trace.concatenate([Trace.of(track, time_s, joints, setup.skeleton) for time_s, joints in pieces])
+        return Trace.concatenate(
+            [Trace.of(track, time_s, joints, setup.skeleton) for time_s, joints in pieces]
+        )
 
     return stitch(Ends.of(map(trace, tracks.rows_of)), setup.config.stitching, cuts_s)
 
 
-def _summary(notes: Notes, config: PipelineConfig, frames: range, result: Assembly) -> dict[str, Any]:
+def _summary(
+    notes: Notes, config: PipelineConfig, frames: range, result: Assembly
+) -> dict[str, Any]:
     """Entries of run.json about a run, without its inputs."""
     problems = [
         {
@@ -274,7 +309,10 @@ def _summary(notes: Notes, config: PipelineConfig, frames: range, result: Assemb
     dropped = {reason: frames for reason, frames in notes.dropped.items() if len(frames) > 0}
 
     def spans(of: dict[str, list[int]]) -> dict[str, list[list[int]]]:
-        return {name: [[span.start, span.stop] for span in spans_of(numbers)] for name, numbers in of.items()}
+        return {
+            name: [[span.start, span.stop] for span in spans_of(numbers)]
+            for name, numbers in of.items()
+        }
 
     named = Notes()
     for track, each in notes.evidence.items():

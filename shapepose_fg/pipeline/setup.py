@@ -93,9 +93,18 @@ class Setup:
         rows = solution.observations
         if not self.config.temporal:  # numbers within the frame
             number = np.arange(len(rows)) - np.searchsorted(rows.frame, rows.frame)
-            problems = tuple(replace(each, track=int(number[each.row])) for each in solution.problems)
-            solution = replace(solution, observations=replace(rows, track=number), problems=problems)
-        notes = Notes(len(own), dict(solution.seconds), problems=list(solution.problems), factors=solution.factors)
+            problems = tuple(
+                replace(each, track=int(number[each.row])) for each in solution.problems
+            )
+            solution = replace(
+                solution, observations=replace(rows, track=number), problems=problems
+            )
+        notes = Notes(
+            len(own),
+            dict(solution.seconds),
+            problems=list(solution.problems),
+            factors=solution.factors,
+        )
         if dropped := sorted(frame for frame in left.elements() if frame in own):
             notes.dropped[_FALSE_POSITIVE] = dropped
         said = np.isfinite(rows.evidence)
@@ -108,14 +117,21 @@ class Setup:
             notes.probable = dict(Counter(tenths))
         if len(given) == len(every):
             return Part(self._result(solution, given, rig), notes)
-        frame, time_s = np.array([each.frame for each in every]), np.array([each.time_s.mean() for each in every])
+        frame, time_s = (
+            np.array([each.frame for each in every]),
+            np.array([each.time_s.mean() for each in every]),
+        )
         key = np.array([each.key for each in every])
         motion = MotionModel.load(self.skeleton.joints, self.config.motion)
         carried = with_rows_between(self._result(whole, given, rig), frame, time_s, key, motion)
         for part in map(self.solve, halved(span, whole, carried, self.config)):
             anew = np.unique(part.rows.frame)
-            carried = Reconstruction.concatenate([carried.rows(~np.isin(carried.frame, anew)), part.rows])
-            notes.problems = [each for each in notes.problems if each.frame not in anew] + part.notes.problems
+            carried = Reconstruction.concatenate(
+                [carried.rows(~np.isin(carried.frame, anew)), part.rows]
+            )
+            notes.problems = [
+                each for each in notes.problems if each.frame not in anew
+            ] + part.notes.problems
             notes.add(Notes(seconds=part.notes.seconds))
         carried = carried.rows(np.lexsort((carried.person, carried.frame)))
         return Part(carried.rows(np.isin(carried.frame, list(own))), notes)
@@ -138,11 +154,15 @@ class Setup:
         hips = sure.of_the_rest()
         if sure.proposals.evidence and not config.temporal:
             # In single frames evidence decides during reassociation.
-            likely = replace(sure.proposals, min_probability=_ON_TRIAL * sure.proposals.min_probability)
+            likely = replace(
+                sure.proposals, min_probability=_ON_TRIAL * sure.proposals.min_probability
+            )
             sure, tracking = replace(sure, proposals=likely), replace(tracking, min_new_joints=3)
         law = self.estimator.law
         motion = MotionModel.load(skeleton.joints, config.motion, law)
-        scale = BodyScale(longest_bones(skeleton), motion.density(np.full(len(skeleton), FAST_M_S), UNSEEN_S), law)
+        scale = BodyScale(
+            longest_bones(skeleton), motion.density(np.full(len(skeleton), FAST_M_S), UNSEEN_S), law
+        )
         find = (sure, hips) if config.temporal else (sure,)
         told = {"fitter": self.fitter, "drop": book.drop_in, "search": book.search}
         return Engine(Tracker(skeleton, scale, find, tracking, config.observations, **told), config)
@@ -161,6 +181,8 @@ def _doubted(solution: WindowSolution, doubted: Mapping[int, tuple[int, ...]]) -
     return np.where(there, Status.CONTRADICTED, solution.status)
 
 
-def find_people(detections: Detections, rig: Rig, skeleton: Skeleton, config: PipelineConfig) -> Observations:
+def find_people(
+    detections: Detections, rig: Rig, skeleton: Skeleton, config: PipelineConfig
+) -> Observations:
     """Stage I for one frame: people's 2D observations and initial joints."""
     return StageOne(skeleton, config.candidates, config.proposals, Notebook())(detections, rig)

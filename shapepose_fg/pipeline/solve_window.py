@@ -44,8 +44,8 @@ class Assigning:
     rounds: int
     """Maximum number of rounds."""
     over_time: bool
-    """Whether people are the same from frame to frame. If not, each round demands a higher probability of
-    people (`LEAST_PROBABILITY`)."""
+    """Whether people are the same from frame to frame. If not, each round demands a higher
+    probability of people (`LEAST_PROBABILITY`)."""
 
 
 def solve_window(
@@ -69,9 +69,13 @@ def solve_window(
     (`BodyFit.prior_xyz`), so that no measurement counts twice. Motion constrains the joints, never
     the targets of the body.
     """
-    if len(views) != observations.confidence.shape[2] or views.rows_known not in (None, len(observations)):
+    if len(views) != observations.confidence.shape[2] or views.rows_known not in (
+        None,
+        len(observations),
+    ):
         raise ValueError(
-            f"views must be of the {len(observations)} rows' {observations.confidence.shape[2]} views"
+            f"views must be of the {len(observations)} rows' {observations.confidence.shape[2]} "
+            "views"
         )
     began = time.perf_counter()
     motion = MotionModel.load(config.joints, config.motion, config.law)
@@ -86,9 +90,13 @@ def solve_window(
             times_s = observations.time_s.mean(axis=1)
             places, covariance = smoothed(places, covariance, observations.track, times_s, motion)
             covariance = widened(covariance, observations, places, views)
-        least = None if assigning.over_time else n / max(assigning.rounds - 1, 1) * LEAST_PROBABILITY
+        least = (
+            None if assigning.over_time else n / max(assigning.rounds - 1, 1) * LEAST_PROBABILITY
+        )
         before = observations
-        observations = reassociate(assigning.frames, before, places, covariance, assigning.skeleton, least)
+        observations = reassociate(
+            assigning.frames, before, places, covariance, assigning.skeleton, least
+        )
         views = views if views.rows_known is None else views.rows(rows_in(before, observations))
         if assigning.over_time and changed(before, observations) < _SETTLED:
             break
@@ -121,7 +129,10 @@ def solve_window(
             evidence = linearise(observed, sigma, there, cameras, config.observations)
             again = np.flatnonzero(wrong.any(axis=-1))
             targets = step.targets(evidence, state.enough[rows])
-            body, anew = body.with_rows(again, step.fit(targets, body, again)), np.union1d(anew, again)
+            body, anew = (
+                body.with_rows(again, step.fit(targets, body, again)),
+                np.union1d(anew, again),
+            )
         state.told.put(rows[anew], targets.rows(anew))
         # delta of Eq. 4; joints that their views do not determine need the body despite a confident
         # single view.
@@ -163,7 +174,9 @@ def solve_window(
         if len(moving) == 0:
             break
     solution = outcome(state, fitter)
-    solution.seconds.update({"associate again": assigned - began, "solve": time.perf_counter() - assigned})
+    solution.seconds.update(
+        {"associate again": assigned - began, "solve": time.perf_counter() - assigned}
+    )
     return solution
 
 

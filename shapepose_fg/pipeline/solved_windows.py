@@ -71,7 +71,9 @@ class SolvedWindows:
                 self._rigs[said] = replace(self.setup.rig, dark=said[0], doubted=said[1])
             return Input(frame, self._time_s[frame], found, self._rigs[said], key)
 
-    def after(self, begin: Checkpoint | None, pool: Pool[Setup], chunk_frames: int | None) -> Iterator[Part]:
+    def after(
+        self, begin: Checkpoint | None, pool: Pool[Setup], chunk_frames: int | None
+    ) -> Iterator[Part]:
         """The windows from `begin` on, in order; in chunks of about `chunk_frames` if given."""
         begin = Checkpoint(self.frames.start) if begin is None else begin
         if chunk_frames is not None:
@@ -107,12 +109,16 @@ class SolvedWindows:
                         next_id = state.follow.next_id
                     else:
                         spans = [engine.alone(self.book.watched(given))]
-                behind = Checkpoint(batch.stop, next_id, state if config.temporal and not last else None)
+                behind = Checkpoint(
+                    batch.stop, next_id, state if config.temporal and not last else None
+                )
                 for n, span in enumerate(spans, start=1):
                     yield span, behind if n == len(spans) else None
 
     def _by_chunks(self, begin: Checkpoint, pool: Pool[Setup], chunk_frames: int) -> Iterator[Part]:
-        chunks = cut_in_chunks(self.frames, self.cuts, self.times.frame_s, self.setup.config, chunk_frames)
+        chunks = cut_in_chunks(
+            self.frames, self.cuts, self.times.frame_s, self.setup.config, chunk_frames
+        )
         waiting: deque[tuple[Chunk, Notes]] = deque()
 
         def jobs() -> Iterator[tuple[Chunk, Sequence[Input]]]:
@@ -130,13 +136,19 @@ class SolvedWindows:
             identities.remember(found.ends, names)
             for part in found.parts:
                 notes, rows, behind = part.notes, part.rows, None
-                notes.problems = [replace(each, track=name(each.track, names)) for each in notes.problems]
+                notes.problems = [
+                    replace(each, track=name(each.track, names)) for each in notes.problems
+                ]
                 notes.evidence = {name(of, names): each for of, each in notes.evidence.items()}
-                rows = rows.relabelled(np.array([name(each, names) for each in rows.person.tolist()], np.int64))
+                rows = rows.relabelled(
+                    np.array([name(each, names) for each in rows.person.tolist()], np.int64)
+                )
                 if part is found.parts[-1]:
                     notes.add(read)
                     notes.add(found.notes)
-                    behind = Checkpoint(chunk.own.stop, identities.next_id, border=identities.border)
+                    behind = Checkpoint(
+                        chunk.own.stop, identities.next_id, border=identities.border
+                    )
                 yield Part(rows.rows(np.lexsort((rows.person, rows.frame))), notes, behind)
 
 
@@ -176,5 +188,7 @@ def solve_chunk(setup: Setup, job: tuple[Chunk, Sequence[Input]]) -> SolvedChunk
         raise RuntimeError(f"windows of {len(frames)} frames were found for a chunk of {chunk.own}")
     parts = tuple(map(setup.solve, spans))
     notes = book.flush()
-    notes.dropped = {why: [each for each in of if each in chunk.own] for why, of in notes.dropped.items()}
+    notes.dropped = {
+        why: [each for each in of if each in chunk.own] for why, of in notes.dropped.items()
+    }
     return SolvedChunk(parts, notes, Border.of(spans[0]), Border.of(spans[-1]))

@@ -53,12 +53,16 @@ class Solver:
         """
         configuration = people.run.get("configuration")
         if not isinstance(configuration, dict):
-            raise InputError(f"{run_file}: configuration is missing; reconstruct the recording again")
+            raise InputError(
+                f"{run_file}: configuration is missing; reconstruct the recording again"
+            )
         config = config_from(configuration, PipelineConfig, run_file, cure=ANOTHER_VERSION)
         told, body = people.run.get("keypoint_offsets"), people.run.get("body")
         offsets = None if told is None else KeypointOffsets.read(told, run_file)
         model = BodyModel.default() if body is None else BodyModel.load(Path(str(body)))
-        fitter = make_fitter(config.body, model.with_keypoints(tuple(people.joint_names.tolist())), config.law)
+        fitter = make_fitter(
+            config.body, model.with_keypoints(tuple(people.joint_names.tolist())), config.law
+        )
         fitter = fitter if offsets is None else fitter.with_keypoint_offsets(offsets)
         return cls(rig, config, fitter, NoiseLaw.read(people.run, run_file))
 
@@ -74,7 +78,9 @@ class Solver:
         return cls.of(people, rig, folder / "run.json")
 
 
-def solve_rows(rows: Reconstruction, solver: Solver, extra_factors: ExtraFactors | None = None) -> Reconstruction:
+def solve_rows(
+    rows: Reconstruction, solver: Solver, extra_factors: ExtraFactors | None = None
+) -> Reconstruction:
     """Solve some people of a result again, each over all of their rows, in the windows of the whole
     recording.
 
@@ -111,21 +117,32 @@ def window_solutions(
     solver = Solver.of(people, rig)
     for _, part, solution in _solved(people, solver, extra_factors):
         for person in solution.people:
-            as_reported = {"joints": part.joints[person.rows], "covariance": part.covariance[person.rows]}
+            as_reported = {
+                "joints": part.joints[person.rows],
+                "covariance": part.covariance[person.rows],
+            }
             yield person if extra_factors is not None else replace(person, **as_reported)
 
 
 def solved_around(
-    people: Reconstruction, solver: Solver, person: int, frame: int, extra_factors: ExtraFactors | None = None
+    people: Reconstruction,
+    solver: Solver,
+    person: int,
+    frame: int,
+    extra_factors: ExtraFactors | None = None,
 ) -> PersonGraph | None:
     """Graph of a person's window that contains this frame, solved again from the person's own
     observations; None if it is empty. With `extra_factors` all people in the window are solved. The
     observations must be present.
     """
     if extra_factors is None:
-        people = people.rows(people.person == person if solver.config.temporal else people.frame == frame)
+        people = people.rows(
+            people.person == person if solver.config.temporal else people.frame == frame
+        )
     found = [solution for _, _, solution in _solved(people, solver, extra_factors, frame)]
-    return next((each for solution in found for each in solution.people if each.person == person), None)
+    return next(
+        (each for solution in found for each in solution.people if each.person == person), None
+    )
 
 
 def _solved(
@@ -138,10 +155,14 @@ def _solved(
     overlap, and the solution.
     """
     if rows.observations is None:
-        raise ValueError("rows without observations cannot be solved again; reconstruct the recording again")
+        raise ValueError(
+            "rows without observations cannot be solved again; reconstruct the recording again"
+        )
     config, rig = solver.config, solver.rig
     _check_rows(rows, over_time=config.temporal)
-    settings = replace(config.estimator, joints=tuple(rows.joint_names.tolist()), noise=solver.noise)
+    settings = replace(
+        config.estimator, joints=tuple(rows.joint_names.tolist()), noise=solver.noise
+    )
     for own, segment in _windows(rows, config):
         if frame is not None and frame not in own:
             continue
@@ -150,9 +171,13 @@ def _solved(
             part = part.rows(looked_at(part))
         assert part.observations is not None
         # Initialised from the views: the current joints may be another person's.
-        observations = part.observations.observations(np.full_like(part.joints, np.nan), part.time_s)
+        observations = part.observations.observations(
+            np.full_like(part.joints, np.nan), part.time_s
+        )
         views = Views.of(rig, observations.time_s)
-        found = solve_window(observations, views, solver.fitter, settings, extra_factors=extra_factors)
+        found = solve_window(
+            observations, views, solver.fitter, settings, extra_factors=extra_factors
+        )
         yield own, part, found
 
 
@@ -162,7 +187,11 @@ def _check_rows(rows: Reconstruction, *, over_time: bool) -> None:
     person, frame, time_s = (each[order] for each in (rows.person, rows.frame, rows.time_s))
     same = np.diff(person) == 0
     twice = np.flatnonzero(same & (np.diff(frame) == 0))
-    problem = f"person {person[twice[0]]} occurs twice in frame {frame[twice[0]]}" if len(twice) > 0 else ""
+    problem = (
+        f"person {person[twice[0]]} occurs twice in frame {frame[twice[0]]}"
+        if len(twice) > 0
+        else ""
+    )
     if len(rows) > 0 and (person.max() > MAX_PERSON or frame.max() > MAX_FRAME):
         problem = f"persons must be at most {MAX_PERSON} and frames {MAX_FRAME}"
     if over_time and not problem:
@@ -171,10 +200,13 @@ def _check_rows(rows: Reconstruction, *, over_time: bool) -> None:
         if wrong.any():
             at = int(wrong.argmax())
             problem = (
-                f"time_s must increase with the frames, but does not at person {person[at]}, frame {frame[at]}"
+                f"time_s must increase with the frames, but does not at person {person[at]}, "
+                f"frame {frame[at]}"
             )
     if problem:
-        raise InputError(f"people.npz: {problem}; restore the file or reconstruct the recording again")
+        raise InputError(
+            f"people.npz: {problem}; restore the file or reconstruct the recording again"
+        )
 
 
 def _rows_of(rows: Reconstruction, own: range, segment: range, overlap_s: float) -> Index:
@@ -197,7 +229,9 @@ def _windows(rows: Reconstruction, config: PipelineConfig) -> list[tuple[range, 
     Windows are those in which the recording was solved; single frames are windows of their own.
     """
     if not config.temporal:
-        return [(frames, frames) for frames in (range(t, t + 1) for t in np.unique(rows.frame).tolist())]
+        return [
+            (frames, frames) for frames in (range(t, t + 1) for t in np.unique(rows.frame).tolist())
+        ]
     first, last = (int(rows.frame.min()), int(rows.frame.max()) + 1) if len(rows) > 0 else (0, 0)
     cuts: Sequence[int] = rows.run.get("cuts", ())
     windows = []

@@ -20,7 +20,13 @@ from shapepose_fg.core.frame_times import segments
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.storage.kept_arrays import ANEW, KeptArrays
 from shapepose_fg.core.trajectory import Trajectory
-from shapepose_fg.estimation.trajectory_graph import CameraFactors, Mounted, TrajectoryGraph, poses_of, symmetric
+from shapepose_fg.estimation.trajectory_graph import (
+    CameraFactors,
+    Mounted,
+    TrajectoryGraph,
+    poses_of,
+    symmetric,
+)
 from shapepose_fg.pipeline.solved_windows import SolvedWindows
 from shapepose_fg.pipeline.windows import Span
 
@@ -60,11 +66,15 @@ def keep(kept: KeptArrays, rig: Rig) -> None:
 
 
 def refine(windows: SolvedWindows, camera_factors: CameraFactors | None = None) -> Rig:
-    """The rig of `windows` with trajectories refined by the people of the recording, and their covariances."""
+    """The rig of `windows` with trajectories refined by the people of the recording, and their
+    covariances.
+    """
     rig, time_s = windows.setup.rig, windows.times.of_views(len(windows.setup.rig))
     frames = np.arange(windows.frames.start, windows.frames.stop)
     if len(frames) < 2:
-        return replace(rig, trajectories=tuple(replace(each, refined=True) for each in rig.trajectories))
+        return replace(
+            rig, trajectories=tuple(replace(each, refined=True) for each in rig.trajectories)
+        )
     whole = Mounted(rig, frames, time_s[frames])
     poses, of_people = whole.odometry.copy(), list[gtsam.NonlinearFactor]()
     still = (rig.carrier < 0).any()
@@ -84,10 +94,14 @@ def refine(windows: SolvedWindows, camera_factors: CameraFactors | None = None) 
 
 
 def about(given: Rig, refined: Rig) -> list[dict[str, Any]]:
-    """The entry of run.json about trajectories: cameras, length, corrections, standard deviations."""
+    """The entry of run.json about trajectories: cameras, length, corrections, standard
+    deviations.
+    """
     told = []
     for number, (old, new) in enumerate(zip(given.trajectories, refined.trajectories, strict=True)):
-        cameras = [name for name, on in zip(given.names, given.carrier, strict=True) if on == number]
+        cameras = [
+            name for name, on in zip(given.names, given.carrier, strict=True) if on == number
+        ]
         was, covariance = old.at(new.time_s), new.covariance_at(new.time_s)
         moved = np.linalg.norm(new.wTb[:, :3, 3] - was[:, :3, 3], axis=1)
         cosine = (np.trace(new.wTb[:, :3, :3] @ was[:, :3, :3].mT, axis1=1, axis2=2) - 1) / 2
@@ -97,11 +111,15 @@ def about(given: Rig, refined: Rig) -> list[dict[str, Any]]:
                 "carrier": new.name,
                 "cameras": cameras,
                 "refined": new.refined,
-                "way_m": round(float(np.linalg.norm(np.diff(new.wTb[:, :3, 3], axis=0), axis=1).sum()), 3),
+                "way_m": round(
+                    float(np.linalg.norm(np.diff(new.wTb[:, :3, 3], axis=0), axis=1).sum()), 3
+                ),
                 "moved_mm": round(1e3 * float(moved.max()), 1),
                 "turned_deg": round(float(np.degrees(np.arccos(np.clip(cosine, -1, 1)).max())), 3),
                 "sigma_mm": round(1e3 * float(np.sqrt(np.median(variance[:, 3:].mean(axis=1)))), 1),
-                "sigma_deg": round(float(np.degrees(np.sqrt(np.median(variance[:, :3].mean(axis=1))))), 3),
+                "sigma_deg": round(
+                    float(np.degrees(np.sqrt(np.median(variance[:, :3].mean(axis=1))))), 3
+                ),
             }
         )
     return told
@@ -164,7 +182,9 @@ class _Pass:
         mounted = Mounted(setup.rig, frames, self.time_s[frames])
         anchors = gtsam.NonlinearFactorGraph() if self._before is None else self._before
         for carrier in range(len(setup.rig.trajectories)):
-            for factor in mounted.steps(carrier) + mounted.known(carrier)[0 if last is None else 1 :]:
+            for factor in (
+                mounted.steps(carrier) + mounted.known(carrier)[0 if last is None else 1 :]
+            ):
                 anchors.push_back(factor)
         graph = TrajectoryGraph(
             mounted,
@@ -180,7 +200,9 @@ class _Pass:
         return graph
 
 
-def _known(graph: TrajectoryGraph, anchors: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGraph:
+def _known(
+    graph: TrajectoryGraph, anchors: gtsam.NonlinearFactorGraph
+) -> gtsam.NonlinearFactorGraph:
     """Marginal of a solved window on its last poses, independently for each carrier."""
     both, values = gtsam.NonlinearFactorGraph(anchors), gtsam.Values()
     for factor in graph.of_poses():
@@ -194,7 +216,9 @@ def _known(graph: TrajectoryGraph, anchors: gtsam.NonlinearFactorGraph) -> gtsam
     return known
 
 
-def _smoothed(whole: Mounted, poses: Array, of_people: list[gtsam.NonlinearFactor]) -> tuple[Array, Array]:
+def _smoothed(
+    whole: Mounted, poses: Array, of_people: list[gtsam.NonlinearFactor]
+) -> tuple[Array, Array]:
     """(T, B, 4, 4) poses of all frames in one graph, starting at `poses`, and covariances (T, B, 6,
     6).
     """
@@ -214,7 +238,9 @@ def _smoothed(whole: Mounted, poses: Array, of_people: list[gtsam.NonlinearFacto
     return poses_of(solved, keys), symmetric(covariance).reshape(*keys.shape, 6, 6)
 
 
-def _refined(given: Trajectory, time_s: Array, poses: Array, odometry: Array, covariance: Array) -> Trajectory:
+def _refined(
+    given: Trajectory, time_s: Array, poses: Array, odometry: Array, covariance: Array
+) -> Trajectory:
     """The trajectory through `poses` (T, 4, 4) at the frames' times, and along the odometry between
     them.
     """
@@ -228,5 +254,9 @@ def _refined(given: Trajectory, time_s: Array, poses: Array, odometry: Array, co
     correction = Trajectory(given.name, middle, poses @ np.linalg.inv(odometry))
     surely = Trajectory(given.name, middle, poses, covariance).covariance_at(times)
     return replace(
-        given, time_s=times, wTb=correction.at(times) @ given.at(times), covariance=surely, refined=True
+        given,
+        time_s=times,
+        wTb=correction.at(times) @ given.at(times),
+        covariance=surely,
+        refined=True,
     )

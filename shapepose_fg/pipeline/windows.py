@@ -132,14 +132,19 @@ class Engine:
         return int(np.flatnonzero(near)[0]) if direction < 0 else int(np.flatnonzero(near)[-1]) + 1
 
 
-def halved(span: Span, solved: WindowSolution, between: Reconstruction, config: PipelineConfig) -> list[Span]:
+def halved(
+    span: Span, solved: WindowSolution, between: Reconstruction, config: PipelineConfig
+) -> list[Span]:
     """Parts of a span to be solved again, with a further keyframe where a joint deviates from its
     interpolation.
 
     `solved` are the rows of the span's keyframes, `between` includes the interpolated ones.
     """
     given, rows = [each for each, _ in span.decided], solved.observations
-    number, time_s = np.array([each.frame for each in given]), np.array([each.time_s.mean() for each in given])
+    number, time_s = (
+        np.array([each.frame for each in given]),
+        np.array([each.time_s.mean() for each in given]),
+    )
     key, new = np.array([each.key for each in given]), np.zeros(len(given), dtype=bool)
     for mine in window_rows(rows):
         at = np.searchsorted(number, rows.frame[mine])
@@ -152,7 +157,10 @@ def halved(span: Span, solved: WindowSolution, between: Reconstruction, config: 
         if new[n]:
             carried = between.rows(between.frame == each.frame)
             unseen = np.full((*carried.joints.shape[:2], len(each.rig)), -1)
-            when = {"frame": carried.frame, "time_s": np.repeat(each.time_s[None], len(carried), axis=0)}
+            when = {
+                "frame": carried.frame,
+                "time_s": np.repeat(each.time_s[None], len(carried), axis=0),
+            }
             found = thinned(each.detections, each.rig, config.candidates)[0]
             decided.append((
                 replace(each, detections=found, key=True),

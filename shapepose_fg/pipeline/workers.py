@@ -30,11 +30,11 @@ Shared = TypeVar("Shared")
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-_ENVIRONMENT = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1") | {
-    "LOKY_MAX_MEMORY_LEAK_SIZE": "1e18"
-}
-"""Environment of worker processes: one thread each for linear algebra; loky must not restart a worker whose memory
-grows, because recordings differ in size."""
+_ENVIRONMENT = dict.fromkeys(
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"
+) | {"LOKY_MAX_MEMORY_LEAK_SIZE": "1e18"}
+"""Environment of worker processes: one thread each for linear algebra; loky must not restart a
+worker whose memory grows, because recordings differ in size."""
 _LOOK_S = 0.5
 """Interval at which a worker checks whether the process that started it is alive, s."""
 
@@ -48,14 +48,17 @@ class Pool(Generic[Shared]):
     call: tuple[Any, ...]
     """A function and its first arguments; the last two arguments are the work and the item."""
     under_way: Callable[[], float]
-    """Maximum number of submitted items: enough to keep all processes busy, few enough to bound memory."""
+    """Maximum number of submitted items: enough to keep all processes busy, few enough to bound
+    memory."""
 
     def submit(self, work: Callable[[Shared, Item], Result], item: Item) -> Future[Result]:
         """Submit `work(shared, item)`; without further processes it is done on return."""
         with naming_lost_work():
             return self.executor.submit(*self.call, work, item)
 
-    def map(self, work: Callable[[Shared, Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+    def map(
+        self, work: Callable[[Shared, Item], Result], items: Iterable[Item]
+    ) -> Iterator[Result]:
         """Yield `work(shared, item)` for each item, in order; `items` are consumed on demand.
 
         Raises `WorkLost` if a process dies.
@@ -99,12 +102,18 @@ class Here(Executor):
 
 
 class Processes(Executor):
-    """An executor of further processes, which start at once, ignore Ctrl-C, and end with this process."""
+    """An executor of further processes, which start at once, ignore Ctrl-C, and end with this
+    process.
+    """
 
     def __init__(self, count: int, initializer: Callable[..., object], *arguments: Any) -> None:
-        """Each of `count` processes calls `initializer(*arguments)` first; it must be in an importable module."""
+        """Each of `count` processes calls `initializer(*arguments)` first; it must be in an
+        importable module.
+        """
         given = (os.getpid(), initializer, *arguments)
-        self._pool = ProcessPoolExecutor(count, initializer=_begin, initargs=given, env=_ENVIRONMENT)
+        self._pool = ProcessPoolExecutor(
+            count, initializer=_begin, initargs=given, env=_ENVIRONMENT
+        )
         with _ctrl_c_blocked(), naming_lost_work():
             self._pool.submit(_nothing)  # the first job starts all processes
 
@@ -124,7 +133,8 @@ def naming_lost_work() -> Iterator[None]:
         yield
     except BrokenProcessPool as error:
         raise WorkLost(
-            "a worker process was killed, probably because there is too little memory for so many workers"
+            "a worker process was killed, probably because there is too little memory for so "
+            "many workers"
         ) from error
 
 
@@ -135,8 +145,8 @@ def packed(shared: object) -> bytes:
     except Exception as error:  # of the user's own objects
         reason = " ".join(str(error).split())[:300]
         raise ValueError(
-            f"this cannot be sent to worker processes ({type(error).__name__}: {reason}); leave out objects of"
-            " this process, such as open files and locks, or use workers=1"
+            f"this cannot be sent to worker processes ({type(error).__name__}: {reason}); leave "
+            "out objects of this process, such as open files and locks, or use workers=1"
         ) from error
 
 

@@ -8,7 +8,9 @@ from shapepose_fg.core.compiled import kernel
 
 def lesser(value: Real | Whole) -> Mask:
     """(P, P) whether one has a smaller `value` (P,) than another; on a tie, the later one has."""
-    return (value[:, None] < value) | ((value[:, None] == value) & np.tri(len(value), k=-1, dtype=bool))
+    return (value[:, None] < value) | (
+        (value[:, None] == value) & np.tri(len(value), k=-1, dtype=bool)
+    )
 
 
 def match_best_first(left: Index, right: Index, score: Array) -> Index:

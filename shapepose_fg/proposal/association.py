@@ -22,8 +22,8 @@ depth, m."""
 _FAR_M = 0.25
 """Maximum distance of a detection from the projection of a placed joint, m."""
 _REACH_M = 0.6
-"""A joint whose place is not known yet is sought this far around its neighbours on the skeleton: no limb
-from a joint to the next is longer, the trunk aside."""
+"""A joint whose place is not known yet is sought this far around its neighbours on the skeleton: no
+limb from a joint to the next is longer, the trunk aside."""
 _PASSES = 2
 """Number of further passes, each with the neighbours that the last one assigned."""
 
@@ -56,7 +56,9 @@ def associate(
     return Observations.of(own, detections, places), int((~real).sum())
 
 
-def _claimed(places: Array, own: Index, detections: Detections, rig: Rig, skeleton: Skeleton) -> Index:
+def _claimed(
+    places: Array, own: Index, detections: Detections, rig: Rig, skeleton: Skeleton
+) -> Index:
     """Detections (P, J, V) assigned to people at `places` (P, J, 3), whose present ones are `own`
     (P, J, V).
     """
@@ -69,7 +71,11 @@ def _claimed(places: Array, own: Index, detections: Detections, rig: Rig, skelet
     (xy, depth), of = rig.project(places), near.detection[lost]
     beside, view = skeleton.tree_neighbours[detections.joint[of]], detections.view[of]
     at = view[:, None], near.person[lost][:, None], beside
-    away_m = np.linalg.norm(xy[at] - detections.xy[of][:, None], axis=-1) * depth[at] / rig.focal_px[view][:, None]
+    away_m = (
+        np.linalg.norm(xy[at] - detections.xy[of][:, None], axis=-1)
+        * depth[at]
+        / rig.focal_px[view][:, None]
+    )
     reachable[lost] = ((beside >= 0) & (away_m < _REACH_M)).any(axis=1)
     nearness = np.where(reachable, np.exp(-0.5 * near.distance_m**2 / _NEAR_M**2), -np.inf)
     rule = nearness, lost & reachable, LEAST_AFFINITY
@@ -83,7 +89,9 @@ def seen_twice(seen: Mask, skeleton: Skeleton) -> Mask:
     return (seen.sum(axis=2) >= 2)[:, list(skeleton.core)]
 
 
-def by_support(proposals: Proposals, candidates: Candidates, detections: Detections, views: int) -> Index:
+def by_support(
+    proposals: Proposals, candidates: Candidates, detections: Detections, views: int
+) -> Index:
     """(P, J, V) the detections that support each person's candidates, -1 for none."""
     of = np.full(len(candidates) + 1, -1, dtype=np.intp)
     own = np.full((*proposals.candidate.shape, views), -1, dtype=np.intp)

@@ -126,7 +126,9 @@ def triangulate_pairs(detections: Detections, rig: Rig, config: CandidateConfig)
     xy = rig.normalise(view, detections.xy)
     P = rig.cTw[view]
     rows = xy[:, :, None] * P[:, 2:3] - P[:, :2]
-    rays = np.einsum("dji,dj->di", P[:, :, :3], np.concatenate([xy, np.ones((len(view), 1))], axis=1))
+    rays = np.einsum(
+        "dji,dj->di", P[:, :, :3], np.concatenate([xy, np.ones((len(view), 1))], axis=1)
+    )
     seen = _Rays(view, xy, rays, np.linalg.norm(rays, axis=1), rows[..., :3].swapaxes(1, 2) @ rows)
     limits = 2.0 * config.gate_m, float(np.sin(np.deg2rad(config.min_angle_deg))), config.gate_m
     pair, xyz, count = np.empty((0, 2), dtype=np.intp), np.empty((0, 3)), 4 * len(view)
@@ -150,12 +152,15 @@ class _Rays(NamedTuple):
     length: Array
     """(D,) length of the ray's direction."""
     normal: Array
-    """(D, 3, 4) B^T (B, c), where (B, c) are the view's two rows of A: x P_3 - P_1 and y P_3 - P_2."""
+    """(D, 3, 4) B^T (B, c), where (B, c) are the view's two rows of A: x P_3 - P_1 and y P_3 -
+    P_2."""
 
     kinds = "i1 f2 f2 f1 f3"
 
 
-def vote(points: PairPoints, detections: Detections, views: int, config: CandidateConfig) -> Candidates:
+def vote(
+    points: PairPoints, detections: Detections, views: int, config: CandidateConfig
+) -> Candidates:
     """Cluster the points of each joint around the most confident ones (the paper's set S_i).
 
     As in the paper: pick the most confident point, add all neighbours within rho, remove them, and
@@ -163,7 +168,9 @@ def vote(points: PairPoints, detections: Detections, views: int, config: Candida
     """
     if len(points.xyz) == 0:
         none = np.zeros(0, dtype=np.intp)
-        return Candidates(np.zeros((0, 3)), none, np.zeros(0), none, none > 0, np.zeros((0, 2), dtype=np.intp))
+        return Candidates(
+            np.zeros((0, 3)), none, np.zeros(0), none, none > 0, np.zeros((0, 2), dtype=np.intp)
+        )
     seed = greedy_seeds(points, config.vote_radius_m)
     _, cluster = np.unique(seed, return_inverse=True)
     count = cluster.max() + 1
@@ -232,13 +239,21 @@ def _triangulate(order, stop, rays, cameras, centres, gap_m, least_sine, gate_m,
                 continue
             A, B = rays.normal[i], rays.normal[j]
             solved(
-                A[0, 0] + B[0, 0], A[0, 1] + B[0, 1], A[0, 2] + B[0, 2], A[1, 1] + B[1, 1], A[1, 2] + B[1, 2],
-                A[2, 2] + B[2, 2], -A[0, 3] - B[0, 3], -A[1, 3] - B[1, 3], -A[2, 3] - B[2, 3], x,
+                A[0, 0] + B[0, 0], A[0, 1] + B[0, 1], A[0, 2] + B[0, 2], A[1, 1] + B[1, 1],
+                A[1, 2] + B[1, 2], A[2, 2] + B[2, 2], -A[0, 3] - B[0, 3], -A[1, 3] - B[1, 3],
+                -A[2, 3] - B[2, 3], x,
             )  # fmt: skip
-            if _off_m(cameras[one], rays.xy[i], x) < gate_m and _off_m(cameras[other], rays.xy[j], x) < gate_m:
+            if (
+                _off_m(cameras[one], rays.xy[i], x) < gate_m
+                and _off_m(cameras[other], rays.xy[j], x) < gate_m
+            ):
                 if count < len(pair):
                     pair[count, 0], pair[count, 1] = i, j
-                    xyz[count, 0], xyz[count, 1], xyz[count, 2] = x[0], x[1], x[2]  # slicing compiles slowly
+                    xyz[count, 0], xyz[count, 1], xyz[count, 2] = (
+                        x[0],
+                        x[1],
+                        x[2],
+                    )  # slicing compiles slowly
                 count += 1
     return count
 

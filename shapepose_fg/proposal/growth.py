@@ -74,7 +74,9 @@ def link(candidates: Candidates, detections: Detections, config: GrowthConfig) -
     return Links(ends[plausible], (total - config.doubt * shared)[plausible])
 
 
-def grow(anchors: Index, candidates: Candidates, links: Links, skeleton: Skeleton, config: GrowthConfig) -> Index:
+def grow(
+    anchors: Index, candidates: Candidates, links: Links, skeleton: Skeleton, config: GrowthConfig
+) -> Index:
     """Choose a candidate per person and joint: (P, J), -1 where none is linked to the person.
 
     Joints are chosen outwards from the hip, level by level of the skeleton's tree; then `sweeps`
@@ -86,7 +88,8 @@ def grow(anchors: Index, candidates: Candidates, links: Links, skeleton: Skeleto
     chosen[:, skeleton.root] = anchors
     supported = candidates.support[:, 0]
     evidence = np.asarray(
-        config.view_weight * np.bincount(supported, candidates.score[supported], len(candidates)), dtype=np.float64
+        config.view_weight * np.bincount(supported, candidates.score[supported], len(candidates)),
+        dtype=np.float64,
     )
     both_ways = np.concatenate([links.ends, links.ends[:, ::-1]])
     score = np.concatenate([links.score, links.score])
@@ -164,10 +167,14 @@ def _support(chosen: Index, ends: Index, score: Array, count: int) -> Array:
     np.put_along_axis(has, chosen, True, axis=1)  # -1 sets the spare last column
     person, edge = np.nonzero(has[:, ends[:, 0]])
     key = person * count + ends[edge, 1]
-    return np.bincount(key, score[edge], len(chosen) * count).reshape(len(chosen), count).astype(float)
+    return (
+        np.bincount(key, score[edge], len(chosen) * count).reshape(len(chosen), count).astype(float)
+    )
 
 
-def _choose(chosen: Index, support: Array, evidence: Array, candidates: Candidates, joints: Index) -> None:
+def _choose(
+    chosen: Index, support: Array, evidence: Array, candidates: Candidates, joints: Index
+) -> None:
     """Set `chosen` for these joints to the best supported candidates, each for one person."""
     person, candidate = np.nonzero(support > 0)
     of_these = np.isin(candidates.joint[candidate], joints)

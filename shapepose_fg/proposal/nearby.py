@@ -123,7 +123,9 @@ class Nearby:
         mine, views = own[person, joint, view], len(sight.cameras)
         start, count = sight.begin[mine], sight.begin[mine + 1] - sight.begin[mine]
         whose = np.repeat(person, count)
-        tied = sight.other[np.arange(len(whose)) + np.repeat(start - np.cumsum(count) + count, count)]
+        tied = sight.other[
+            np.arange(len(whose)) + np.repeat(start - np.cumsum(count) + count, count)
+        ]
         lacks = unplaced[whose, sight.of_joint[tied]]
         key = np.unique(whose[lacks] * len(sight.of_view) + tied[lacks])
         whose, tied = np.divmod(key, max(len(sight.of_view), 1))
@@ -153,12 +155,20 @@ def nearby(places: Array, reach_m: Array, world: Index, sight: Sight) -> Nearby:
     distance_m = np.zeros(0)
     while count > room:
         room = count
-        person, detection, distance_m = np.empty(room, np.intp), np.empty(room, np.intp), np.empty(room)
-        count = find_near(places, reach_m, people, sight, first, begins, person, detection, distance_m)
+        person, detection, distance_m = (
+            np.empty(room, np.intp),
+            np.empty(room, np.intp),
+            np.empty(room),
+        )
+        count = find_near(
+            places, reach_m, people, sight, first, begins, person, detection, distance_m
+        )
     return Nearby(begins, person[:count], detection[:count], distance_m[:count])
 
 
-def own_affinity(person: Index, detection: Index, candidate: Index, sight: Sight) -> tuple[Array, Index]:
+def own_affinity(
+    person: Index, detection: Index, candidate: Index, sight: Sight
+) -> tuple[Array, Index]:
     """Mean affinity (N,) of each `detection` (N,) to the detections `candidate` (A, J, V) of
     `person` (N,) at the other ends of the joint's limbs, and their number (N,).
     """
@@ -182,7 +192,9 @@ def _limb_ends(skeleton: Skeleton) -> tuple[Index, Index, Mask]:
 def limbs_of(skeleton: Skeleton) -> Index:
     """(L, 2) limbs between core joints, and the spine; these occlude others."""
     core = set(skeleton.core)
-    return np.array([(skeleton.parents[j], j) for j in skeleton.core if skeleton.parents[j] in core])
+    return np.array(
+        [(skeleton.parents[j], j) for j in skeleton.core if skeleton.parents[j] in core]
+    )
 
 
 @kernel("f3 f2 i1", Sight, "i1 i1 i1 i1 f1")
@@ -229,7 +241,13 @@ def find_near(places, reach_m, people, sight, first, begins, person, detection, 
 @kernel("i1 i1 i3", Sight, "f1 i1")
 def tie(person, detection, own, sight, mean, neighbours):
     """Fill in the `mean` affinity (N,) and `neighbours` (N,) of `own_affinity`."""
-    of_joint, of_view, begin, other, value = sight.of_joint, sight.of_view, sight.begin, sight.other, sight.value
+    of_joint, of_view, begin, other, value = (
+        sight.of_joint,
+        sight.of_view,
+        sight.begin,
+        sight.other,
+        sight.value,
+    )
     limb, limb_ends = sight.limb, sight.limb_ends
     for e in range(len(person)):
         a, d = person[e], detection[e]
@@ -247,8 +265,8 @@ def tie(person, detection, own, sight, mean, neighbours):
 
 @kernel("i1 i1 i1 f1 b1 f0 i3 i1", Sight, "f1 f1 b1 f1 i1 i1 i3")
 def claim(
-    first, person, detection, nearness, lost, sure, own, world, sight, tied, score, likely, key, queue, taken,
-    chosen,
+    first, person, detection, nearness, lost, sure, own, world, sight, tied, score, likely, key,
+    queue, taken, chosen,
 ):  # fmt: skip
     """Fill in the results of `Nearby.claimed`; `key` and `queue` (N,) and `taken` (D,) are
     workspace.

@@ -46,7 +46,9 @@ def pooled(points: PairPoints, free: Mask, frame: Frame) -> PossiblePeople:
     owners, detections = owners[hypothesis], frame.detections
     confidence = np.zeros((group.max(initial=-1) + 1, places.shape[1]))
     grouped = np.flatnonzero(group >= 0)
-    np.add.at(confidence, (group[grouped], detections.joint[grouped]), detections.confidence[grouped])
+    np.add.at(
+        confidence, (group[grouped], detections.joint[grouped]), detections.confidence[grouped]
+    )
     has = np.isfinite(places[..., 0])
     different = _different(places, np.where(has, confidence[owners].sum(axis=1), 0.0).sum(axis=1))
     if len(different) == 0:
@@ -67,7 +69,9 @@ def _groups(free: Mask, frame: Frame) -> Index:
     tied = free[detections.pairs].all(axis=1) & (detections.affinity >= _LEAST_AFFINITY)
     tied = replace(detections, pairs=detections.pairs[tied], affinity=detections.affinity[tied])
     group = np.full(len(detections), -1, dtype=np.intp)
-    for number, members in enumerate(each for each in group_people(tied) if len(each) >= _LEAST_JOINTS):
+    for number, members in enumerate(
+        each for each in group_people(tied) if len(each) >= _LEAST_JOINTS
+    ):
         group[members] = number
     return group
 

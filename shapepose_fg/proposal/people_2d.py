@@ -31,7 +31,12 @@ def without_repeats(found: Detections) -> tuple[Detections, Index]:
     affinity = np.zeros(len(pairs))
     np.maximum.at(affinity, place, found.affinity)
     return Detections(
-        found.view[first], found.joint[first], found.xy[first], found.confidence[first], pairs, affinity
+        found.view[first],
+        found.joint[first],
+        found.xy[first],
+        found.confidence[first],
+        pairs,
+        affinity,
     ), first
 
 

@@ -73,7 +73,9 @@ def _spans(skeleton: Skeleton, longest_m: tuple[float, ...]) -> tuple[Index, Arr
         length = np.minimum(length, length[:, [over]] + length[over])
     near = np.argwhere((bones > 0) & (bones <= len(_STRETCH)) & (joints[:, None] > joints))
     first, second = near.T
-    return np.ascontiguousarray(near), np.array(_STRETCH)[bones[first, second] - 1] * length[first, second]
+    return np.ascontiguousarray(near), np.array(_STRETCH)[bones[first, second] - 1] * length[
+        first, second
+    ]
 
 
 @dataclass(frozen=True)
@@ -104,7 +106,9 @@ class PossiblePeople(Rows):
         return cls(np.zeros((*shape[:2], 3)), np.full(shape, -1, dtype=np.intp), np.zeros(shape))
 
 
-def settled(places: Array, own: Index, frame: Frame, passes: int, *, exclusive: bool = False) -> PossiblePeople:
+def settled(
+    places: Array, own: Index, frame: Frame, passes: int, *, exclusive: bool = False
+) -> PossiblePeople:
     """Alternate assignment of detections and triangulation, `passes` times, starting at `places`
     (H, J, 3) with detections `own` (H, J, V), -1 for none.
 
@@ -151,7 +155,9 @@ def triangulated(chosen: Index, frame: Frame) -> tuple[Array, Array]:
     """
     places, gap_m = np.full((*chosen.shape[:2], 3), np.nan), np.full(chosen.shape, np.nan)
     confidence = frame.detections.confidence
-    _triangulate(chosen, frame.rays, confidence, frame.rig.centres, np.empty(chosen.shape[2]), places, gap_m)
+    _triangulate(
+        chosen, frame.rays, confidence, frame.rig.centres, np.empty(chosen.shape[2]), places, gap_m
+    )
     return places, gap_m
 
 
@@ -188,7 +194,11 @@ def _nearest(chosen, rays, weight, centres, place):
             along = x * a + y * b + z * c
             xx, yy, zz = xx + w * (1 - x * x), yy + w * (1 - y * y), zz + w * (1 - z * z)
             xy, xz, yz = xy - w * x * y, xz - w * x * z, yz - w * y * z
-            px, py, pz = px + w * (a - along * x), py + w * (b - along * y), pz + w * (c - along * z)
+            px, py, pz = (
+                px + w * (a - along * x),
+                py + w * (b - along * y),
+                pz + w * (c - along * z),
+            )
     solved(xx, xy, xz, yy, yz, zz, px, py, pz, place)
 
 
@@ -251,4 +261,6 @@ def sizes(part: Index) -> Index:
     """(H, J) number of joints of each component of `connected`, at the component's number."""
     people, joints = part.shape
     row, column = np.nonzero(part >= 0)
-    return np.bincount(row * joints + part[row, column], minlength=people * joints).reshape(people, joints)
+    return np.bincount(row * joints + part[row, column], minlength=people * joints).reshape(
+        people, joints
+    )

@@ -102,7 +102,11 @@ class Proposals:
 
 
 def propose(
-    candidates: Candidates, detections: Detections, skeleton: Skeleton, up: Array, config: ProposalConfig
+    candidates: Candidates,
+    detections: Detections,
+    skeleton: Skeleton,
+    up: Array,
+    config: ProposalConfig,
 ) -> Proposals:
     """Find the people of a frame: anchors at root candidates, checked by their boxes, then grown.
 
@@ -111,7 +115,13 @@ def propose(
     is the (3,) unit vector upwards. Two people do not share a candidate.
     """
     search = Search(
-        candidates, link(candidates, detections, config.growth), detections, skeleton, up, config, Counter()
+        candidates,
+        link(candidates, detections, config.growth),
+        detections,
+        skeleton,
+        up,
+        config,
+        Counter(),
     )
     roots = candidates.joint == skeleton.root
     anchors = search.anchors(np.flatnonzero(roots & candidates.strong), np.zeros(0, dtype=np.intp))
@@ -129,7 +139,9 @@ def propose(
     places = np.full((*chosen.shape, 3), np.nan)
     places[chosen >= 0] = search.candidates.xyz[chosen[chosen >= 0]]
     score = search.boxes(anchors)[1]
-    return Proposals(np.where(chosen < len(candidates), chosen, -1), places, score, dict(search.dropped))
+    return Proposals(
+        np.where(chosen < len(candidates), chosen, -1), places, score, dict(search.dropped)
+    )
 
 
 @dataclass(frozen=True)
@@ -154,7 +166,9 @@ class Search:
         anchors = roots[enough & confident]
         kept = standing_apart(anchors, taken, self.candidates, self.detections, self.config)
         self.dropped["hip seen as a better one's"] += len(anchors) - len(kept)
-        self.dropped["more people than are looked for"] += max(0, len(kept) - self.config.most_people)
+        self.dropped["more people than are looked for"] += max(
+            0, len(kept) - self.config.most_people
+        )
         kept = kept[: self.config.most_people]
         self.dropped["too few parts in the box"] += int((~enough).sum())
         self.dropped["low confidence"] += int((enough & ~confident).sum())
@@ -241,17 +255,25 @@ class Search:
             np.concatenate([candidates.xyz, (candidates.xyz[first] + candidates.xyz[second]) / 2]),
             np.append(candidates.joint, np.full(len(first), self.skeleton.root)),
             np.append(candidates.score, (candidates.score[first] + candidates.score[second]) / 2),
-            np.append(candidates.votes, np.minimum(candidates.votes[first], candidates.votes[second])),
+            np.append(
+                candidates.votes, np.minimum(candidates.votes[first], candidates.votes[second])
+            ),
             np.append(candidates.strong, np.zeros(len(first), dtype=bool)),
             np.concatenate([candidates.support, *from_first]),
         )
         ends = np.stack([np.tile(middle, 2), np.concatenate([first, second])], axis=1)
-        links = Links(np.concatenate([self.links.ends, ends]), np.append(self.links.score, np.ones(len(ends))))
+        links = Links(
+            np.concatenate([self.links.ends, ends]), np.append(self.links.score, np.ones(len(ends)))
+        )
         return replace(self, candidates=more, links=links)
 
 
 def standing_apart(
-    anchors: Index, taken: Index, candidates: Candidates, detections: Detections, config: ProposalConfig
+    anchors: Index,
+    taken: Index,
+    candidates: Candidates,
+    detections: Detections,
+    config: ProposalConfig,
 ) -> Index:
     """Non-maximum suppression: `anchors` apart from better ones and from `taken`, best first.
 
@@ -261,15 +283,21 @@ def standing_apart(
     both = np.concatenate([taken, anchors])
     views = int(detections.view.max(initial=0)) + 1
     made_of = np.full((len(candidates), views), -1, dtype=np.intp)
-    made_of[candidates.support[:, 0], detections.view[candidates.support[:, 1]]] = candidates.support[:, 1]
+    made_of[candidates.support[:, 0], detections.view[candidates.support[:, 1]]] = (
+        candidates.support[:, 1]
+    )
     made_of = made_of[both]
-    weight = np.where(made_of >= 0, detections.confidence[made_of] if len(detections) > 0 else 0.0, 0.0)
+    weight = np.where(
+        made_of >= 0, detections.confidence[made_of] if len(detections) > 0 else 0.0, 0.0
+    )
     distance = np.linalg.norm(candidates.xyz[both, None] - candidates.xyz[both][None], axis=-1)
     open_ = np.ones(len(both), dtype=bool)
     kept = []
     while open_.any():  # a few iterations
         waiting = np.flatnonzero(open_[: len(taken)])
-        best = waiting[0] if len(waiting) > 0 else np.where(open_, weight.sum(axis=1), -1.0).argmax()
+        best = (
+            waiting[0] if len(waiting) > 0 else np.where(open_, weight.sum(axis=1), -1.0).argmax()
+        )
         kept.append(best)
         weight[made_of == made_of[best]] = 0.0
         open_ &= distance[best] >= config.separation_m

@@ -83,7 +83,9 @@ class Evidence:
         whose, which = np.ascontiguousarray(np.nonzero(has)[0]), chosen[has]
         affinity, neighbours = own_affinity(whose, which, chosen, frame.sight)
         near = np.exp(-0.5 * (np.nan_to_num(people.gap_m[has], posinf=1.0) / _GAP_M) ** 2)
-        worth[has] = detections.confidence[which] * np.where(neighbours > 0, affinity, LEAST_AFFINITY) * near
+        worth[has] = (
+            detections.confidence[which] * np.where(neighbours > 0, affinity, LEAST_AFFINITY) * near
+        )
         xy, depth = frame.rig.project(people.places)
         size = frame.rig.image_sizes[:, None, None]
         inside = np.moveaxis((depth > 0) & ((xy >= 0) & (xy < size)).all(axis=-1), 0, 2)
@@ -121,7 +123,9 @@ def _bones(people: PossiblePeople, frame: Frame) -> Array:
     phantoms = np.exp(-0.5 * ((off - _PHANTOMS_SHIFT) / _PHANTOMS_SPREAD) ** 2) / _PHANTOMS_SPREAD
     # Far from both distributions `mine` vanishes, and `_ASTRAY` bounds the ratio.
     ratio = (1 - _ASTRAY) * mine / np.maximum(phantoms, 1e-300) + _ASTRAY
-    return np.asarray(_BONE * np.log(ratio).sum(axis=1, where=known) - _BROKEN * broken, dtype=np.float64)
+    return np.asarray(
+        _BONE * np.log(ratio).sum(axis=1, where=known) - _BROKEN * broken, dtype=np.float64
+    )
 
 
 def probability(score: Array, prior: float = _PRIOR) -> Array:
@@ -165,7 +169,11 @@ def _greedy(
         new = pool.rows(best)
         taken[new.chosen[new.chosen >= 0]] = True
         whole = _whole(new.places[0], people.places, frame)
-        people = PossiblePeople.concatenate([people, new]) if whole is None else people.completed(whole, new)
+        people = (
+            PossiblePeople.concatenate([people, new])
+            if whole is None
+            else people.completed(whole, new)
+        )
     return None if people is before else people
 
 

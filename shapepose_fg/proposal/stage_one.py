@@ -43,7 +43,9 @@ class StageOne:
 
     def of_few(self) -> "StageOne":
         """Return `by_hips` for a search for few people: fewer points and candidates are kept."""
-        few = replace(self.candidates, most_points=_POINTS_OF_FEW, most_candidates=_CANDIDATES_OF_FEW)
+        few = replace(
+            self.candidates, most_points=_POINTS_OF_FEW, most_candidates=_CANDIDATES_OF_FEW
+        )
         return replace(self.by_hips(), candidates=few)
 
     def of_the_rest(self) -> "StageOne":
@@ -77,9 +79,14 @@ class StageOne:
     def _by_hips(self, detections: Detections, rig: Rig) -> Observations:
         """The variant of the paper: votes, hips as anchors, and joints linked to them."""
         points, skeleton, book = self._points(detections, rig), self.skeleton, self.book
-        if not np.isin(points.joint, skeleton.root).any() and not np.isin(skeleton.hips, points.joint).all():
+        if (
+            not np.isin(points.joint, skeleton.root).any()
+            and not np.isin(skeleton.hips, points.joint).all()
+        ):
             return Observations.of(
-                np.full((0, len(skeleton), len(rig)), -1), detections, np.zeros((0, len(skeleton), 3))
+                np.full((0, len(skeleton), len(rig)), -1),
+                detections,
+                np.zeros((0, len(skeleton), 3)),
             )
         with book.stage("vote"):
             every = vote(points, detections, len(rig), self.candidates)
@@ -88,7 +95,12 @@ class StageOne:
         with book.stage("propose"):
             proposals = propose(candidates, detections, skeleton, rig.up_vector, self.proposals)
         with book.stage("associate"):
-            observations, phantoms = associate(proposals, candidates, detections, rig, skeleton, self.proposals)
-        for reason, count in (*proposals.dropped.items(), ("hardly any joint seen by two views", phantoms)):
+            observations, phantoms = associate(
+                proposals, candidates, detections, rig, skeleton, self.proposals
+            )
+        for reason, count in (
+            *proposals.dropped.items(),
+            ("hardly any joint seen by two views", phantoms),
+        ):
             book.drop(reason, count)
         return observations

@@ -52,7 +52,9 @@ def thinned(every: Detections, rig: Rig, config: CandidateConfig) -> tuple[Detec
     kept = kept_detections(found, len(rig), config)
     found = without_faults(found if kept is None else found.only(kept), rig)
     order = np.lexsort(found.pairs.T)
-    return replace(found, pairs=found.pairs[order], affinity=found.affinity[order]), kept is not None
+    return replace(
+        found, pairs=found.pairs[order], affinity=found.affinity[order]
+    ), kept is not None
 
 
 def kept_detections(detections: Detections, views: int, config: CandidateConfig) -> Mask | None:
@@ -77,7 +79,9 @@ def thinned_points(points: PairPoints, config: CandidateConfig) -> PairPoints:
     return PairPoints(points.xyz[keep], points.joint[keep], points.pair[keep], points.score[keep])
 
 
-def thinned_candidates(candidates: Candidates, detections: Detections, config: CandidateConfig) -> Candidates:
+def thinned_candidates(
+    candidates: Candidates, detections: Detections, config: CandidateConfig
+) -> Candidates:
     """At most `config.most_candidates` candidates per joint, fewer if there are too many links.
 
     Strong ones are kept first, then those with most votes and confidence.
@@ -108,8 +112,13 @@ def _with_most(candidates: Candidates, most: int) -> Candidates:
     keep = _best(candidates.joint, most, (-candidates.score, -candidates.votes, ~candidates.strong))
     place = np.cumsum(keep) - 1
     support = candidates.support[keep[candidates.support[:, 0]]]
-    columns = {name: getattr(candidates, name)[keep] for name in ("xyz", "joint", "score", "votes", "strong")}
-    return replace(candidates, **columns, support=np.column_stack([place[support[:, 0]], support[:, 1]]))
+    columns = {
+        name: getattr(candidates, name)[keep]
+        for name in ("xyz", "joint", "score", "votes", "strong")
+    }
+    return replace(
+        candidates, **columns, support=np.column_stack([place[support[:, 0]], support[:, 1]])
+    )
 
 
 def _best(group: Index, most: int, order: tuple[NDArray[Any], ...]) -> Mask:

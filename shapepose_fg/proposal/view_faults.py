@@ -82,7 +82,9 @@ def doubled(found: Detections, rig: Rig) -> Mask:
     has = np.isfinite(xy[..., 0]).sum(axis=1)
     enough = common >= np.maximum(_LEAST_JOINTS, np.minimum(has[one], has[other]) / 2)
     median = apart[np.arange(len(one)), np.maximum(common - 1, 0) // 2]
-    same = enough & (median < np.maximum(_SAME * np.minimum(size[one], size[other]), least[view[one]]))
+    same = enough & (
+        median < np.maximum(_SAME * np.minimum(size[one], size[other]), least[view[one]])
+    )
     gone = np.zeros(len(groups), dtype=bool)
     for kept, twin in zip(one[same].tolist(), other[same].tolist(), strict=True):
         gone[twin] |= not gone[kept]

@@ -66,7 +66,9 @@ class Residuals:
     """(N,) part of the recording, 0 to K - 1; cameras may have another rotation in each."""
 
     @classmethod
-    def of(cls, seen: tuple[Array, Array, Array], views: Views, person: Index, part: Index) -> "Residuals":
+    def of(
+        cls, seen: tuple[Array, Array, Array], views: Views, person: Index, part: Index
+    ) -> "Residuals":
         """Build residuals from the arrays of `observed`. Robust weights use each residual's
         deviation from its median over the person's frames.
         """
@@ -113,13 +115,19 @@ class Residuals:
         return np.concatenate([cameras, directions.reshape(-1, 3)])
 
     def marginals(
-        self, views: Views, levels: Sequence[float] = LEVELS, shift: float = SHIFT, larger: float = LARGER
+        self,
+        views: Views,
+        levels: Sequence[float] = LEVELS,
+        shift: float = SHIFT,
+        larger: float = LARGER,
     ) -> list[Marginal]:
         """Marginal likelihoods around the cameras `views` for each size of biases: `levels`, each
         with all of `COMMON`.
         """
         information = self._information(views)
-        return [each for n in levels for each in self._marginals(information, n, shift * n, larger * n)]
+        return [
+            each for n in levels for each in self._marginals(information, n, shift * n, larger * n)
+        ]
 
     def _rows(self, views: Views) -> Array:
         """(N, J, 2 V, n) derivatives by cameras, the joint's bias and the scaling, and residuals.
@@ -142,7 +150,9 @@ class Residuals:
         of_cameras = by_parameters(projected, at, by_point, views)
         for v in range(V):
             rows[:, :, v, :, v * Q : v * Q + Q] = of_cameras[:, :, v]
-            rows[:, :, v, :, bias + 2 * v : bias + 2 * v + 2] = np.eye(2) * self.size_px[:, None, v, None, None]
+            rows[:, :, v, :, bias + 2 * v : bias + 2 * v + 2] = (
+                np.eye(2) * self.size_px[:, None, v, None, None]
+            )
             rows[:, :, v, :, bias + 2 * V + v] = self.xy[:, :, v] - middle[:, None, v]
         rows[..., -1:] = self.xy[..., None] - projected[..., None]
         rows = (rows * root).reshape(N, J, 2 * V, -1)
@@ -156,15 +166,21 @@ class Residuals:
         found = np.zeros((_count(self.person), J, *[V * (Q - 3 + 3 * K) + 3 * V + 1] * 2))
         for person, part in sorted({*zip(self.person.tolist(), self.part.tolist(), strict=True)}):
             mine = (
-                rows[(self.person == person) & (self.part == part)].swapaxes(0, 1).reshape(J, -1, rows.shape[-1])
+                rows[(self.person == person) & (self.part == part)]
+                .swapaxes(0, 1)
+                .reshape(J, -1, rows.shape[-1])
             )
             turn, rest = Q - 3 + 3 * part + np.arange(3), np.arange(Q - 3)
-            cameras = (np.arange(V)[:, None] * (Q - 3 + 3 * K) + np.concatenate([turn, rest])).ravel()
+            cameras = (
+                np.arange(V)[:, None] * (Q - 3 + 3 * K) + np.concatenate([turn, rest])
+            ).ravel()
             at = np.concatenate([cameras, V * (Q - 3 + 3 * K) + np.arange(3 * V + 1)])
             found[person][:, at[:, None], at] += mine.swapaxes(1, 2) @ mine
         return found
 
-    def _marginals(self, information: Array, level: float, shift: float, larger: float) -> list[Marginal]:
+    def _marginals(
+        self, information: Array, level: float, shift: float, larger: float
+    ) -> list[Marginal]:
         """Marginals for each of `COMMON`, with biases of these standard deviations."""
         P, J, _, V = *information.shape[:3], self.size_px.shape[1]
         C = V * (Q - 3 + 3 * self.parts)
@@ -199,7 +215,9 @@ class Residuals:
             rest = total[common:, common:] - total[common:, :common] @ np.linalg.solve(
                 known, total[:common, common:]
             )
-            likely = log - 0.5 * float(np.linalg.slogdet(known * (ratio * level) ** 2)[1] + rest[-1, -1])
+            likely = log - 0.5 * float(
+                np.linalg.slogdet(known * (ratio * level) ** 2)[1] + rest[-1, -1]
+            )
             found.append(Marginal(rest[:-1, :-1], rest[:-1, -1], likely))
         return found
 

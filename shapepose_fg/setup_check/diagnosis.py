@@ -69,8 +69,13 @@ def _same_detections(evidence: Evidence, rig: Rig, first: int, second: int) -> b
     if min(len(one), len(other)) < 5:
         return False
     i, j = same_frame(one.frame, other.frame)
-    raw = [rig.cameras[view].distort(seen.xy.reshape(-1, 2)) for seen, view in ((one, first), (other, second))]
-    distance = np.linalg.norm(raw[0].reshape(one.xy.shape)[i] - raw[1].reshape(other.xy.shape)[j], axis=-1)
+    raw = [
+        rig.cameras[view].distort(seen.xy.reshape(-1, 2))
+        for seen, view in ((one, first), (other, second))
+    ]
+    distance = np.linalg.norm(
+        raw[0].reshape(one.xy.shape)[i] - raw[1].reshape(other.xy.shape)[j], axis=-1
+    )
     there = ~np.isnan(distance)
     alike = (there & (distance < _SAME_PX)).sum(axis=1) >= 0.9 * np.maximum(there.sum(axis=1), 1)
     alike &= there.sum(axis=1) >= 3
@@ -83,7 +88,9 @@ def other_sizes(given: Sequence[str], rig: Rig) -> tuple[Finding, ...]:
     """
     return _unlike(
         {
-            name: glance(path)[0] if path.suffix.lower() in VIDEOS and path.is_file() else open_footage(path).size
+            name: glance(path)[0]
+            if path.suffix.lower() in VIDEOS and path.is_file()
+            else open_footage(path).size
             for name, path in zip(rig.names, find_footage(given, rig.names)[0], strict=True)
         },
         rig,
@@ -94,7 +101,9 @@ def detected_sizes(file: Path, rig: Rig) -> tuple[Finding, ...]:
     """Cameras for which `detect` was given another calibrated size, according to its
     footage.json.
     """
-    return _unlike({each.name: each.placement.calibrated_size for each in read_used_footage(file)}, rig)
+    return _unlike(
+        {each.name: each.placement.calibrated_size for each in read_used_footage(file)}, rig
+    )
 
 
 def _unlike(sizes: Mapping[str, tuple[int, int]], rig: Rig) -> tuple[Finding, ...]:
@@ -199,7 +208,9 @@ class Diagnosis:
     """Cameras that a reconstruction should exclude or doubt."""
 
 
-def put_right(detections: DetectionSequence, rig: Rig, frames: range) -> tuple[Look, Look, list[Finding]]:
+def put_right(
+    detections: DetectionSequence, rig: Rig, frames: range
+) -> tuple[Look, Look, list[Finding]]:
     """The set-up as given, with gross mistakes of cameras corrected, and these mistakes."""
     evidence = gather(detections, frames, len(rig))
     given = Look.given(evidence, rig)
@@ -209,7 +220,11 @@ def put_right(detections: DetectionSequence, rig: Rig, frames: range) -> tuple[L
         given if evidence is given.evidence else replace(given, evidence=evidence)
     )  # the duplicates found remain in the scores
     rng, enough = np.random.default_rng(0), len(rig) > 1 and len(look.sightings) >= MIN_SIGHTINGS
-    while enough and len(findings) < _MOST_FINDINGS and (change := mistake_of_cameras(look, rng)) is not None:
+    while (
+        enough
+        and len(findings) < _MOST_FINDINGS
+        and (change := mistake_of_cameras(look, rng)) is not None
+    ):
         findings.append(change.finding)
         look = change.look
     return given, look, findings
@@ -223,13 +238,17 @@ def diagnose(detections: DetectionSequence, rig: Rig, frames: range | None = Non
         return Diagnosis(tuple(findings), given, look)
     if len(look.groups()) < MIN_SIGHTINGS // 2:
         none = look.cameras_used > 1 and len(look.groups()) < _NOBODY * len(look.sightings)
-        findings += _nobody(look) if none else _unfit(look, {view for f in findings for view in f.cameras})
+        findings += (
+            _nobody(look) if none else _unfit(look, {view for f in findings for view in f.cameras})
+        )
         trust = trust_of(findings, given, look, frames)
         return Diagnosis(tuple(findings), given, look, trust=trust)
     problem = Problem.of(look)
     remaining = lags(refined := replace(look, views=problem.relaxed()))
     for _ in range(_MOST_FINDINGS):
-        late = [view for view, lag in enumerate(remaining) if abs(lag.frames) >= 2 and lag.is_offset]
+        late = [
+            view for view, lag in enumerate(remaining) if abs(lag.frames) >= 2 and lag.is_offset
+        ]
         if len(late) == 0:
             break
         view = max(late, key=lambda view: remaining[view].gain)
@@ -246,7 +265,9 @@ def diagnose(detections: DetectionSequence, rig: Rig, frames: range | None = Non
     findings += [*(small if look.cameras_used > 2 else []), *unfit]
     build = build_of(refined.structure()[1].points, detections.skeleton)
     order = order_of_joints(detections, refined)
-    findings += order or _of_people(build, rig)  # with wrong joints, unit and up axis cannot be tested
+    findings += order or _of_people(
+        build, rig
+    )  # with wrong joints, unit and up axis cannot be tested
     trust = trust_of(findings, given, refined, frames)
     return Diagnosis(tuple(findings), given, look, tuple(remaining), build, tuple(biased), trust)
 
@@ -279,7 +300,10 @@ def _blind(look: Look) -> list[Finding]:
 def _stopped(look: Look) -> list[Finding]:
     """Cameras with repeated pictures."""
     share = look.evidence.stopped
-    return [Finding(Kind.STOPPED, (v,), float(share[v])) for v in np.flatnonzero(share >= _STOPPED).tolist()]
+    return [
+        Finding(Kind.STOPPED, (v,), float(share[v]))
+        for v in np.flatnonzero(share >= _STOPPED).tolist()
+    ]
 
 
 def _nobody(look: Look) -> list[Finding]:
@@ -324,7 +348,9 @@ def _small_findings(problem: Problem, known: set[int]) -> tuple[list[Finding], l
         if guilt > SURE * (1 - nothing) or nothing > 1 - SURE or len(biased) == _MOST_BIASED:
             break
         (person, bias), camera = next(each for each in told if each[0] >= 0), one_of(of_cameras)
-        instead = tuple(each for each in (replace(camera, instead=()), *camera.instead) if each.sure > 1 - SURE)
+        instead = tuple(
+            each for each in (replace(camera, instead=()), *camera.instead) if each.sure > 1 - SURE
+        )
         biased.append(replace(bias, sure=1 - guilt - nothing, instead=instead))
         problem = replace(problem, biased=(*problem.biased, (person, *bias.cameras)))
     of_cameras = [each for each in of_cameras if known.isdisjoint(each.cameras)]
@@ -332,7 +358,9 @@ def _small_findings(problem: Problem, known: set[int]) -> tuple[list[Finding], l
         return [], biased
     found = one_of(of_cameras)
     size, least = (
-        (found.amount, _LEAST_DEG) if found.kind != Kind.FOCAL else (abs(np.log(found.amount)), _LEAST_FOCAL)
+        (found.amount, _LEAST_DEG)
+        if found.kind != Kind.FOCAL
+        else (abs(np.log(found.amount)), _LEAST_FOCAL)
     )
     return ([found] if size > least or found.kind == Kind.MOVED else []), biased
 

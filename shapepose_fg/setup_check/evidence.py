@@ -76,15 +76,25 @@ def gather(detections: DetectionSequence, frames: range, views: int) -> Evidence
     if count <= _WHOLE:
         wanted = np.arange(frames.start, frames.stop)
         most = min(MOST_LAG, count // 4)
-        spread = np.unique(np.linspace(frames.start, frames.stop - 1, min(count, ANCHORS)).astype(np.intp))
+        spread = np.unique(
+            np.linspace(frames.start, frames.stop - 1, min(count, ANCHORS)).astype(np.intp)
+        )
     else:
         most = MOST_LAG
-        spread = np.unique(np.linspace(frames.start + most, frames.stop - 1 - most, ANCHORS).astype(np.intp))
-        if sum(len(detections[t]) > 0 for t in spread.tolist()) < ANCHORS // 4:  # people are present only at times
-            there = np.array([t for t in frames if len(detections[t]) > 0] or [frames.start], dtype=np.intp)
+        spread = np.unique(
+            np.linspace(frames.start + most, frames.stop - 1 - most, ANCHORS).astype(np.intp)
+        )
+        if (
+            sum(len(detections[t]) > 0 for t in spread.tolist()) < ANCHORS // 4
+        ):  # people are present only at times
+            there = np.array(
+                [t for t in frames if len(detections[t]) > 0] or [frames.start], dtype=np.intp
+            )
             spread = there[np.unique(np.linspace(0, len(there) - 1, ANCHORS).astype(np.intp))]
         around = spread[:: max(1, ANCHORS // _LAG_ANCHORS)]
-        wanted = np.unique(np.concatenate([spread, *(np.arange(t - most, t + most + 1) for t in around)]))
+        wanted = np.unique(
+            np.concatenate([spread, *(np.arange(t - most, t + most + 1) for t in around)])
+        )
         wanted = wanted[(wanted >= frames.start) & (wanted < frames.stop)]
     pictures, stopped = WithoutRepeats(detections, views), np.zeros(views)
     sightings = Sightings.of(pictures, wanted.tolist())
@@ -108,7 +118,8 @@ class Structure:
     """Triangulated joints: P people, J joints, V cameras."""
 
     points: Array
-    """(P, J, 3) in the world, the calibration's unit; NaN where fewer than two cameras saw a joint."""
+    """(P, J, 3) in the world, the calibration's unit; NaN where fewer than two cameras saw a
+    joint."""
     xy: Array
     """(P, J, V, 2) detections, undistorted pixels; NaN where there is none."""
     miss_px: Array
@@ -133,17 +144,24 @@ def observed(groups: Groups, sightings: Sightings) -> tuple[Array, Array, Array]
     return np.moveaxis(xy, 1, 2), np.moveaxis(confidence, 1, 2), size
 
 
-def triangulate(xy: Array, confidence: Array, size: Array, views: Views, steps: int = _STEPS) -> Structure:
+def triangulate(
+    xy: Array, confidence: Array, size: Array, views: Views, steps: int = _STEPS
+) -> Structure:
     """Robust triangulation of the arrays of `observed`, two or more views: linear, then reweighted
     Gauss-Newton.
     """
     seen = ~np.isnan(xy[..., 0])
-    prior = np.where(seen, confidence, 0.0) / (KERNEL * np.where(np.isnan(size), 1.0, size)[:, None]) ** 2
+    prior = (
+        np.where(seen, confidence, 0.0)
+        / (KERNEL * np.where(np.isnan(size), 1.0, size)[:, None]) ** 2
+    )
     prior = np.where((seen.sum(axis=-1) >= 2)[..., None], prior, 0.0)
     xy, prior = np.ascontiguousarray(xy), np.ascontiguousarray(prior)
     points = np.empty((*prior.shape[:2], 3))
     miss_px, depth, weight = (np.empty(prior.shape) for _ in range(3))
-    _triangulate(xy, prior, views.K @ views.cTw, views.focal[0], steps, points, miss_px, depth, weight)
+    _triangulate(
+        xy, prior, views.K @ views.cTw, views.focal[0], steps, points, miss_px, depth, weight
+    )
     return Structure(points, xy, miss_px, depth, size, weight)
 
 
@@ -171,7 +189,9 @@ def _triangulate(
             for v in range(views):
                 seen += prior[p, j, v] > 0
             if seen >= 2:
-                triangulated(cameras, focal, xy[p, j], prior[p, j], math.inf, math.inf, -math.inf, room, x)
+                triangulated(
+                    cameras, focal, xy[p, j], prior[p, j], math.inf, math.inf, -math.inf, room, x
+                )
             for step in range(steps + 1):
                 for i in range(3):
                     b[i] = A[i, 0] = A[i, 1] = A[i, 2] = 0.0
@@ -188,7 +208,18 @@ def _triangulate(
                     least = 1e-9 * (A[0, 0] + A[1, 1] + A[2, 2]) + 1e-300
                     for i in range(3):
                         A[i, i] += least
-                    solved(A[0, 0], A[0, 1], A[0, 2], A[1, 1], A[1, 2], A[2, 2], b[0], b[1], b[2], step_m)
+                    solved(
+                        A[0, 0],
+                        A[0, 1],
+                        A[0, 2],
+                        A[1, 1],
+                        A[1, 2],
+                        A[2, 2],
+                        b[0],
+                        b[1],
+                        b[2],
+                        step_m,
+                    )
                     for i in range(3):
                         x[i] -= step_m[i]
             points[p, j, 0], points[p, j, 1], points[p, j, 2] = x[0], x[1], x[2]
@@ -229,7 +260,8 @@ class Look:
         xy, confidence, new = every.xy.copy(), every.confidence.copy(), change(every.rows(mine))
         xy[mine], confidence[mine] = new.xy, new.confidence
         return replace(
-            self, evidence=replace(self.evidence, sightings=replace(every, xy=xy, confidence=confidence))
+            self,
+            evidence=replace(self.evidence, sightings=replace(every, xy=xy, confidence=confidence)),
         )
 
     def later(self, view: int, frames: int) -> "Look":
@@ -292,7 +324,9 @@ class Look:
         views = range(self.view_count)
         if self.cameras_used < 3:
             return np.full(self.view_count, self._pair_score)
-        return np.array([match(self.others(v), self.seen_by(v), self.camera(v)).score for v in views])
+        return np.array(
+            [match(self.others(v), self.seen_by(v), self.camera(v)).score for v in views]
+        )
 
     def beside_biases(self, view: int) -> float:
         """Score of a camera for the others' people, as `Match.score`, corrected for persistent

@@ -36,11 +36,15 @@ def trust_of(findings: Sequence[Finding], given: Look, right: Look, frames: rang
             continue
         if each.kind == Kind.DUPLICATE:
             views = (min(each.cameras[::-1], key=lambda view: given.scores[view] - 1e-6 * view),)
-        first, last = (end if said is None else said for said, end in zip(each.frames, whole, strict=True))
+        first, last = (
+            end if said is None else said for said, end in zip(each.frames, whole, strict=True)
+        )
         if given.cameras_used == 2 or len(views) >= given.cameras_used:  # the culprit is unknown
             return Trust(doubted=tuple((view, first, last) for view in range(given.view_count)))
         sure = each.kind in (Kind.UNFIT, Kind.DUPLICATE)
-        wrong += [(v, first, last) for v in views if sure or _worse(given, right, v, range(first, last))]
+        wrong += [
+            (v, first, last) for v in views if sure or _worse(given, right, v, range(first, last))
+        ]
     seeing = set(np.unique(given.sightings.view).tolist())
     if doubted or (len(wrong) > 0 and len(seeing - {view for view, _, _ in wrong}) < 2):
         everybody = tuple((view, frames.start, frames.stop) for view in range(given.view_count))
@@ -55,6 +59,7 @@ def _worse(given: Look, right: Look, view: int, frames: range) -> bool:
     others = right.others(view)
     others = others.rows((others.frame >= frames.start) & (others.frame < frames.stop))
     was, now = (
-        match(others, look.seen_by(view, every_frame=True), look.camera(view)).score for look in (given, right)
+        match(others, look.seen_by(view, every_frame=True), look.camera(view)).score
+        for look in (given, right)
     )
     return now - was > _WORSE

@@ -81,7 +81,9 @@ def one_of(found: Sequence[Finding]) -> Finding:
         what = each.kind, each.cameras
         sure[what] = sure.get(what, 0.0) + each.sure
         first.setdefault(what, each)
-    told = sorted((replace(first[what], sure=p) for what, p in sure.items()), key=lambda each: -each.sure)
+    told = sorted(
+        (replace(first[what], sure=p) for what, p in sure.items()), key=lambda each: -each.sure
+    )
     return replace(told[0], instead=tuple(each for each in told[1:] if each.sure >= 1 - SURE))
 
 
@@ -103,7 +105,9 @@ def _words(finding: Finding, rig: Rig) -> str:
     shifts = [_shift(x, y) for x, y in finding.shift_px]
     count = abs(round(amount))
     return (words if isinstance(words, str) else words(finding, max(width, height))).format(
-        who="all cameras" if all_of_them else " and ".join(filter(None, (", ".join(names[:-1]), *names[-1:]))),
+        who="all cameras"
+        if all_of_them
+        else " and ".join(filter(None, (", ".join(names[:-1]), *names[-1:]))),
         first=names[0] if names else "",
         second=names[-1] if names else "",
         sees="sees" if len(names) == 1 else "see",
@@ -138,12 +142,15 @@ def _turned(finding: Finding, side_px: int) -> str:
 
 
 def _principal_point(finding: Finding, side_px: int) -> str:
-    cure = "check that pictures have the calibrated sizes and are not cropped, or calibrate the intrinsics again"
+    cure = (
+        "check that pictures have the calibrated sizes and are not cropped, or calibrate the "
+        "intrinsics again"
+    )
     if len(finding.cameras) == 1:
         return f"the principal point of {{who}} appears to be wrong, it should be {{shift}}; {cure}"
     return (
-        f"principal points appear to be wrong, they should be {{shifts}} (equivalent to rotations of at"
-        f" most {{degrees}} degrees); {cure}"
+        "principal points appear to be wrong, they should be {shifts} (equivalent to rotations "
+        f"of at most {{degrees}} degrees); {cure}"
     )
 
 
@@ -164,8 +171,8 @@ def _focal(finding: Finding, side_px: int) -> str:
         else ("{amount:.2g} times the fitting value,", " and the size of its pictures")
     )
     return (
-        f"{{who}} has a focal length in the calibration that appears to be {by} too {what}; check its"
-        f" intrinsics{more}"
+        f"{{who}} has a focal length in the calibration that appears to be {by} too {what}; "
+        f"check its intrinsics{more}"
     )
 
 
@@ -173,8 +180,13 @@ def _duplicate(finding: Finding, side_px: int) -> str:
     if finding.same == "":
         return "{first} and {second} are one camera listed twice; remove one of them"
     detections = finding.same == "detections"
-    same, others = ("the same detections", "files") if detections else ("the same pose", "calibration")
-    return f"{{first}} and {{second}} have {same}; one of them has the {others} of the other; give its own"
+    same, others = (
+        ("the same detections", "files") if detections else ("the same pose", "calibration")
+    )
+    return (
+        f"{{first}} and {{second}} have {same}; one of them has the {others} of the other; give "
+        "its own"
+    )
 
 
 ADULT_M = 1.7
@@ -194,30 +206,40 @@ def _unit(finding: Finding, side_px: int) -> str:
     factor = finding.amount / ADULT_M
     for times, truth, taken in _UNITS:
         if 0.55 < factor / times < 1.45:
-            unit = f"the calibration is probably in {truth}, but was read as {taken}; give its unit with --unit"
+            unit = (
+                f"the calibration is probably in {truth}, but was read as {taken}; give its unit "
+                "with --unit"
+            )
             return f"the stature of people is {{stature}}: {unit}"
     off = f"{1 / factor:.2g} times too small" if factor < 1 else f"{factor:.2g} times too large"
     return (
-        f"the stature of people is {{stature}}: lengths in the calibration are about {off}; check its unit, and"
-        " the size of the squares of the calibration board"
+        f"the stature of people is {{stature}}: lengths in the calibration are about {off}; "
+        "check its unit, and the size of the squares of the calibration board"
     )
 
 
 def _joint_order(finding: Finding, side_px: int) -> str:
     if len(finding.joints) == 2:
         fits, read_as = finding.joints
-        order = f"people do not look like a body in the joint order of {read_as}, but do in that of {fits}"
+        order = (
+            f"people do not look like a body in the joint order of {read_as}, but do in that of "
+            f"{fits}"
+        )
         return f"{order}; give --skeleton {fits}"
     if finding.joints == ("left and right",):
         what = "left and right appear to be exchanged: knees and faces point backwards"
-        return f"{what}; exchange them in a --skeleton file, or check whether all pictures are mirrored"
+        return (
+            f"{what}; exchange them in a --skeleton file, or check whether all pictures are "
+            "mirrored"
+        )
     if any(finding.joints):
         return (
-            f"{finding.joints[0]} appear to be exchanged in all detections; give their order in a --skeleton file"
+            f"{finding.joints[0]} appear to be exchanged in all detections; give their order in "
+            "a --skeleton file"
         )
     return (
-        "people do not look like a body: the joints are in another order; give the keypoint layout of the"
-        " detector with --skeleton"
+        "people do not look like a body: the joints are in another order; give the keypoint "
+        "layout of the detector with --skeleton"
     )
 
 
@@ -227,8 +249,9 @@ def _nobody(finding: Finding, side_px: int) -> str:
     if finding.amount < 1:
         return "no camera sees a person in the checked frames; check the detections"
     return (
-        "no person is seen by two cameras that agree, although cameras saw {amount:.0f} people; check that"
-        " calibration and detections are of one recording, and that the cameras are in the same order"
+        "no person is seen by two cameras that agree, although cameras saw {amount:.0f} people; "
+        "check that calibration and detections are of one recording, and that the cameras are in "
+        "the same order"
     )
 
 
@@ -236,7 +259,11 @@ def _unfit(finding: Finding, side_px: int) -> str:
     check = "check that its calibration and its detections belong to it"
     if len(finding.cameras) == 1:
         return f"{{who}} fits the others under no tested explanation; {check}"
-    since = "" if finding.frames == (None, None) else " {when}, but agree in other frames: one of them was moved"
+    since = (
+        ""
+        if finding.frames == (None, None)
+        else " {when}, but agree in other frames: one of them was moved"
+    )
     return (
         f"{{who}} contradict {{others}}{since};"
         f" {check.replace('its', 'their').replace('belong to it', 'belong to them')}"
@@ -245,41 +272,65 @@ def _unfit(finding: Finding, side_px: int) -> str:
 
 _WORDS: dict[Kind, str | Callable[[Finding, int], str]] = {
     Kind.TURNED: _turned,
-    Kind.MOVED: f"{{who}} appears to be moved by about {{moved}} and rotated by {{amount:.1f}} degrees;"
-    f" {_POSE_AGAIN}",
+    Kind.MOVED: (
+        "{who} appears to be moved by about {moved} and rotated by {amount:.1f} degrees; "
+        f"{_POSE_AGAIN}"
+    ),
     Kind.LATE: _late,
-    Kind.EXCHANGED: "{who} appear to be exchanged: each sees what the other should see; exchange their names in"
-    " the"
-    " calibration, or their detections",
+    Kind.EXCHANGED: (
+        "{who} appear to be exchanged: each sees what the other should see; exchange their names "
+        "in the calibration, or their detections"
+    ),
     Kind.INVERTED: "the extrinsics of {who} appear to be inverted: camera-from-world was read as"
     " world-from-camera, or the reverse; write the inverse",
-    Kind.TRANSPOSED: "the rotation of {who} appears to be transposed, but not the translation; transpose it",
-    Kind.AXES: "the camera axes of {who} appear to be those of OpenGL or Blender (y up, z backwards); reverse y"
-    " and z",
+    Kind.TRANSPOSED: (
+        "the rotation of {who} appears to be transposed, but not the translation; transpose it"
+    ),
+    Kind.AXES: (
+        "the camera axes of {who} appear to be those of OpenGL or Blender (y up, z backwards); "
+        "reverse y and z"
+    ),
     Kind.MIRRORED: "the pictures of {who} appear to be mirrored; mirror them back",
-    Kind.BUMPED: "{who} appears to be rotated by {degrees} degrees {when}: it was moved; calibrate it for each"
-    " part, or leave it out of one",
-    Kind.DRIFTING: "{who} appears to rotate slowly, by {degrees} degrees over the recording; fix it on its"
-    " stand, and leave it out of this recording",
+    Kind.BUMPED: (
+        "{who} appears to be rotated by {degrees} degrees {when}: it was moved; calibrate it for "
+        "each part, or leave it out of one"
+    ),
+    Kind.DRIFTING: (
+        "{who} appears to rotate slowly, by {degrees} degrees over the recording; fix it on its "
+        "stand, and leave it out of this recording"
+    ),
     Kind.FOCAL: _focal,
-    Kind.RESIZED: "the detections of {who} appear to be from pictures of {amount:.2g} times the calibrated size"
-    " ({resized} instead of {calibrated}); give detections from pictures of the calibrated size, or the"
-    " calibration of these pictures",
+    Kind.RESIZED: (
+        "the detections of {who} appear to be from pictures of {amount:.2g} times the calibrated "
+        "size ({resized} instead of {calibrated}); give detections from pictures of the "
+        "calibrated size, or the calibration of these pictures"
+    ),
     Kind.PRINCIPAL_POINT: _principal_point,
     Kind.DUPLICATE: _duplicate,
     Kind.UNIT: _unit,
-    Kind.UP: "people stand along {axis}, but {up} is up in the calibration; give --up {axis} unless they lie",
+    Kind.UP: (
+        "people stand along {axis}, but {up} is up in the calibration; give --up {axis} unless "
+        "they lie"
+    ),
     Kind.JOINT_ORDER: _joint_order,
     Kind.NOBODY: _nobody,
-    Kind.STOPPED: "{who} repeats the previous picture in {percent:.0f} % of the checked frames; the repeated"
-    " pictures are left out; check its recording",
+    Kind.STOPPED: (
+        "{who} repeats the previous picture in {percent:.0f} % of the checked frames; the "
+        "repeated pictures are left out; check its recording"
+    ),
     Kind.UNFIT: _unfit,
-    Kind.CROWDED: "pictures show {amount:.0f} people or more, who occlude each other, so the cameras cannot be"
-    " checked; use frames with fewer people",
-    Kind.BIASED: "{who} sees one person beside where the others see this person, by {percent:.0f} % of the"
-    " stature: this is an error of the detector",
-    Kind.PICTURE_SIZE: "the pictures of {first} have {found} pixels, but the calibration is for {calibrated};"
-    " give --image-placement, or calibrate with these pictures",
+    Kind.CROWDED: (
+        "pictures show {amount:.0f} people or more, who occlude each other, so the cameras "
+        "cannot be checked; use frames with fewer people"
+    ),
+    Kind.BIASED: (
+        "{who} sees one person beside where the others see this person, by {percent:.0f} % of the"
+        " stature: this is an error of the detector"
+    ),
+    Kind.PICTURE_SIZE: (
+        "the pictures of {first} have {found} pixels, but the calibration is for {calibrated}; "
+        "give --image-placement, or calibrate with these pictures"
+    ),
 }
 """Sentence of each kind: a template for `sentence`, or a function that chooses it by the finding
 and the longer side of the camera's picture, pixels."""

@@ -11,9 +11,26 @@ from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.decompositions import nearest_rotation
 from shapepose_fg.core.rows import Rows
-from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS, Pinhole, Sightings, distances, same_frame
+from shapepose_fg.setup_check.matching import (
+    GATE,
+    MIN_JOINTS,
+    Pinhole,
+    Sightings,
+    distances,
+    same_frame,
+)
 
-PARAMETERS = ("turn x", "turn y", "turn z", "move x", "move y", "move z", "centre x", "centre y", "focal")
+PARAMETERS = (
+    "turn x",
+    "turn y",
+    "turn z",
+    "move x",
+    "move y",
+    "move z",
+    "centre x",
+    "centre y",
+    "focal",
+)
 """Parameters of a camera: rotation about its own axes (rad) at a fixed centre, translation along
 them (unit of the calibration), principal point (px), and logarithm of the focal length."""
 Q = len(PARAMETERS)
@@ -83,7 +100,12 @@ def independent(others: Others) -> float:
     if len(others) == 0:
         return 0.0
     frames = np.unique(others.frame)
-    return _JOINTS * len(others) / len(frames) * max(1.0, min(float(np.ptp(frames)) / _LASTS, len(frames)))
+    return (
+        _JOINTS
+        * len(others)
+        / len(frames)
+        * max(1.0, min(float(np.ptp(frames)) / _LASTS, len(frames)))
+    )
 
 
 def likelihood(score: float, worth: float, freedom: int) -> float:
@@ -99,8 +121,12 @@ def match(others: Others, seen: Sightings, camera: Pinhole, lag: int = 0) -> Mat
     best_of_person, best_of_sighting = np.full(len(others), np.inf), np.full(len(seen), np.inf)
     np.minimum.at(best_of_person, person, error)
     np.minimum.at(best_of_sighting, sighting, error)
-    keep = (error <= best_of_person[person]) & (error <= best_of_sighting[sighting]) & (error < GATE)
-    return Match(person[keep], sighting[keep], error[keep], possible_matches(others.frame, seen.frame - lag))
+    keep = (
+        (error <= best_of_person[person]) & (error <= best_of_sighting[sighting]) & (error < GATE)
+    )
+    return Match(
+        person[keep], sighting[keep], error[keep], possible_matches(others.frame, seen.frame - lag)
+    )
 
 
 def possible_matches(first: Index, second: Index) -> int:
@@ -111,7 +137,9 @@ def possible_matches(first: Index, second: Index) -> int:
     return int(np.minimum(counts[i], other_counts[j]).sum())
 
 
-def tries(others: Others, seen: Sightings, rng: np.random.Generator) -> Iterator[tuple[Array, Array]]:
+def tries(
+    others: Others, seen: Sightings, rng: np.random.Generator
+) -> Iterator[tuple[Array, Array]]:
     """Yield joints in the world (N, 3) and in the picture (N, 2) for random candidate pairs of
     people and sightings.
     """
@@ -143,7 +171,9 @@ def posed_to(points: Array, xy: Array, camera: Pinhole) -> Pinhole | None:
     if not scale > 0:
         return None
     middle = points.mean(axis=0)
-    ok, turn, move = cv2.solvePnP((points - middle) / scale, xy, camera.K, np.zeros(4), flags=cv2.SOLVEPNP_SQPNP)
+    ok, turn, move = cv2.solvePnP(
+        (points - middle) / scale, xy, camera.K, np.zeros(4), flags=cv2.SOLVEPNP_SQPNP
+    )
     if not ok or not (np.isfinite(turn).all() and np.isfinite(move).all()):
         return None
     R = np.asarray(cv2.Rodrigues(turn)[0], dtype=np.float64)
@@ -185,14 +215,20 @@ def scaled(camera: Pinhole, factor: float, centre: Array) -> Pinhole:
 
 
 def best_of(
-    others: Others, seen: Sightings, camera: Pinhole, pairs: Sequence[tuple[Array, Array]], fitted: Fitted
+    others: Others,
+    seen: Sightings,
+    camera: Pinhole,
+    pairs: Sequence[tuple[Array, Array]],
+    fitted: Fitted,
 ) -> Pinhole | None:
     """Return the camera with the best score for all people, among exact fits to single people."""
     step = max(1, len(others) // 40)
     few = others.rows(slice(None, None, step))
     tried = [each for points, xy in pairs if (each := fitted(points, xy, camera)) is not None]
     score, best = max(
-        ((match(few, seen, each).score, each) for each in tried), key=lambda pair: pair[0], default=(0, None)
+        ((match(few, seen, each).score, each) for each in tried),
+        key=lambda pair: pair[0],
+        default=(0, None),
     )
     return best if score > 0 else None
 
@@ -212,7 +248,9 @@ def refined(others: Others, seen: Sightings, camera: Pinhole, columns: list[int]
     return camera
 
 
-def _solved(points: Array, xy: Array, width_px: Array, camera: Pinhole, columns: list[int]) -> Pinhole:
+def _solved(
+    points: Array, xy: Array, width_px: Array, camera: Pinhole, columns: list[int]
+) -> Pinhole:
     """The camera fitted robustly (Cauchy) to points (N, 3) observed at xy (N, 2)."""
     ahead = camera.project(points)[1] > 0
     if ahead.sum() < 4:
@@ -223,14 +261,20 @@ def _solved(points: Array, xy: Array, width_px: Array, camera: Pinhole, columns:
         at, place, by_point = seen_by(points, views)
         error = (at[:, 0, 0] - xy) / width_px
         cost = float(np.log1p(error**2).sum()) if (place[..., 2] > 0).all() else np.inf
-        return cost, error, by_parameters(at, place, by_point, views)[:, 0, 0][..., columns] / width_px[..., None]
+        return (
+            cost,
+            error,
+            by_parameters(at, place, by_point, views)[:, 0, 0][..., columns] / width_px[..., None],
+        )
 
     views = Views(camera.K[None], camera.cTw[None])
     cost, error, J = linearised(views)
     for _ in range(_STEPS):
         weight, step = 1 / (1 + error**2), np.zeros((1, Q))
         H = np.einsum("nij,ni,nik->jk", J, weight, J)
-        step[0, columns] = -np.linalg.lstsq(H, np.einsum("nij,ni,ni->j", J, weight, error), rcond=1e-12)[0]
+        step[0, columns] = -np.linalg.lstsq(
+            H, np.einsum("nij,ni,ni->j", J, weight, error), rcond=1e-12
+        )[0]
         for part in (1.0, 0.25, 0.06):
             tried = changed(views, part * step)
             new = linearised(tried)
@@ -266,7 +310,9 @@ def difference(cTw: Array, other: Array) -> tuple[float, float]:
     """Rotation in degrees and distance of centres between two poses (3, 4)."""
     cosine = (np.trace(cTw[:, :3] @ other[:, :3].T) - 1) / 2
     centres = [-each[:, :3].T @ each[:, 3] for each in (cTw, other)]
-    return float(np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))), float(np.linalg.norm(centres[0] - centres[1]))
+    return float(np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))), float(
+        np.linalg.norm(centres[0] - centres[1])
+    )
 
 
 def changed(views: Views, change: Array) -> Views:

@@ -13,7 +13,16 @@ from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.setup_check import fit
 from shapepose_fg.setup_check.evidence import Look
 from shapepose_fg.setup_check.findings import SURE, Finding, Kind, one_of
-from shapepose_fg.setup_check.fit import ERROR, FOCAL, POSE, TURN, Others, independent, likelihood, match
+from shapepose_fg.setup_check.fit import (
+    ERROR,
+    FOCAL,
+    POSE,
+    TURN,
+    Others,
+    independent,
+    likelihood,
+    match,
+)
 from shapepose_fg.setup_check.matching import (
     GATE,
     MIN_JOINTS,
@@ -85,7 +94,11 @@ def lag_of(look: Look, view: int, most: int | None = None) -> Lag:
     people best.
     """
     most = look.evidence.most_lag if most is None else min(most, look.evidence.most_lag)
-    others, seen, camera = look.others(view), look.seen_by(view, every_frame=True), look.camera(view)
+    others, seen, camera = (
+        look.others(view),
+        look.seen_by(view, every_frame=True),
+        look.camera(view),
+    )
     worth, step = independent(others), max(1, len(others) // _MOST_PEOPLE)
     others = others.rows(slice(None, None, step))
     still = _nearest(others, seen, camera, 0)
@@ -95,7 +108,11 @@ def lag_of(look: Look, view: int, most: int | None = None) -> Lag:
 
     first = [tried(lag) for lag in range(-(most // _STRIDE) * _STRIDE, most + 1, _STRIDE)]
     best = max(first, key=_worth)
-    near = [tried(best.frames + d) for d in range(1 - _STRIDE, _STRIDE) if d != 0 and abs(best.frames + d) <= most]
+    near = [
+        tried(best.frames + d)
+        for d in range(1 - _STRIDE, _STRIDE)
+        if d != 0 and abs(best.frames + d) <= most
+    ]
     best = max([best, *near], key=_worth)
     return best if best.gain > 0 else NONE
 
@@ -134,7 +151,9 @@ def _nearest(others: Others, seen: Sightings, camera: Pinhole, lag: int) -> _Nea
     return _Nearest(np.isin(others.frame + lag, seen.frame), found, errors)
 
 
-def _compare(lag: int, frame: Whole, seen: Sightings, worth: float, still: _Nearest, moved: _Nearest) -> Lag:
+def _compare(
+    lag: int, frame: Whole, seen: Sightings, worth: float, still: _Nearest, moved: _Nearest
+) -> Lag:
     """Compare the fit with and without an offset, on joints of people seen in either case."""
     usable = still.there & moved.there & ((still.sighting >= 0) | (moved.sighting >= 0))
     a, b = still.sighting[usable], moved.sighting[usable]
@@ -142,7 +161,9 @@ def _compare(lag: int, frame: Whole, seen: Sightings, worth: float, still: _Near
     # People outside the gate at one of the offsets have moved at least by the gate.
     error_a = np.where((a < 0)[:, None] & ~np.isnan(error_b), GATE, error_a)
     error_b = np.where((b < 0)[:, None] & ~np.isnan(error_a), GATE, error_b)
-    xy = np.concatenate([seen.xy, np.full((1, *seen.xy.shape[1:]), np.inf)])  # the last row is for no sighting
+    xy = np.concatenate(
+        [seen.xy, np.full((1, *seen.xy.shape[1:]), np.inf)]
+    )  # the last row is for no sighting
     size = np.append(seen.size_px, np.inf)
     with np.errstate(invalid="ignore"):
         way = np.linalg.norm(xy[a] - xy[b], axis=-1) / np.minimum(size[a], size[b])[:, None]
@@ -154,7 +175,11 @@ def _compare(lag: int, frame: Whole, seen: Sightings, worth: float, still: _Near
     late = frame[usable] > np.median(frame[usable])
     halves = [(float(better[half].sum()), float(way[half].sum())) for half in (late, ~late)]
     whole = max(sum(moves for _, moves in halves), 1e-9)
-    agreement = min(gain / moves for gain, moves in halves if moves >= _HALF * whole) if whole > 1e-9 else 0.0
+    agreement = (
+        min(gain / moves for gain, moves in halves if moves >= _HALF * whole)
+        if whole > 1e-9
+        else 0.0
+    )
     gain = float(better[both].mean())
     near = (a >= 0) & (b >= 0)
     moves = float(way[near].sum())
@@ -172,7 +197,11 @@ _FITTED: tuple[tuple[Kind, fit.Fitted, list[int]], ...] = (
     (Kind.TURNED, fit.turned_to, TURN),
     (Kind.MOVED, fit.posed_to, POSE),
     (Kind.PRINCIPAL_POINT, fit.centred_to, fit.CENTRE),
-    (Kind.FOCAL, lambda points, xy, camera: fit.scaled_to(points, xy, camera, camera.K[:2, 2]), FOCAL),
+    (
+        Kind.FOCAL,
+        lambda points, xy, camera: fit.scaled_to(points, xy, camera, camera.K[:2, 2]),
+        FOCAL,
+    ),
     (Kind.RESIZED, lambda points, xy, camera: fit.scaled_to(points, xy, camera, fit.CORNER), []),
 )
 """Corrections of one camera: an exact fit to one person, then parameters (`fit.PARAMETERS`) fitted
@@ -243,12 +272,18 @@ def mistake_of_cameras(look: Look, rng: np.random.Generator) -> Change | None:
     if len(poor) > look.view_count / 2 and best < _EXPLAINED:
         few = replace(look, evidence=look.evidence.thinned(_FEW))
         found += [
-            (change.score - few.total, replace(change, look=replace(change.look, evidence=look.evidence)))
+            (
+                change.score - few.total,
+                replace(change, look=replace(change.look, evidence=look.evidence)),
+            )
             for change in _of_all(few)
         ]
     found = [(gain, change) for gain, change in found if gain > GAIN / look.view_count]
     for view in range(look.view_count if look.cameras_used > 2 else 0):
-        changes = [Change(finding, after, 0.0, freedom) for finding, after, freedom in stories(look, view, rng)]
+        changes = [
+            Change(finding, after, 0.0, freedom)
+            for finding, after, freedom in stories(look, view, rng)
+        ]
         found += [(judged(look, change), change) for change in changes]
     return _likeliest(look, found)
 
@@ -263,29 +298,43 @@ def _likeliest(look: Look, found: list[tuple[float, Change]]) -> Change | None:
         return None
     # Evidence counts all independent joints of people and cameras.
     gains = np.array([gain for gain, _ in found]) * GATE / ERROR
-    gains *= look.view_count * max(independent(look.others(view)) for view in range(look.view_count))
+    gains *= look.view_count * max(
+        independent(look.others(view)) for view in range(look.view_count)
+    )
     weights = np.exp(gains - gains.max()) / np.exp(gains - gains.max()).sum()
     changes = [
         replace(change, finding=replace(change.finding, sure=float(weight)))
-        for weight, (_, change) in sorted(zip(weights, found, strict=True), key=lambda each: -each[0])
+        for weight, (_, change) in sorted(
+            zip(weights, found, strict=True), key=lambda each: -each[0]
+        )
     ]
     best, (view, *_) = changes[0], changes[0].finding.cameras
     if best.look.evidence is not look.evidence or best.look.lag is not look.lag:
         return replace(best, finding=one_of([each.finding for each in changes]))
     # Which parameters of a camera are wrong is decided on single joints, with the people's
     # positions free.
-    rivals = [each for each in changes if each.fitted is not None and each.finding.cameras == best.finding.cameras]
+    rivals = [
+        each
+        for each in changes
+        if each.fitted is not None and each.finding.cameras == best.finding.cameras
+    ]
     problem = Problem.of(best.look, look.views)
     if best.fitted is None:
         of_camera = [problem.as_they_are(best.finding, best.look.views)]
     else:
-        starts = {each.fitted: each.look.views for each in reversed(rivals) if each.fitted is not None}
+        starts = {
+            each.fitted: each.look.views for each in reversed(rivals) if each.fitted is not None
+        }
         of_camera = problem.explained(view, starts)
     told = probable([problem.as_they_are(None, look.views), *problem.biases(), *of_camera])
-    guilty = [(each.finding, each.views) for each in told if each.finding is not None and each.person < 0]
+    guilty = [
+        (each.finding, each.views) for each in told if each.finding is not None and each.person < 0
+    ]
     guilt = sum(finding.sure for finding, _ in guilty)
     if guilt < SURE:
-        return _likeliest(look, [each for each in found if each[1].finding.cameras != best.finding.cameras])
+        return _likeliest(
+            look, [each for each in found if each[1].finding.cameras != best.finding.cameras]
+        )
     if best.fitted is not None:
         share = sum(each.finding.sure for each in rivals) / guilt
         fitted = [
@@ -350,7 +399,9 @@ def _in_mirror(look: Look, view: int) -> list[Change]:
         return replace(seen, xy=xy, confidence=seen.confidence[:, joints])
 
     side = look.evidence.other_side
-    looks = [look.seeing(view, partial(mirrored, joints=each)) for each in (side, np.arange(len(side)))]
+    looks = [
+        look.seeing(view, partial(mirrored, joints=each)) for each in (side, np.arange(len(side)))
+    ]
     return [
         Change(Finding(Kind.MIRRORED, (view,)), each, each.total if look.view_count == 2 else 0.0)
         for each in looks
@@ -361,7 +412,9 @@ def _of_two(look: Look, first: int, second: int) -> Change:
     """Two cameras exchanged, scored by the people that all others see; 0 if they see none."""
     others = look.others(first, second)
     change = look.with_cameras({first: look.camera(second), second: look.camera(first)})
-    score = min(match(others, look.seen_by(view), change.camera(view)).score for view in (first, second))
+    score = min(
+        match(others, look.seen_by(view), change.camera(view)).score for view in (first, second)
+    )
     return Change(Finding(Kind.EXCHANGED, (first, second)), change, score)
 
 
@@ -377,7 +430,9 @@ def _of_all(look: Look) -> Iterator[Change]:
 
 def _misread(look: Look, kind: Kind, views: tuple[int, ...]) -> Change:
     """Misinterpreted poses of some cameras, with the total score."""
-    return _whole(look, Finding(kind, views), {view: misread(kind, look.camera(view)) for view in views})
+    return _whole(
+        look, Finding(kind, views), {view: misread(kind, look.camera(view)) for view in views}
+    )
 
 
 def _whole(look: Look, finding: Finding, cameras: dict[int, Pinhole]) -> Change:

@@ -55,12 +55,18 @@ def order_of_joints(detections: DetectionSequence, look: Look) -> list[Finding]:
         return []
     in_space = np.isfinite(fit_of_order(space, names)).sum() >= _FEWEST
     order = exchanges(space if in_space else flat, names, _sides(names))
-    order = order if _gains(flat, space if in_space else None, names, order) else list(range(len(names)))
+    order = (
+        order
+        if _gains(flat, space if in_space else None, names, order)
+        else list(range(len(names)))
+    )
     backwards = in_space and _backwards(space[:, order], names)
     if backwards:
         other = {"L": "R", "R": "L"}
         mirror = [other.get(name[0], "") + name[1:] for name in names]
-        order = [order[names.index(name)] if name in names else order[n] for n, name in enumerate(mirror)]
+        order = [
+            order[names.index(name)] if name in names else order[n] for n, name in enumerate(mirror)
+        ]
     if order == list(range(len(names))):
         return []
     return [Finding(Kind.JOINT_ORDER, (), joints=_words(names, order))]
@@ -78,7 +84,10 @@ def _words(names: Sequence[str], order: Sequence[int]) -> tuple[str, ...]:
         parts = {name[1:] for name, _ in pairs}
         if parts == sided:
             return ("left and right",)
-        return ("left and right " + _listed([part.lower() for part in (*_ARMS, *_LEGS) if part in parts]),)
+        return (
+            "left and right "
+            + _listed([part.lower() for part in (*_ARMS, *_LEGS) if part in parts]),
+        )
     if swapped and len(pairs) <= 2:
         return (" as well as ".join(f"{name} and {to}" for name, to in pairs),)
     return ("",)
@@ -94,7 +103,9 @@ def _gains(flat: Array, space: Array | None, names: Sequence[str], order: Sequen
     def gain(people: Array) -> tuple[float, float]:
         more = fit_of_order(people[:, order], names) - fit_of_order(people, names)
         more = more[np.isfinite(more)]
-        return (float(more.mean()), float((more > 0).mean())) if len(more) >= _FEWEST else (0.0, 0.0)
+        return (
+            (float(more.mean()), float((more > 0).mean())) if len(more) >= _FEWEST else (0.0, 0.0)
+        )
 
     fits = fit_of_order(flat[:, order], names)
     fits = fits[np.isfinite(fits)]
@@ -105,7 +116,9 @@ def _gains(flat: Array, space: Array | None, names: Sequence[str], order: Sequen
     if space is None:
         return in_pictures
     in_space, share = gain(space)
-    return in_picture > 0 and in_space > 0 and (in_pictures or (in_space > _GAIN and share > _SHARE))
+    return (
+        in_picture > 0 and in_space > 0 and (in_pictures or (in_space > _GAIN and share > _SHARE))
+    )
 
 
 def _other_layout(people: Array, skeleton: Skeleton) -> str | None:
@@ -165,7 +178,10 @@ def _people(detections: DetectionSequence, look: Look, skeleton: Skeleton) -> Ar
     names = keypoint_names(skeleton)
     place = np.array([names.index(joint) if joint in names else -1 for joint in skeleton.joints])
     frames = look.evidence.anchors[:: max(1, len(look.evidence.anchors) // 30)].tolist()
-    found = [people_of(detections[frame], place, len(names), max(1, len(names) // 3))[1] for frame in frames]
+    found = [
+        people_of(detections[frame], place, len(names), max(1, len(names) // 3))[1]
+        for frame in frames
+    ]
     return _some(np.concatenate(found))
 
 

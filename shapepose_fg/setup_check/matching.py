@@ -50,7 +50,10 @@ class Sightings(Rows):
         """
         joints = len(detections.skeleton.core)
         none = Sightings(
-            np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros((0, joints, 2)), np.zeros((0, joints))
+            np.zeros(0, np.intp),
+            np.zeros(0, np.intp),
+            np.zeros((0, joints, 2)),
+            np.zeros((0, joints)),
         )
         found = [_of_frame(detections[frame], frame, detections.skeleton) for frame in frames]
         return Sightings.concatenate([none, *found])
@@ -78,11 +81,15 @@ def size_of(xy: Array) -> Array:
     count = np.maximum(seen.sum(axis=-2), 1)
     here = np.where(seen, xy, 0.0)
     mean = here.sum(axis=-2) / count
-    variance = (np.where(seen, (here - mean[..., None, :]) ** 2, 0.0).sum(axis=-2) / count).sum(axis=-1)
+    variance = (np.where(seen, (here - mean[..., None, :]) ** 2, 0.0).sum(axis=-2) / count).sum(
+        axis=-1
+    )
     return np.asarray(np.maximum(_STATURE_PER_SPREAD * np.sqrt(variance), 1.0))
 
 
-def people_of(found: Detections, place: Index, count: int, least: int) -> tuple[Index, Array, Array]:
+def people_of(
+    found: Detections, place: Index, count: int, least: int
+) -> tuple[Index, Array, Array]:
     """The 2D people of one frame with at least `least` joints: views (N,), pixels (N, K, 2) and
     confidences (N, K).
 
@@ -164,7 +171,12 @@ class Pairs:
         members = np.stack([first[keep], second[keep]], axis=1)
         third, third_error = _others(sightings, views, members, points[keep])
         return cls(
-            members, sightings.view[members], error[keep], sightings.frame[members[:, 0]], third, third_error
+            members,
+            sightings.view[members],
+            error[keep],
+            sightings.frame[members[:, 0]],
+            third,
+            third_error,
         )
 
     def groups(self, count: int, views: tuple[int, ...]) -> Groups:
@@ -183,7 +195,9 @@ class Pairs:
         members, thirds = self.members, self.third
         frames, rows = [], []
         while len(live := live[free[members[live]].all(axis=1)]) > 0:
-            supported = free[thirds[live]] & (thirds[live] >= 0) & allowed & (self.third_error[live] < GATE)
+            supported = (
+                free[thirds[live]] & (thirds[live] >= 0) & allowed & (self.third_error[live] < GATE)
+            )
             worth = 1 - self.error[live] / GATE
             worth = worth + np.where(supported, 1 - self.third_error[live] / GATE, 0).sum(axis=1)
             best = least_of_each(self.frame[live], -worth)
@@ -203,7 +217,9 @@ class Pairs:
         """
         of_pair = (self.views == (first, second)).all(axis=1)
         members = self.members[of_pair].tolist()
-        error = {(a, b): miss for (a, b), miss in zip(members, self.error[of_pair].tolist(), strict=True)}
+        error = {
+            (a, b): miss for (a, b), miss in zip(members, self.error[of_pair].tolist(), strict=True)
+        }
         return np.array([error[a, b] for a, b in groups.member[:, [first, second]].tolist()])
 
 
@@ -220,7 +236,9 @@ def centres_of(views: Views) -> Array:
     return -np.einsum("vji,vj->vi", views.cTw[:, :, :3], views.cTw[:, :, 3])
 
 
-def _meeting(sightings: Sightings, views: Views, first: Index, second: Index) -> tuple[Array, Array]:
+def _meeting(
+    sightings: Sightings, views: Views, first: Index, second: Index
+) -> tuple[Array, Array]:
     """Median distances of the rays of pairs (M,), relative to people's sizes, and triangulated
     midpoints (M, J, 3).
 
@@ -231,7 +249,10 @@ def _meeting(sightings: Sightings, views: Views, first: Index, second: Index) ->
     a, b = rays[first], rays[second]
     between = (centres[sightings.view[first]] - centres[sightings.view[second]])[:, None]
     cosine = np.einsum("mji,mji->mj", a, b)
-    along_a, along_b = np.einsum("mji,mji->mj", a, between + 0 * a), np.einsum("mji,mji->mj", b, between + 0 * b)
+    along_a, along_b = (
+        np.einsum("mji,mji->mj", a, between + 0 * a),
+        np.einsum("mji,mji->mj", b, between + 0 * b),
+    )
     sine2 = np.maximum(1 - cosine**2, 1e-12)
     s, t = (cosine * along_b - along_a) / sine2, (along_b - cosine * along_a) / sine2
     on_a = s[..., None] * a
@@ -239,7 +260,9 @@ def _meeting(sightings: Sightings, views: Views, first: Index, second: Index) ->
     half_gap = np.linalg.norm(on_a - on_b, axis=-1) / 2
     focal, size = views.focal_px[sightings.view], sightings.size_px
     with np.errstate(divide="ignore", invalid="ignore"):
-        error = np.maximum(half_gap / s * (focal / size)[first, None], half_gap / t * (focal / size)[second, None])
+        error = np.maximum(
+            half_gap / s * (focal / size)[first, None], half_gap / t * (focal / size)[second, None]
+        )
     error = np.where(np.isfinite(half_gap) & ((s <= 0) | (t <= 0)), np.inf, error)
     angle = median_of(np.arcsin(np.minimum(np.sqrt(sine2), 1.0)))
     median = np.where(angle > _MIN_ANGLE, median_of(error, MIN_JOINTS), np.inf)
@@ -247,7 +270,9 @@ def _meeting(sightings: Sightings, views: Views, first: Index, second: Index) ->
     return median, points
 
 
-def _others(sightings: Sightings, views: Views, members: Index, points: Array) -> tuple[Index, Array]:
+def _others(
+    sightings: Sightings, views: Views, members: Index, points: Array
+) -> tuple[Index, Array]:
     """Supporting sightings by other cameras for pairs with joints at `points` (M, J, 3): see
     `Pairs`.
     """
@@ -258,7 +283,10 @@ def _others(sightings: Sightings, views: Views, members: Index, points: Array) -
         of_view = np.flatnonzero(sightings.view == view)
         beside = np.flatnonzero((sightings.view[members] != view).all(axis=1))
         person, sighting, error = distances(
-            frame[beside], points[beside], sightings.rows(of_view), Pinhole(views.K[view], views.cTw[view])
+            frame[beside],
+            points[beside],
+            sightings.rows(of_view),
+            Pinhole(views.K[view], views.cTw[view]),
         )
         best = least_of_each(person, error)
         third[beside[person[best]], view] = of_view[sighting[best]]
@@ -283,7 +311,10 @@ def distances(
 def same_frame(first: Index, second: Index) -> tuple[Index, Index]:
     """All pairs (i, j) with first[i] == second[j]."""
     order = np.argsort(second, kind="stable")
-    start, stop = np.searchsorted(second[order], first), np.searchsorted(second[order], first, side="right")
+    start, stop = (
+        np.searchsorted(second[order], first),
+        np.searchsorted(second[order], first, side="right"),
+    )
     i = np.repeat(np.arange(len(first)), stop - start)
     step = np.arange(len(i)) - np.repeat(np.cumsum(stop - start) - (stop - start), stop - start)
     return i, order[start[i] + step]
@@ -320,7 +351,9 @@ def median_over(values: Array) -> Array:
     """(...) median over the first axis ignoring NaN; 0 if all are NaN."""
     ordered = np.sort(values, axis=0)  # NaN last
     count = np.isfinite(values).sum(axis=0)
-    middle = [np.take_along_axis(ordered, np.maximum(count - k, 0)[None] // 2, axis=0)[0] for k in (0, 1)]
+    middle = [
+        np.take_along_axis(ordered, np.maximum(count - k, 0)[None] // 2, axis=0)[0] for k in (0, 1)
+    ]
     return np.where(count > 0, (middle[0] + middle[1]) / 2, 0.0)
 
 

@@ -79,7 +79,10 @@ def stories(look: Look, view: int, rng: np.random.Generator) -> Iterator[tuple[F
         lasting = match(others, seen, fit.refined(others, seen, camera, columns)).score
         before = max(before, likelihood(lasting, worth, len(columns)))
     middle = np.array([(sum(spans[n]) - 1) / 2 for n in enough])[usable]
-    found = _bumped(others, seen, camera, turns[usable]), _drifted(middle, turns[usable], both[0], both[-1])
+    found = (
+        _bumped(others, seen, camera, turns[usable]),
+        _drifted(middle, turns[usable], both[0], both[-1]),
+    )
     for finding, way, freedom in found:
         after = match(others, warped(seen, camera, way(seen.frame)), camera).score
         gain = likelihood(after, worth, freedom) - before
@@ -89,7 +92,9 @@ def stories(look: Look, view: int, rng: np.random.Generator) -> Iterator[tuple[F
 
 def _as_if_still(look: Look, view: int, way: Way) -> Look:
     """The look corrected for the rotations of a camera."""
-    return look.seeing(view, lambda seen: warped(seen, look.camera(view), way(seen.frame - look.lag[view])))
+    return look.seeing(
+        view, lambda seen: warped(seen, look.camera(view), way(seen.frame - look.lag[view]))
+    )
 
 
 def _during(others: Others, seen: Sightings, first: float, last: float) -> tuple[Others, Sightings]:
@@ -127,15 +132,22 @@ def _turn_between(camera: Pinhole, other: Pinhole) -> Array:
     return log_so3(other.cTw[:, :3] @ camera.cTw[:, :3].T)
 
 
-def _bumped(others: Others, seen: Sightings, camera: Pinhole, turns: Array) -> tuple[Finding, Way, int]:
+def _bumped(
+    others: Others, seen: Sightings, camera: Pinhole, turns: Array
+) -> tuple[Finding, Way, int]:
     """One step between two rotations, from the `turns` (n, 3) of pieces, and its number of
     parameters.
     """
     splits = [(turns[:j], turns[j:]) for j in range(1, len(turns))]
-    split = min(splits, key=lambda parts: sum(np.abs(each - np.median(each, axis=0)).sum() for each in parts))
+    split = min(
+        splits,
+        key=lambda parts: sum(np.abs(each - np.median(each, axis=0)).sum() for each in parts),
+    )
     before, after = (np.median(each, axis=0) for each in split)
     rest = np.deg2rad(_LEAST_DEG)
-    before, after = (np.where(np.linalg.norm(each) < rest, 0.0, 1.0) * each for each in (before, after))
+    before, after = (
+        np.where(np.linalg.norm(each) < rest, 0.0, 1.0) * each for each in (before, after)
+    )
     for _ in range(2):
         at = _step(others, seen, camera, before, after)
         before = _settled(*_during(others, seen, -1, at), camera, before)
@@ -165,7 +177,9 @@ def _step(others: Others, seen: Sightings, camera: Pinhole, before: Array, after
         found = match(others, seen, _turned(camera, turn))
         place = np.searchsorted(frames, others.frame[found.person])
         worth[row] = np.bincount(place, 1 - found.error / GATE, minlength=len(frames))
-    total = np.concatenate([[0], np.cumsum(worth[0])]) + np.concatenate([np.cumsum(worth[1][::-1])[::-1], [0]])
+    total = np.concatenate([[0], np.cumsum(worth[0])]) + np.concatenate(
+        [np.cumsum(worth[1][::-1])[::-1], [0]]
+    )
     return int(frames[min(int(np.argmax(total)), len(frames) - 1)])
 
 
@@ -180,7 +194,11 @@ def _drifted(t: Array, turns: Array, first: int, last: int) -> tuple[Finding, Wa
         off = np.linalg.norm(turns - A @ line, axis=1)
         weight = 1 / np.sqrt(1 + (off / np.deg2rad(0.5)) ** 2)
     amount = float(np.rad2deg(np.linalg.norm(line[1]) * (last - first)))
-    return Finding(Kind.DRIFTING, (), amount), lambda frame: line[0] + (frame - first)[:, None] * line[1], 6
+    return (
+        Finding(Kind.DRIFTING, (), amount),
+        lambda frame: line[0] + (frame - first)[:, None] * line[1],
+        6,
+    )
 
 
 _PARTED, _LEAST_PART, _POOR = 0.3, 0.15, 0.5

@@ -91,11 +91,15 @@ class SetupReport:
         """The warnings, with their consequences for a reconstruction."""
         out = {view for view, _, _ in self.trust.left_out}
         words = [
-            f"{said}. It is left out of these frames (--no-check keeps it)" if out & set(found.cameras) else said
+            f"{said}. It is left out of these frames (--no-check keeps it)"
+            if out & set(found.cameras)
+            else said
             for found, said in zip(self.findings, self.warnings, strict=True)
         ]
         if len(self.trust.doubted) > 0:
-            names = ", ".join(rig.names[view] for view in sorted({view for view, _, _ in self.trust.doubted}))
+            names = ", ".join(
+                rig.names[view] for view in sorted({view for view, _, _ in self.trust.doubted})
+            )
             words.append(
                 f"it is unknown which of {names} is wrong: rows that depend on them have the status"
                 f" {str(Status.CONTRADICTED)!r} instead of 'ok'"
@@ -107,7 +111,11 @@ class SetupReport:
         names = [each.camera for each in self.cameras]
         return {
             "findings": [
-                {"kind": str(each.kind), "cameras": [names[view] for view in each.cameras], "says": words}
+                {
+                    "kind": str(each.kind),
+                    "cameras": [names[view] for view in each.cameras],
+                    "says": words,
+                }
                 for each, words in zip(self.findings, self.warnings, strict=True)
             ],
             "notes": list(self.notes),
@@ -121,7 +129,10 @@ class SetupReport:
 
 
 def check_setup(
-    detections: DetectionSequence, rig: Rig, frames: range | None = None, more: tuple[Finding, ...] = ()
+    detections: DetectionSequence,
+    rig: Rig,
+    frames: range | None = None,
+    more: tuple[Finding, ...] = (),
 ) -> SetupReport:
     """Check whether cameras and detections of a recording are consistent, and diagnose the mistake
     if not.
@@ -135,7 +146,9 @@ def check_setup(
         findings,
         tuple(sentence(finding, rig) for finding in findings),
         _camera_figures(diagnosis, rig),
-        tuple(_pair_figures(diagnosis.look, rig, *pair) for pair in combinations(range(len(rig)), 2)),
+        tuple(
+            _pair_figures(diagnosis.look, rig, *pair) for pair in combinations(range(len(rig)), 2)
+        ),
         len(diagnosis.look.evidence.anchors),
         build.stature if build is not None and build.count > 0 else None,
         diagnosis.trust,
@@ -147,10 +160,13 @@ def _children(build: Build | None) -> list[str]:
     """A note for people as tall as children, on the scale of the rig."""
     if build is None or not build.are_children:
         return []
-    lengths = f"lengths in the calibration are about {build.stature / ADULT_M:.1f} times what they should be"
+    lengths = (
+        f"lengths in the calibration are about {build.stature / ADULT_M:.1f} times what they "
+        "should be"
+    )
     return [
-        f"the stature of people is {build.stature:.2f} m, as of children; if they are adults, {lengths}: check"
-        " the size of the board's squares"
+        f"the stature of people is {build.stature:.2f} m, as of children; if they are adults, "
+        f"{lengths}: check the size of the board's squares"
     ]
 
 
@@ -263,7 +279,10 @@ class Distances:
     def of(cls, px: Array, mm: Array) -> "Distances":
         """Summarise all finite distances `px` and `mm`, arrays of one shape."""
         finite = np.isfinite(px) & np.isfinite(mm)
-        return cls(int(finite.sum()), *(quantile(each[finite], part) for each in (px, mm) for part in (0.5, 0.9)))
+        return cls(
+            int(finite.sum()),
+            *(quantile(each[finite], part) for each in (px, mm) for part in (0.5, 0.9)),
+        )
 
 
 @dataclass(frozen=True)
@@ -307,7 +326,11 @@ class ResultCheck:
 
 
 def result_check(
-    report: SetupReport, people: Reconstruction, detections: DetectionSequence, rig: Rig, frames: Sequence[int]
+    report: SetupReport,
+    people: Reconstruction,
+    detections: DetectionSequence,
+    rig: Rig,
+    frames: Sequence[int],
 ) -> ResultCheck:
     """Add the results of a reconstruction to the check of a set-up.
 
@@ -319,7 +342,10 @@ def result_check(
         warnings.append(
             "No people were found; see the findings of the set-up check"
             if warnings
-            else "No people were found; check with check-calibration whether cameras and detections fit"
+            else (
+                "No people were found; check with check-calibration whether cameras and "
+                "detections fit"
+            )
         )
     warnings += [*_shapes(people), *_speeds(people)]
     chance = [*_too_many(people), *_clutter(uses)][:1]
@@ -397,8 +423,9 @@ def _shapes(people: Reconstruction) -> Iterator[str]:
     far = largest > _MOST_BETA
     if far.sum() > 0 and far.mean() >= _SHARE:
         yield (
-            f"{far.sum()} of {len(far)} bodies have an implausible shape (a component of {largest.max():.0f}"
-            " standard deviations); check the calibration's unit, and whether its poses are inverted"
+            f"{far.sum()} of {len(far)} bodies have an implausible shape (a component of "
+            f"{largest.max():.0f} standard deviations); check the calibration's unit, and "
+            "whether its poses are inverted"
         )
 
 
@@ -406,7 +433,11 @@ def _speeds(people: Reconstruction) -> Iterator[str]:
     """Warning on implausible speeds of people, if rows have identities."""
     if not people.run.get("configuration", {}).get("temporal", True):
         return
-    hips = [place for place, name in enumerate(people.joint_names.tolist()) if name in ("RHip", "LHip", "MidHip")]
+    hips = [
+        place
+        for place, name in enumerate(people.joint_names.tolist())
+        if name in ("RHip", "LHip", "MidHip")
+    ]
     order = np.lexsort((people.frame, people.person))
     x, t = people.joints[order][:, hips].mean(axis=1), people.time_s[order]
     follows = (np.diff(people.person[order]) == 0) & (np.diff(t) > 0)
@@ -417,19 +448,22 @@ def _speeds(people: Reconstruction) -> Iterator[str]:
     if fast >= _FASTEST_M_S:
         rate = 1 / float(np.median(np.diff(t)[follows] / np.diff(people.frame[order])[follows]))
         yield (
-            f"people move at {fast:.0f} m/s, which is implausible: --fps is probably wrong ({rate:.0f} Hz;"
-            " usual cameras have 25 to 60), or frames are missing, or the calibration's unit is wrong"
+            f"people move at {fast:.0f} m/s, which is implausible: --fps is probably wrong "
+            f"({rate:.0f} Hz; usual cameras have 25 to 60), or frames are missing, or the "
+            "calibration's unit is wrong"
         )
 
 
 def _too_many(people: Reconstruction) -> Iterator[str]:
     """Warning on frames with more detections than people could explain."""
-    frames = sum(last - first for first, last in people.run.get("thinned_frames", {}).get("detections", []))
+    frames = sum(
+        last - first for first, last in people.run.get("thinned_frames", {}).get("detections", [])
+    )
     if frames > 0:
         yield (
-            f"{frames} frames have more detections than people could cause: identities are arbitrary there, and"
-            f" rows have the status {str(Status.CONTRADICTED)!r}; use a higher confidence threshold in the"
-            " detector"
+            f"{frames} frames have more detections than people could cause: identities are "
+            f"arbitrary there, and rows have the status {str(Status.CONTRADICTED)!r}; use a "
+            "higher confidence threshold in the detector"
         )
 
 
@@ -438,8 +472,8 @@ def _clutter(uses: Sequence[CameraUse]) -> Iterator[str]:
     offered, used = (sum(getattr(use, name) for use in uses) for name in ("offered", "used"))
     if 0 < used < _LEAST_USED * offered:
         yield (
-            f"people explain only {100 * used / offered:.1f} % of the detections: identities may be arbitrary;"
-            " use a higher confidence threshold in the detector"
+            f"people explain only {100 * used / offered:.1f} % of the detections: identities may "
+            "be arbitrary; use a higher confidence threshold in the detector"
         )
 
 
@@ -448,16 +482,27 @@ def _unused(uses: Sequence[CameraUse]) -> Iterator[str]:
     for use in uses:
         if use.offered < _FEW or use.used >= _MOST * use.offered:
             continue
-        why = [f"{count} {words}" for words, count in sorted(use.unused.items(), key=lambda each: -each[1])]
+        why = [
+            f"{count} {words}"
+            for words, count in sorted(use.unused.items(), key=lambda each: -each[1])
+        ]
         cure = (
-            "; either other cameras do not see these people, or this camera does not fit: run check-calibration"
+            (
+                "; either other cameras do not see these people, or this camera does not fit: run "
+                "check-calibration"
+            )
             if use.unused.get(NOBODY, 0) > use.offered / 2
             else ""
         )
-        yield f"{use.camera}: {use.used} of {use.offered} detections were used: {', '.join(why)}{cure}"
+        yield (
+            f"{use.camera}: {use.used} of {use.offered} detections were used: "
+            f"{', '.join(why)}{cure}"
+        )
 
 
-def _unseen(people: Reconstruction, detections: DetectionSequence, rig: Rig, frames: Sequence[int]) -> list[str]:
+def _unseen(
+    people: Reconstruction, detections: DetectionSequence, rig: Rig, frames: Sequence[int]
+) -> list[str]:
     """`unseen` for a result with people."""
     if len(people) == 0 or len(frames) == 0:
         return []
@@ -465,7 +510,9 @@ def _unseen(people: Reconstruction, detections: DetectionSequence, rig: Rig, fra
     alone = not people.run.get("configuration", {}).get("temporal", True)
     rows = np.searchsorted(frames, people.frame[np.isin(people.frame, frames)])
     per_frame = np.bincount(rows, minlength=len(frames))
-    return unseen(detections, rig.names, frames, per_frame, None if alone or not fps else len(frames) / fps)
+    return unseen(
+        detections, rig.names, frames, per_frame, None if alone or not fps else len(frames) / fps
+    )
 
 
 def unseen(
@@ -494,10 +541,18 @@ def unseen(
         return []
     why = "the others are seen too little, or the cameras do not agree on them"
     if lasts_s is not None and lasts_s < _SHORT_S:
-        why = f"{lasts_s:.2g} s are too short to confirm all people; give more frames, or --no-temporal"
+        why = (
+            f"{lasts_s:.2g} s are too short to confirm all people; give more frames, or "
+            "--no-temporal"
+        )
     two: list[int] = sorted(np.argsort(-np.asarray(seen.mean(axis=0)), kind="stable")[:2].tolist())
     most = " and ".join(names[view] for view in two)
-    return [f"two cameras see {by_two:.1f} people per frame, but {here:.1f} are found: {why} ({most} see most)"]
+    return [
+        (
+            f"two cameras see {by_two:.1f} people per frame, but {here:.1f} are found: {why} "
+            f"({most} see most)"
+        )
+    ]
 
 
 def _outlier(uses: Sequence[CameraUse]) -> Iterator[str]:
@@ -509,6 +564,7 @@ def _outlier(uses: Sequence[CameraUse]) -> Iterator[str]:
     usual = float(np.nanmedian(np.delete(lengths, worst)))
     if lengths[worst] >= max(_WORST * usual, _FAR_MM):
         yield (
-            f"{uses[worst].camera} is {lengths[worst]:.0f} mm from where the other cameras place its joints"
-            f" (median), and they are {usual:.0f} mm from each other; check its calibration and its pictures"
+            f"{uses[worst].camera} is {lengths[worst]:.0f} mm from where the other cameras place "
+            f"its joints (median), and they are {usual:.0f} mm from each other; check its "
+            "calibration and its pictures"
         )

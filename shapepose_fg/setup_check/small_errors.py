@@ -86,16 +86,26 @@ class Problem:
         often = np.bincount(who, minlength=1) >= _LEAST_OF_ONE
         person = np.unique(np.where(often[who], who, len(often)), return_inverse=True)[1]
         ends = np.quantile(frame, np.arange(1, _PARTS) / _PARTS) if len(frame) > 0 else np.zeros(0)
-        part = np.unique(np.searchsorted(np.unique(np.ceil(ends)), frame, side="right"), return_inverse=True)[1]
+        part = np.unique(
+            np.searchsorted(np.unique(np.ceil(ends)), frame, side="right"), return_inverse=True
+        )[1]
         seen = observed(groups, look.sightings)
-        return cls(Residuals.of(seen, look.views, person, part), frame, look.views if given is None else given)
+        return cls(
+            Residuals.of(seen, look.views, person, part),
+            frame,
+            look.views if given is None else given,
+        )
 
     @cached_property
     def _marginals(self) -> list[Marginal]:
         return self.residuals.marginals(self.given)
 
     def _likelihood(
-        self, directions: Array, sigma: Array, views: Views | None = None, before: Array | None = None
+        self,
+        directions: Array,
+        sigma: Array,
+        views: Views | None = None,
+        before: Array | None = None,
     ) -> tuple[float, Array]:
         """Log-likelihood of changes along `directions` (C, n) with standard deviations (n,), and
         the best change (n,).
@@ -103,7 +113,11 @@ class Problem:
         With `views` it is linearised at these cameras, which already include the change `before`
         (n,).
         """
-        marginals = self._marginals if views is None or views is self.given else self.residuals.marginals(views)
+        marginals = (
+            self._marginals
+            if views is None or views is self.given
+            else self.residuals.marginals(views)
+        )
         others = [self.residuals.of_person(*each) for each in self.biased]
         to = np.concatenate([directions * sigma, *(BIAS * each for each in others)], axis=1)
         done = np.zeros(to.shape[1])
@@ -114,7 +128,9 @@ class Problem:
             H, g = to.T @ each.H @ to, to.T @ each.g
             known = H + np.eye(len(H))
             best = np.linalg.solve(known, g - done)
-            likely = each.log + 0.5 * float((g - done) @ best - done @ done - np.linalg.slogdet(known)[1])
+            likely = each.log + 0.5 * float(
+                (g - done) @ best - done @ done - np.linalg.slogdet(known)[1]
+            )
             found.append((likely, best[: len(sigma)] * sigma))
         logs = np.nan_to_num([likely for likely, _ in found], nan=-np.inf)  # people behind a camera
         return float(np.logaddexp.reduce(logs)), found[int(np.argmax(logs))][1]
@@ -132,7 +148,9 @@ class Problem:
         mistake.
         """
         likely, _ = self._likelihood(self.residuals.camera(0, []), np.zeros(0), views)
-        return Cause(finding, likely if finding is None else likely + self._rare(finding.kind), views)
+        return Cause(
+            finding, likely if finding is None else likely + self._rare(finding.kind), views
+        )
 
     def explained(self, view: int, starts: Mapping[Kind, Views]) -> list[Cause]:
         """Mistakes of a single camera; `starts` are the cameras with each mistake approximately
@@ -146,7 +164,9 @@ class Problem:
                 before = _between(self.given, views, view)[which]
                 likely, change = self._likelihood(directions, sigma, views, before)
                 views = _moved(views, view, which, change)
-            found.append(Cause(named(kind, view, self.given, views), likely + self._rare(kind), views))
+            found.append(
+                Cause(named(kind, view, self.given, views), likely + self._rare(kind), views)
+            )
         return found
 
     def biases(self) -> Iterator[Cause]:
@@ -173,7 +193,9 @@ class Problem:
                 (Kind.BUMPED, np.arange(K) < k, (None, first[k])),
             ]
         for kind, share, frames in stories:
-            likely, turn = self._likelihood(self.residuals.camera(view, TURN, share), np.full(3, _TURN))
+            likely, turn = self._likelihood(
+                self.residuals.camera(view, TURN, share), np.full(3, _TURN)
+            )
             finding = Finding(kind, (view,), float(np.rad2deg(np.linalg.norm(turn))), frames=frames)
             count = 2 if kind == Kind.DRIFTING else 2 * K - 2
             yield Cause(finding, likely + self._rare(kind) - np.log(count), self.given)
@@ -181,7 +203,9 @@ class Problem:
     def _of_several(self) -> list[Cause]:
         """Independent errors of the principal points of all cameras."""
         V = len(self.given)
-        directions = np.concatenate([self.residuals.camera(view, CENTRE) for view in range(V)], axis=1)
+        directions = np.concatenate(
+            [self.residuals.camera(view, CENTRE) for view in range(V)], axis=1
+        )
         sigma = np.repeat(_EVERY * self.given.focal_px, 2)
         likely, change = self._likelihood(directions, sigma)
         change = change.reshape(V, 2)
@@ -196,7 +220,9 @@ class Problem:
     def relaxed(self) -> Views:
         """The cameras with the small errors that are likely in all of them."""
         V, which = len(self.given), [TURN[2], *CENTRE, *FOCAL]
-        directions = np.concatenate([self.residuals.camera(view, which) for view in range(V)], axis=1)
+        directions = np.concatenate(
+            [self.residuals.camera(view, which) for view in range(V)], axis=1
+        )
         sigma = np.array([np.append(_EVERY, self._usual(view)[which[1:]] / 5) for view in range(V)])
         change = np.zeros((V, Q))
         change[:, which] = self._likelihood(directions, sigma.ravel())[1].reshape(V, -1)
@@ -209,15 +235,21 @@ class Problem:
         which = np.flatnonzero(usual).tolist()
         views = [view for view in range(len(self.given)) if view != reference]
         directions = [self.residuals.camera(view, which) for view in views]
-        likely, _ = self._likelihood(np.concatenate(directions, axis=1), np.tile(usual[which], len(views)))
+        likely, _ = self._likelihood(
+            np.concatenate(directions, axis=1), np.tile(usual[which], len(views))
+        )
         return float(1 / (1 + np.exp(min(self.as_they_are(None, self.given).log - likely, 700.0))))
 
     def _usual(self, view: int) -> Array:
         """(Q,) standard deviations of small mistakes of a camera's parameters."""
         seen = self.residuals.weight[:, :, view] > 0
         cTw = self.given.cTw[view, 2]
-        depth = float(np.median(self.residuals.points[seen] @ cTw[:3] + cTw[3])) if seen.any() else 1.0
-        return np.array([_TURN] * 3 + [_MOVE * depth] * 3 + [_TURN * self.given.focal_px[view]] * 2 + [_FOCAL])
+        depth = (
+            float(np.median(self.residuals.points[seen] @ cTw[:3] + cTw[3])) if seen.any() else 1.0
+        )
+        return np.array(
+            [_TURN] * 3 + [_MOVE * depth] * 3 + [_TURN * self.given.focal_px[view]] * 2 + [_FOCAL]
+        )
 
     def _rare(self, kind: Kind) -> float:
         """Log prior probability of one kind of mistake of one camera."""
@@ -231,7 +263,11 @@ def probable(causes: list[Cause]) -> list[Cause]:
     told = list[Cause]()
     for each in sorted(causes, key=lambda each: -each.log):
         sure = float(np.exp(each.log - total))
-        told.append(replace(each, finding=None if each.finding is None else replace(each.finding, sure=sure)))
+        told.append(
+            replace(
+                each, finding=None if each.finding is None else replace(each.finding, sure=sure)
+            )
+        )
     return told
 
 

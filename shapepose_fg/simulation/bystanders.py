@@ -86,9 +86,11 @@ def endless(clip: Clip, frames: int, start: int = 0) -> Clip:
     return replace(clip, rotations=rotations[index], pelvis=pelvis[index])
 
 
-def stand(body: BodyModel, betas: Array, clip: Clip, frames: int, fps: float, start: int = 0) -> Performance:
-    """`clip` of a person who stays in place, looped, by a body of shape `betas` (10,), its middle at the
-    origin.
+def stand(
+    body: BodyModel, betas: Array, clip: Clip, frames: int, fps: float, start: int = 0
+) -> Performance:
+    """`clip` of a person who stays in place, looped, by a body of shape `betas` (10,), its middle
+    at the origin.
     """
     clip = endless(clip.resampled(fps), frames, start)
     performed = perform(body, betas, clip)
@@ -96,7 +98,14 @@ def stand(body: BodyModel, betas: Array, clip: Clip, frames: int, fps: float, st
 
 
 def walk_along(
-    body: BodyModel, betas: Array, clip: Clip, path: Array, heading: Array, *, fps: float, start: float = 0.0
+    body: BodyModel,
+    betas: Array,
+    clip: Clip,
+    path: Array,
+    heading: Array,
+    *,
+    fps: float,
+    start: float = 0.0,
 ) -> Performance:
     """The walk of `clip` along `path` (T, 2) with `heading` (T,), by a body of shape `betas` (10,).
 
@@ -104,7 +113,9 @@ def walk_along(
     person takes slower steps. `start` is the phase of the loop at which the walk begins, 0 to 1.
     """
     cycle, gain = _cycle(perform(body, betas, clip.resampled(fps)))
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])[: len(path)]
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])[
+        : len(path)
+    ]
     count = len(cycle)
     # Steps do not stop abruptly: below a quarter of the recorded speed the feet continue in place.
     floor = 0.25 * gain / count
@@ -116,7 +127,9 @@ def walk_along(
     turn = turned_about("z", heading)
     rotations = blend(cycle.rotations[low], cycle.rotations[high], share)
     rotations[:, 0] = turn @ rotations[:, 0]
-    side = cycle.joints[low, 0, 1:] + share[:, None] * (cycle.joints[high, 0, 1:] - cycle.joints[low, 0, 1:])
+    side = cycle.joints[low, 0, 1:] + share[:, None] * (
+        cycle.joints[high, 0, 1:] - cycle.joints[low, 0, 1:]
+    )
     pelvis = np.concatenate([path + left_of(heading) * side[:, :1], side[:, 1:]], axis=1)
     return grounded(Figure(body, betas), rotations, pelvis, fps, bend_toes=False)
 
@@ -133,7 +146,9 @@ def _cycle(walk: Performance) -> tuple[Performance, float]:
     first, last = np.arange(seam, count // 2), np.arange(count // 2, count)
     gap = np.linalg.norm(features[first][:, None] - features[last][None], axis=-1)
     # A shorter loop repeats its seam more often: prefer the longer of two that close equally well.
-    begin, end = np.unravel_index(np.argmin(comparable(gap - 0.002 * (last[None] - first[:, None]))), gap.shape)
+    begin, end = np.unravel_index(
+        np.argmin(comparable(gap - 0.002 * (last[None] - first[:, None]))), gap.shape
+    )
     begin, end = int(first[begin]), int(last[end])
     share: Array = np.linspace(0.0, 1.0, seam + 2)[1:-1]
     rotations, joints = walk.rotations[begin:end].copy(), walk.joints[begin:end].copy()
@@ -165,7 +180,9 @@ def way_through(
     """A path from wall to wall and back, with distance `distance_m` (K,) or a little more from
     `others` (T, K, 2).
     """
-    ways = [_walk(others, frames, rng, fps, speed_mps, distance_m, half_room_m) for _ in range(_TRIES)]
+    ways = [
+        _walk(others, frames, rng, fps, speed_mps, distance_m, half_room_m) for _ in range(_TRIES)
+    ]
     return max(ways, key=lambda way: comparable(_way_worth(way, others, distance_m)))
 
 
@@ -174,11 +191,21 @@ def _way_worth(way: Way, others: Array, distance_m: Array) -> float:
     if others.shape[1] == 0 or len(way[0]) == 0:
         return 0.0
     room = (np.linalg.norm(others - way[0][:, None], axis=-1) - distance_m).min(axis=1)
-    return 30.0 * float(np.minimum(room, 0.0).mean()) + min(float(room.min()), 0.0) + float((room < 0.4).mean())
+    return (
+        30.0 * float(np.minimum(room, 0.0).mean())
+        + min(float(room.min()), 0.0)
+        + float((room < 0.4).mean())
+    )
 
 
 def _walk(
-    others: Array, frames: int, rng: np.random.Generator, fps: float, speed: float, distance: Array, half: float
+    others: Array,
+    frames: int,
+    rng: np.random.Generator,
+    fps: float,
+    speed: float,
+    distance: Array,
+    half: float,
 ) -> Way:
     """One random path: each decision takes the best turn and pace for the next two seconds (dynamic
     window).
@@ -193,7 +220,12 @@ def _walk(
             goal = _way_goal(xy, rng, half)
         ahead = np.minimum(frame + np.round(_HORIZON_S * fps).astype(int), frames - 1)
         options = _arcs(xy, heading, turns, paces * speed)
-        cost = 0.35 * np.abs(turns - rate) + 0.15 * np.abs(turns) + 1.2 * (1 - paces) + 1.5 * np.abs(paces - pace)
+        cost = (
+            0.35 * np.abs(turns - rate)
+            + 0.15 * np.abs(turns)
+            + 1.2 * (1 - paces)
+            + 1.5 * np.abs(paces - pace)
+        )
         cost += 2.0 * np.linalg.norm(options[:, -1] - goal, axis=-1)
         cost += 60.0 * np.maximum(np.abs(options) - half, 0.0).sum(axis=(1, 2))
         apart_x, apart_y = (options[..., None, axis] - others[ahead, :, axis] for axis in (0, 1))
@@ -205,7 +237,9 @@ def _walk(
             places[later], headings[later] = xy, heading
             heading += rate / fps
             xy = xy + pace * speed / fps * along(np.array(heading))
-    path, facing = (gaussian_filter1d(each, 0.12 * fps, axis=0, mode="nearest") for each in (places, headings))
+    path, facing = (
+        gaussian_filter1d(each, 0.12 * fps, axis=0, mode="nearest") for each in (places, headings)
+    )
     return path, facing
 
 

@@ -19,21 +19,31 @@ from shapepose_fg.simulation.detector_statistics import JOINT_GROUP, LIMB_GROUP,
 
 
 class NoiseProcess:
-    """Seven standard normal processes for every view, person and joint: fast and slow AR(1), and white noise."""
+    """Seven standard normal processes for every view, person and joint: fast and slow AR(1), and
+    white noise.
+    """
 
     ERROR_X, ERROR_Y, CONFIDENCE, SCALE, SWAP, CAPTURE, LOST = range(7)
 
-    def __init__(self, views: int, people: int, fps: float, statistics: DetectorStatistics, seed: int) -> None:
+    def __init__(
+        self, views: int, people: int, fps: float, statistics: DetectorStatistics, seed: int
+    ) -> None:
         self._seed = seed
         self._shape = (7, 3, views, people, 25)
         memory = np.stack(
-            [statistics.error_memory] * 2 + [statistics.confidence_memory] * 4 + [statistics.lost_memory]
+            [statistics.error_memory] * 2
+            + [statistics.confidence_memory] * 4
+            + [statistics.lost_memory]
         )
         share, seconds = memory[..., 0], memory[..., 1]
         self._keep = np.exp(-1.0 / (fps * seconds))[..., None, None, None]
         self._amplitude = np.sqrt(share)[..., None, None, None]
         self._white = np.sqrt(np.maximum(1.0 - share.sum(axis=1), 0.0))[:, None, None, None]
-        correlations = statistics.error_correlation, statistics.confidence_correlation, statistics.lost_correlation
+        correlations = (
+            statistics.error_correlation,
+            statistics.confidence_correlation,
+            statistics.lost_correlation,
+        )
         self._mix = [_root(each) for each in correlations]
         self._state: Array | None = None
 
@@ -76,17 +86,28 @@ class FalseCandidateProcess:
     """
 
     def __init__(
-        self, views: int, people: int, fps: float, statistics: DetectorStatistics, seed: int, rate: float
+        self,
+        views: int,
+        people: int,
+        fps: float,
+        statistics: DetectorStatistics,
+        seed: int,
+        rate: float,
     ) -> None:
         self._views, self._people, self._statistics, self._seed = views, people, statistics, seed
-        near, far = statistics.false_near * people * views * rate, statistics.false_far * views * rate
+        near, far = (
+            statistics.false_near * people * views * rate,
+            statistics.false_far * views * rate,
+        )
         share, seconds = statistics.false_memory.T
         # The share of a group, divided by its members.
         claims = statistics.false_joints[JOINT_GROUP] / np.bincount(JOINT_GROUP)[JOINT_GROUP]
         self._claims = claims / claims.sum()
         self._stays = np.append(np.exp(-1.0 / (fps * seconds)), 0.0)
         # Expected numbers present at any time; births balance deaths.
-        self._present = np.append(share, max(1.0 - share.sum(), 0.0))[:, None] * np.array([near, far])
+        self._present = np.append(share, max(1.0 - share.sum(), 0.0))[:, None] * np.array(
+            [near, far]
+        )
         self._present_now: FalseCandidates | None = None
 
     def next(self, frame: int) -> FalseCandidates:
@@ -95,7 +116,9 @@ class FalseCandidateProcess:
         if self._present_now is None:
             self._present_now = self._born(rng, self._present)
         else:
-            staying = self._present_now.rows(rng.random(len(self._present_now)) < self._present_now.stays)
+            staying = self._present_now.rows(
+                rng.random(len(self._present_now)) < self._present_now.stays
+            )
             born = self._born(rng, self._present * (1.0 - self._stays)[:, None])
             self._present_now = FalseCandidates.concatenate([staying, born])
         return self._present_now
@@ -120,8 +143,8 @@ class FalseCandidateProcess:
 
 
 def _root(correlation: Array) -> Array:
-    """Matrix that correlates independent rows (..., 25) when multiplied from the right; rounding errors are
-    tolerated.
+    """Matrix that correlates independent rows (..., 25) when multiplied from the right; rounding
+    errors are tolerated.
     """
     root = symmetric_root(correlation)
     return (root / np.linalg.norm(root, axis=1, keepdims=True)).T
@@ -172,15 +195,25 @@ def affinities(
     lower = np.minimum(found.confidence[a], found.confidence[b])
     rank = statistics.probability(statistics.affinity_right_confidence[group], lower)
     rho = statistics.affinity_correlation
-    score = rho * ndtri(np.clip(rank, 1e-3, 1 - 1e-3)) + np.sqrt(1 - rho**2) * rng.standard_normal(len(a))
+    score = rho * ndtri(np.clip(rank, 1e-3, 1 - 1e-3)) + np.sqrt(1 - rho**2) * rng.standard_normal(
+        len(a)
+    )
     drawn = statistics.quantile(statistics.affinity_right[group], ndtr(score))
     affinity[right] = 1.0 + doubt * (drawn - 1.0)
     a, b = first[~right], second[~right]
     detour = np.minimum(_detour(found, a, b, true_xy), _detour(found, b, a, true_xy))
     false = ~np.logical_and(owner[a].any(axis=1), owner[b].any(axis=1))
-    kind = np.clip(np.searchsorted(statistics.detours, detour, side="right") - 1, 0, len(statistics.detours) - 1)
-    share = np.where(false, statistics.affinity_nobody_share[kind], statistics.affinity_wrong_share[kind])
-    table = np.where(false[:, None], statistics.affinity_nobody[kind], statistics.affinity_wrong[kind])
+    kind = np.clip(
+        np.searchsorted(statistics.detours, detour, side="right") - 1,
+        0,
+        len(statistics.detours) - 1,
+    )
+    share = np.where(
+        false, statistics.affinity_nobody_share[kind], statistics.affinity_wrong_share[kind]
+    )
+    table = np.where(
+        false[:, None], statistics.affinity_nobody[kind], statistics.affinity_wrong[kind]
+    )
     listed = rng.random(len(a)) < share * wrong
     if owner.shape[1] > 0:
         p, q = owner[a].argmax(axis=1), owner[b].argmax(axis=1)
@@ -217,5 +250,7 @@ def _detour(found: Candidates, near: Index, far: Index, true_xy: Array) -> Array
     person = owner.argmax(axis=1)
     right_end = true_xy[view, person, found.joint[far]]
     length = np.linalg.norm(right_end - true_xy[view, person, found.joint[near]], axis=-1)
-    detour = np.linalg.norm(found.xy[far] - right_end, axis=-1) / np.maximum(length, _LEAST_LENGTH_PX)
+    detour = np.linalg.norm(found.xy[far] - right_end, axis=-1) / np.maximum(
+        length, _LEAST_LENGTH_PX
+    )
     return np.where(owner.any(axis=1), np.nan_to_num(detour, nan=np.inf), np.inf)

@@ -99,7 +99,10 @@ class DetectorConfig:
         """The settings as plain values, for run.json; the statistics by their provenance."""
         knobs = {name: getattr(self, name) for name in _KNOBS}
         knobs |= {"offsets": None if self.offsets is None else self.offsets.as_dict()}
-        return knobs | {"statistics": self.statistics.provenance, "visibility": asdict(self.visibility)}
+        return knobs | {
+            "statistics": self.statistics.provenance,
+            "visibility": asdict(self.visibility),
+        }
 
 
 _KNOBS = "noise misses doubt false_candidates swaps captures merging wrong_affinities".split()
@@ -148,20 +151,26 @@ def simulate(
 class Detector:
     """A detector for one recording, frame after frame; its errors are correlated over time."""
 
-    def __init__(self, rig: Rig, people: int, fps: float, config: DetectorConfig, seed: int = 0) -> None:
+    def __init__(
+        self, rig: Rig, people: int, fps: float, config: DetectorConfig, seed: int = 0
+    ) -> None:
         """A detector for `people` people seen by the cameras of `rig` at `fps` frames
         per second.
         """
         self._rig, self._config, self._table, self._seed = rig, config, config.statistics, seed
         given = (len(rig), people, fps, config.statistics, seed)
-        self._noise, self._false = NoiseProcess(*given), FalseCandidateProcess(*given, config.false_candidates)
+        self._noise, self._false = (
+            NoiseProcess(*given),
+            FalseCandidateProcess(*given, config.false_candidates),
+        )
         self._frame = 0
 
     def skip_to(self, frame: int) -> None:
         """Advance the errors until `frame` is next; raises ValueError if it has passed."""
         if frame < self._frame:
             raise ValueError(
-                f"frames must be requested in order: frame {frame} was requested, but {self._frame} is next"
+                f"frames must be requested in order: frame {frame} was requested, but "
+                f"{self._frame} is next"
             )
         while self._frame < frame:
             self._noise.next(self._frame)
@@ -185,7 +194,13 @@ class Detector:
         found = _merge(Candidates.concatenate([found, self._invented(false, true_xy, depth)]))
         found = found.rows(rng.permutation(len(found.view)))
         pairs, affinity = affinities(
-            found, true_xy, captors, self._table, doubt=config.doubt, wrong=config.wrong_affinities, rng=rng
+            found,
+            true_xy,
+            captors,
+            self._table,
+            doubt=config.doubt,
+            wrong=config.wrong_affinities,
+            rng=rng,
         )
         return Detections(found.view, found.joint, found.xy, found.confidence, pairs, affinity)
 
@@ -213,12 +228,16 @@ class Detector:
         rank = (quality[reported] - miss[reported]) / (1.0 - miss[reported])
         rows = _between(table.confidence[group, hidden_as].T, table.confidence[group, 0].T, seen).T
         confidence, px_a_metre = table.quantile(rows, rank), px_a_metre[reported]
-        sigma_px = self._sigma_px(confidence, seen, hidden_as, px_a_metre, noise[NoiseProcess.SCALE, reported])
+        sigma_px = self._sigma_px(
+            confidence, seen, hidden_as, px_a_metre, noise[NoiseProcess.SCALE, reported]
+        )
         error = noise[:2, reported].T * sigma_px[:, None] * table.joint_scale[group]
         limit = _LARGEST_ERROR_M * px_a_metre / np.maximum(np.linalg.norm(error, axis=1), 1e-9)
         owner = np.zeros((len(view), len(joints)), dtype=bool)
         owner[np.arange(len(view)), person] = True
-        gap_px = np.linalg.norm(true_xy[view, person, joint] - true_xy[view, person, _MIRROR[joint]], axis=-1)
+        gap_px = np.linalg.norm(
+            true_xy[view, person, joint] - true_xy[view, person, _MIRROR[joint]], axis=-1
+        )
         apart = gap_px > _MIRROR_APART_M * px_a_metre
         swap_rank = np.where(apart, ndtr(noise[NoiseProcess.SWAP, reported]), 1.0)
         swapped = swap_rank < config.swaps * table.swap
@@ -231,7 +250,9 @@ class Detector:
             owner=owner,
             reach_px=self._reach_px(ndtr(noise[NoiseProcess.SCALE, reported]), sizes[view, 1]),
         )
-        in_sight = np.where(seen >= 0.5, swap_rank, 1.0)  # the measured share refers to visible joints
+        in_sight = np.where(
+            seen >= 0.5, swap_rank, 1.0
+        )  # the measured share refers to visible joints
         found = Candidates.concatenate([found, self._duplicates(found, in_sight, px_a_metre, rng)])
         inside = np.all((found.xy >= 0) & (found.xy <= sizes[found.view] - 1), axis=1)
         return found.rows(inside), reported
@@ -285,17 +306,26 @@ class Detector:
             for rows in (np.log(own_m), table.tail)
         )
         which = hidden_as, np.arange(len(confidence))
-        sigma_px = np.hypot(np.exp(_between(log_sigma[which], log_sigma[0], seen)) * px_a_metre, table.floor_px)
+        sigma_px = np.hypot(
+            np.exp(_between(log_sigma[which], log_sigma[0], seen)) * px_a_metre, table.floor_px
+        )
         return sigma_px * np.exp(_between(tail[which], tail[0], seen) * scale)
 
     def _captors(
-        self, reported: Mask, true_xy: Array, metres_a_px: Array, visibility: Visibility, noise: Array
+        self,
+        reported: Mask,
+        true_xy: Array,
+        metres_a_px: Array,
+        visibility: Visibility,
+        noise: Array,
     ) -> Index:
         """(2, V, P, 25) person in front of a missed joint who captured it (`affinities`), or did
         not; -1 for none.
         """
         table = self._table
-        view, person, joint = np.nonzero((visibility.hidden_by >= 0) & visibility.in_image & ~reported)
+        view, person, joint = np.nonzero(
+            (visibility.hidden_by >= 0) & visibility.in_image & ~reported
+        )
         front = visibility.hidden_by[view, person, joint]
         gap_px = np.linalg.norm(true_xy[view, person, joint] - true_xy[view, front, joint], axis=-1)
         gap_m = np.nan_to_num(gap_px, nan=np.inf) * metres_a_px[view, person, joint]
@@ -317,7 +347,9 @@ class Detector:
         there = np.all((xy >= 0) & (xy <= size - 1), axis=1)  # false for NaN behind a camera
         # Static ones are in the background: people in front of them occlude them.
         gap_px = np.linalg.norm(true_xy[false.view] - xy[:, None, None], axis=-1)
-        gap_m = (gap_px * depth[false.view]).min(axis=(1, 2), initial=np.inf, where=np.isfinite(gap_px))
+        gap_m = (gap_px * depth[false.view]).min(
+            axis=(1, 2), initial=np.inf, where=np.isfinite(gap_px)
+        )
         there &= near | (gap_m > _NEAR_M * focal_px[false.view])
         quantiles = np.where(near[:, None], table.false_near_confidence, table.false_far_confidence)
         found = Candidates(
@@ -364,5 +396,7 @@ def _merge(found: Candidates) -> Candidates:
 
 
 def _between(hidden: Array, visible: Array, seen: Array) -> Array:
-    """Interpolate from the value of a hidden joint to that of a visible one, by the visible share."""
+    """Interpolate from the value of a hidden joint to that of a visible one, by the visible
+    share.
+    """
     return hidden + (visible - hidden) * seen

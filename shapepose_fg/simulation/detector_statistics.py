@@ -28,7 +28,9 @@ LIMB_GROUP = np.array([sorted(set(_LIMB_NAMES)).index(name) for name in _LIMB_NA
 
 @dataclass(frozen=True, eq=False)
 class DetectorStatistics:
-    """Tables by joint (G rows), state (visible, hidden by itself, hidden by another) and quantile (K levels)."""
+    """Tables by joint (G rows), state (visible, hidden by itself, hidden by another) and quantile
+    (K levels).
+    """
 
     levels: Array
     """(K,) probabilities at which quantiles are given, 0 to 1."""
@@ -51,7 +53,8 @@ class DetectorStatistics:
     knots: Array
     """(N,) confidences at which sigma and tail are given."""
     sigma_m: Array
-    """(3, N) sigma of each image coordinate, as a length on a person of median size, from the error's median."""
+    """(3, N) sigma of each image coordinate, as a length on a person of median size, from the
+    error's median."""
     tail: Array
     """(3, N) standard deviation of log-sigma, which makes the tails heavier than Gaussian."""
     joint_scale: Array
@@ -63,10 +66,11 @@ class DetectorStatistics:
     facing: Array
     """(5, 2) cosines between which nose, eyes and ears become visible."""
     error_memory: Array
-    """(2, 2) share and time constant in seconds of a fast and a slow part of the errors; the rest is white."""
+    """(2, 2) share and time constant in seconds of a fast and a slow part of the errors; the rest
+    is white."""
     confidence_memory: Array
-    """(2, 2) share and time constant in seconds of a fast and a slow part of the variation of confidences and
-    misses."""
+    """(2, 2) share and time constant in seconds of a fast and a slow part of the variation of
+    confidences and misses."""
     error_correlation: Array
     """(25, 25) correlation between the errors of a person's joints in one view."""
     confidence_correlation: Array
@@ -133,9 +137,13 @@ class DetectorStatistics:
         return cls(**tables)
 
     def quantile(self, table: Array, probability: Array) -> Array:
-        """Values (...,) at `probability` (...,) of quantile tables (..., K), or of one table (K,)."""
+        """Values (...,) at `probability` (...,) of quantile tables (..., K), or of one table
+        (K,).
+        """
         table = np.broadcast_to(table, (*probability.shape, len(self.levels)))
-        at = np.clip(np.searchsorted(self.levels, probability, side="right") - 1, 0, len(self.levels) - 2)
+        at = np.clip(
+            np.searchsorted(self.levels, probability, side="right") - 1, 0, len(self.levels) - 2
+        )
         low, high = self.levels[at], self.levels[at + 1]
         part = np.clip((probability - low) / (high - low), 0.0, 1.0)
         first = np.take_along_axis(table, at[..., None], axis=-1)[..., 0]

@@ -64,7 +64,8 @@ def named_scene(
         raise InputError(f"--split {split}: must be {' or '.join(get_args(Split))}")
     if people is not None:
         raise InputError(
-            f"--people {people}: {name} has {SEQUENCES[name].people} people; leave it out, or use demo"
+            f"--people {people}: {name} has {SEQUENCES[name].people} people; leave it out, or "
+            "use demo"
         )
     until = frames if frames > 0 else None
     motions = Mocap.load(_motions(mocap))
@@ -118,10 +119,19 @@ def write_simulated(
     else:
         place = folder / _OPENPOSE
         write_openpose(detections, scene.rig, place)
-    about = {"fps": scene.fps, "frames": len(scene), "people": scene.people, "cameras": len(scene.rig)}
+    about = {
+        "fps": scene.fps,
+        "frames": len(scene),
+        "people": scene.people,
+        "cameras": len(scene.rig),
+    }
     about |= {"cuts": list(scene.cuts), **run}
     truth_of(scene).with_run(simulated=about, versions=versions()).save(folder / "truth")
-    return {"cameras": folder / "rig.json", "detections": place, "truth": folder / "truth" / "people.npz"}
+    return {
+        "cameras": folder / "rig.json",
+        "detections": place,
+        "truth": folder / "truth" / "people.npz",
+    }
 
 
 def _motions(path: Path | None) -> Path:
@@ -133,7 +143,8 @@ def _motions(path: Path | None) -> Path:
     path = Path(os.environ.get("SHAPEPOSE_DATA", Path("..") / "shared")) / _MOCAP
     if not path.is_file():
         raise InputError(
-            f"{path}: the recorded motions are missing; give their file with --mocap, set SHAPEPOSE_DATA to the"
-            " folder that holds data/cmu_mocap, or simulate demo, which needs none"
+            f"{path}: the recorded motions are missing; give their file with --mocap, set "
+            "SHAPEPOSE_DATA to the folder that holds data/cmu_mocap, or simulate demo, which "
+            "needs none"
         )
     return path

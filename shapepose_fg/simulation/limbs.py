@@ -78,8 +78,12 @@ def pose(puppet: Puppet, rest: Array) -> tuple[Array, Array, Array]:
     for side, (hip, knee, ankle) in enumerate(LEGS):
         grow(hip)
         pole = turned[:, PELVIS] @ np.array([0.12 * (1, -1)[side], 0.0, 1.0])
-        _two_bones(turned, position, bones, (hip, knee, ankle), puppet.ankles[:, side], pole, _KNEE_HINGE)
-        turned[:, ankle] = _facing(puppet.foot_heading[:, side]) @ turned_about("x", puppet.foot_pitch[:, side])
+        _two_bones(
+            turned, position, bones, (hip, knee, ankle), puppet.ankles[:, side], pole, _KNEE_HINGE
+        )
+        turned[:, ankle] = _facing(puppet.foot_heading[:, side]) @ turned_about(
+            "x", puppet.foot_pitch[:, side]
+        )
         turned[:, ankle + 3] = turned[:, ankle]
     for side, (collar, shoulder, elbow, wrist) in enumerate(ARMS):
         sign = (1.0, -1.0)[side]
@@ -172,11 +176,15 @@ def _two_bones(
     axis = np.cross(v, u)
     for joint, end in ((first, middle), (middle, last)):
         bone = position[:, end] - position[:, joint]
-        turned[:, joint] = _frame(bone, axis) @ _frame(bones[end][None], hinge[None]).swapaxes(-1, -2)
+        turned[:, joint] = _frame(bone, axis) @ _frame(bones[end][None], hinge[None]).swapaxes(
+            -1, -2
+        )
 
 
 def _frame(bone: Array, axis: Array) -> Array:
-    """Right-handed frames (T, 3, 3) with the first column along `bone` and the second towards `axis`."""
+    """Right-handed frames (T, 3, 3) with the first column along `bone` and the second towards
+    `axis`.
+    """
     e = bone / np.linalg.norm(bone, axis=1, keepdims=True)
     n = axis - (axis * e).sum(axis=1, keepdims=True) * e
     n /= np.linalg.norm(n, axis=1, keepdims=True)

@@ -21,7 +21,9 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.npz import read_npz
 from shapepose_fg.simulation.limbs import ARMS
 
-_OF_CLIP = "seq_start seq_len fps names subject action tier wrist_valid toe_valid leg_m floor_y".split()
+_OF_CLIP = (
+    "seq_start seq_len fps names subject action tier wrist_valid toe_valid leg_m floor_y".split()
+)
 _ARRAYS = {"poses": ("N", 24, 3), "trans": ("N", 3), **dict.fromkeys(_OF_CLIP, ("S",))}
 _ARRAYS |= {"pairs": ("K", 2), "parents": (24,)}
 _GLITCH_RAD_S = np.radians(900.0)
@@ -83,7 +85,9 @@ class Clip:
         """Return the motion at another frame rate: rotations by slerp, positions linearly."""
         if fps == self.fps or len(self) < 2:
             return replace(self, fps=fps)
-        time = np.arange(int(np.floor((len(self) - 1) * fps / self.fps + 1e-9)) + 1) * self.fps / fps
+        time = (
+            np.arange(int(np.floor((len(self) - 1) * fps / self.fps + 1e-9)) + 1) * self.fps / fps
+        )
         low = np.minimum(time.astype(int), len(self) - 2)
         share = np.asarray(time - low, dtype=np.float64)
         rotations = blend(self.rotations[low], self.rotations[low + 1], share)
@@ -120,7 +124,9 @@ class Mocap:
         arrays = read_npz(Path(path), _ARRAYS, "copy the recorded motions again")
         for problem in _problems(arrays):
             raise InputError(f"{path}: {problem}")
-        names, subjects, actions = (tuple(map(str, arrays[name])) for name in ("names", "subject", "action"))
+        names, subjects, actions = (
+            tuple(map(str, arrays[name])) for name in ("names", "subject", "action")
+        )
         pairs = tuple((int(lead), int(follow)) for lead, follow in arrays["pairs"])
         lengths, tiers = (arrays[name].astype(np.int64) for name in ("seq_len", "tier"))
         return cls(names, subjects, actions, lengths, tiers, pairs, arrays)
@@ -131,10 +137,14 @@ class Mocap:
         frames = slice(int(own["seq_start"]), int(own["seq_start"]) + int(self.lengths[index]))
         vectors, fps = self.arrays["poses"][frames].astype(np.float64), float(own["fps"])
         rotations = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(-1, 24, 3, 3)
-        rotations, pelvis = _bridged(rotations, self.arrays["trans"][frames].astype(np.float64), fps)
+        rotations, pelvis = _bridged(
+            rotations, self.arrays["trans"][frames].astype(np.float64), fps
+        )
         who = (self.names[index], self.subjects[index], self.actions[index])
         valid = (bool(own[name]) for name in ("wrist_valid", "toe_valid"))
-        return Clip(*who, rotations, pelvis, fps, float(own["leg_m"]), float(own["floor_y"]), *valid)
+        return Clip(
+            *who, rotations, pelvis, fps, float(own["leg_m"]), float(own["floor_y"]), *valid
+        )
 
 
 def blend(first: Array, second: Array, share: Array) -> Array:
@@ -149,7 +159,9 @@ def _bridged(rotations: Array, pelvis: Array, fps: float) -> tuple[Array, Array]
     if len(pelvis) < 3:
         return rotations, pelvis
     trace = np.einsum("tjab,tjab->tj", rotations[:-1], rotations[1:])  # of R^T R': 1 + 2 cos
-    jumps = np.flatnonzero((np.arccos(np.clip((trace - 1) / 2, -1, 1)) > _GLITCH_RAD_S / fps).any(axis=1))
+    jumps = np.flatnonzero(
+        (np.arccos(np.clip((trace - 1) / 2, -1, 1)) > _GLITCH_RAD_S / fps).any(axis=1)
+    )
     if len(jumps) == 0:
         return rotations, pelvis
     bad = np.zeros(len(pelvis), dtype=bool)
@@ -187,7 +199,10 @@ def _problems(arrays: dict[str, NDArray]) -> Iterator[str]:
     if not ((start >= 0) & (length > 0) & (start + length <= sizes["N"])).all():
         yield "seq_start and seq_len go beyond the last frame; write the file again"
     pairs = arrays["pairs"].astype(np.int64)
-    if not ((pairs >= 0) & (pairs < sizes["S"])).all() or (length[pairs[:, 0]] != length[pairs[:, 1]]).any():
+    if (
+        not ((pairs >= 0) & (pairs < sizes["S"])).all()
+        or (length[pairs[:, 0]] != length[pairs[:, 1]]).any()
+    ):
         yield "pairs must name two clips of one length each; write the file again"
     if tuple(arrays["parents"].tolist()) != SMPL_PARENTS:
         yield "parents are not SMPL's tree; give motions in SMPL's structure"

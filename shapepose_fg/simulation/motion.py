@@ -58,14 +58,18 @@ class Build:
         soles.
         """
         self.rest, self.floor = rest, floor
-        self.pelvis_m, self.ankle_m, self.shoulder_m = (float(rest[joint, 1] - floor) for joint in (0, 7, 16))
+        self.pelvis_m, self.ankle_m, self.shoulder_m = (
+            float(rest[joint, 1] - floor) for joint in (0, 7, 16)
+        )
         """Heights of these joints of an upright body, metres."""
         hip, knee, ankle = rest[list(LEGS[0])]
         self.leg_m = float(np.linalg.norm(knee - hip) + np.linalg.norm(ankle - knee))
         """Length of thigh and shank together, metres."""
 
 
-def close_motion(betas: Array, builds: list[Build], frames: int, fps: float, rng: np.random.Generator) -> Motion:
+def close_motion(
+    betas: Array, builds: list[Build], frames: int, fps: float, rng: np.random.Generator
+) -> Motion:
     """People of shapes `betas` (P, 10) in close motion, in groups of four: a couple dances, one
     walks through, one waves.
 
@@ -112,7 +116,9 @@ def dance(pair: list[Build], time: Array, centre: Array, rng: np.random.Generato
         def path(t: Array) -> tuple[Array, Array]:
             away = along(angle(t)) * sign
             facing = angle(t) + (np.pi if sign > 0 else 0.0)
-            return middle(t) + away * half_distance(t)[:, None], facing + 0.15 * np.sin(np.pi * t / beat)
+            return middle(t) + away * half_distance(t)[:, None], facing + 0.15 * np.sin(
+                np.pi * t / beat
+            )
 
         return path
 
@@ -126,7 +132,9 @@ def dance(pair: list[Build], time: Array, centre: Array, rng: np.random.Generato
         held.append(_at(xy, z))
     puppets = []
     for sign, build, other in ((1.0, pair[0], pair[1]), (-1.0, pair[1], pair[0])):
-        away = np.stack([np.cos(angle(time)), np.sin(angle(time)), np.zeros_like(time)], axis=1) * sign
+        away = (
+            np.stack([np.cos(angle(time)), np.sin(angle(time)), np.zeros_like(time)], axis=1) * sign
+        )
         # For the person at the far end, facing the centre, `across` is to the right; for the other
         # to the left.
         hands = held if sign < 0 else held[::-1]
@@ -141,7 +149,9 @@ def dance(pair: list[Build], time: Array, centre: Array, rng: np.random.Generato
                 stride_s=beat,
                 phase=0.25 if sign > 0 else 0.75,
                 dip=0.03 + 0.02 * np.sin(2 * np.pi * time / beat),
-                lean=np.stack([0.08 + 0.05 * up, 0.12 * np.sin(np.pi * time / beat), 0.1 * up * sign], axis=1),
+                lean=np.stack(
+                    [0.08 + 0.05 * up, 0.12 * np.sin(np.pi * time / beat), 0.1 * up * sign], axis=1
+                ),
                 wrists=wrists,
                 reach=np.ones((len(time), 2)),
                 gaze=gaze,
@@ -180,7 +190,9 @@ def walk(build: Build, time: Array, centre: Array, rng: np.random.Generator) -> 
     )
 
 
-def wave(build: Build, time: Array, spot: Array, heading: float, rng: np.random.Generator) -> Puppet:
+def wave(
+    build: Build, time: Array, spot: Array, heading: float, rng: np.random.Generator
+) -> Puppet:
     """A person who stays at `spot` (2,): waves with the right hand, then crouches and
     reaches down.
     """
@@ -189,7 +201,9 @@ def wave(build: Build, time: Array, spot: Array, heading: float, rng: np.random.
 
     def path(t: Array) -> tuple[Array, Array]:
         shift = 0.04 * np.sin(2 * np.pi * t / 2.8)
-        return spot + shift[:, None] * left_of(np.array(heading)), heading + 0.25 * np.sin(2 * np.pi * t / 2.8)
+        return spot + shift[:, None] * left_of(np.array(heading)), heading + 0.25 * np.sin(
+            2 * np.pi * t / 2.8
+        )
 
     xy, facing = path(time)
     forward = along(facing)
@@ -204,7 +218,9 @@ def wave(build: Build, time: Array, spot: Array, heading: float, rng: np.random.
         stride_s=1.4,
         phase=rng.uniform(),
         dip=0.02 + 0.3 * crouching,
-        lean=np.stack([0.03 + 0.75 * crouching, 0.2 * np.sin(2 * np.pi * time / 2.8), -0.06 * waving], axis=1),
+        lean=np.stack(
+            [0.03 + 0.75 * crouching, 0.2 * np.sin(2 * np.pi * time / 2.8), -0.06 * waving], axis=1
+        ),
         wrists=np.stack([_at(floor, 0.42), _at(hello, build.shoulder_m + 0.32)], axis=1),
         reach=np.stack([crouching, waving], axis=1),
         gaze=_at(xy + 1.2 * forward, 1.45 - 1.1 * crouching),
@@ -212,7 +228,14 @@ def wave(build: Build, time: Array, spot: Array, heading: float, rng: np.random.
 
 
 def _puppet(
-    build: Build, time: Array, path: Path, *, stride_s: float, phase: float, dip: Array, **upper: Array
+    build: Build,
+    time: Array,
+    path: Path,
+    *,
+    stride_s: float,
+    phase: float,
+    dip: Array,
+    **upper: Array,
 ) -> Puppet:
     """A puppet with footsteps along `path`, and the pelvis `dip` (T,) metres lower than upright.
 
@@ -227,7 +250,9 @@ def _puppet(
     # Legs are never fully stretched: the pelvis is low enough for both feet, smoothly.
     aside = np.linalg.norm(feet - xy[:, None], axis=-1) - 0.5 * 0.16
     drop = np.sqrt(np.maximum((0.985 * build.leg_m) ** 2 - np.maximum(aside, 0.0) ** 2, 0.1))
-    allowed = (ankles[..., 2] + drop).min(axis=1) + (build.pelvis_m - build.rest[1, 1] + build.floor)
+    allowed = (ankles[..., 2] + drop).min(axis=1) + (
+        build.pelvis_m - build.rest[1, 1] + build.floor
+    )
     height = _soften(np.minimum(build.pelvis_m - dip, allowed))
     lean_back = -0.22 * np.maximum(dip - 0.05, 0.0)  # hips move back over the heels in a crouch
     return Puppet(

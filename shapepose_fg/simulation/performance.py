@@ -56,7 +56,9 @@ class Performance:
         turn = turned_about("z", np.array([turn_rad]))[0]
         rotations = self.rotations.copy()
         rotations[:, 0] = turn @ rotations[:, 0]
-        return replace(self, rotations=rotations, joints=self.joints @ turn.T + np.array([*xy, 0.0]))
+        return replace(
+            self, rotations=rotations, joints=self.joints @ turn.T + np.array([*xy, 0.0])
+        )
 
 
 class Figure:
@@ -69,7 +71,10 @@ class Figure:
         """(24, 3) joints in the T-pose, y up."""
         self.leg_m = float(np.linalg.norm(np.diff(self.rest[[1, 4, 7]], axis=0), axis=1).sum())
         """Length of thigh and shank together, metres."""
-        feet = [np.flatnonzero(arrays.weights[:, list(_FEET[side::2])].sum(axis=1) > 0.9) for side in (0, 1)]
+        feet = [
+            np.flatnonzero(arrays.weights[:, list(_FEET[side::2])].sum(axis=1) > 0.9)
+            for side in (0, 1)
+        ]
         # The lowest point of a foot is always a vertex of its convex hull.
         hull = np.concatenate([foot[ConvexHull(shaped[foot]).vertices] for foot in feet])
         self._soles, self._weights = shaped[hull], arrays.weights[hull][:, list(_FEET)]
@@ -82,7 +87,9 @@ class Figure:
         world, places = accumulate(rotations), np.empty((len(pelvis), 24, 3))
         places[:, 0] = pelvis
         for joint, parent in enumerate(SMPL_PARENTS[1:], start=1):
-            places[:, joint] = places[:, parent] + world[:, parent] @ (self.rest[joint] - self.rest[parent])
+            places[:, joint] = places[:, parent] + world[:, parent] @ (
+                self.rest[joint] - self.rest[parent]
+            )
         return places, world
 
     def lowest_sole(self, joints: Array, world: Array) -> Array:
@@ -93,7 +100,9 @@ class Figure:
         return (heights + joints[:, list(_FEET), 2] @ self._weights.T).min(axis=1)
 
 
-def perform(body: BodyModel, betas: Array, clip: Clip, *, scale: float | None = None) -> Performance:
+def perform(
+    body: BodyModel, betas: Array, clip: Clip, *, scale: float | None = None
+) -> Performance:
     """Perform `clip` with a body of shape `betas` (10,), on the floor z = 0 of a room with z up; +z
     becomes -y.
 
@@ -113,7 +122,9 @@ def perform(body: BodyModel, betas: Array, clip: Clip, *, scale: float | None = 
     return grounded(figure, rotations, pelvis @ _Z_UP.T, clip.fps, bend_toes=not clip.toe_valid)
 
 
-def grounded(figure: Figure, rotations: Array, pelvis: Array, fps: float, *, bend_toes: bool) -> Performance:
+def grounded(
+    figure: Figure, rotations: Array, pelvis: Array, fps: float, *, bend_toes: bool
+) -> Performance:
     """Shift a person vertically and smoothly, so that the supporting feet are on the floor."""
     joints, world = figure.joints(rotations, pelvis)
     if bend_toes:
@@ -126,9 +137,15 @@ def grounded(figure: Figure, rotations: Array, pelvis: Array, fps: float, *, ben
 
 def together(betas: Array, performances: list[Performance], frames: int) -> Motion:
     """SMPL's parameters of P people, `betas` (P, 10), in `frames` frames (used if P is 0)."""
-    motion = Motion.still(np.asarray(betas, dtype=np.float64).reshape(len(performances), 10), frames)
+    motion = Motion.still(
+        np.asarray(betas, dtype=np.float64).reshape(len(performances), 10), frames
+    )
     for person, performed in enumerate(performances):
-        vectors = Rotation.from_matrix(performed.rotations.reshape(-1, 3, 3)).as_rotvec().reshape(-1, 24, 3)
+        vectors = (
+            Rotation.from_matrix(performed.rotations.reshape(-1, 3, 3))
+            .as_rotvec()
+            .reshape(-1, 24, 3)
+        )
         motion.global_orient[:, person] = vectors[:, 0]
         motion.body_pose[:, person] = vectors[:, 1:]
         # SMPL rotates the body about its pelvis in the T-pose, then translates it.
@@ -143,7 +160,9 @@ def _floor(lowest: Array, fps: float) -> Array:
     if len(lowest) == 0:
         return lowest
     reach = 2 * max(1, round(0.3 * fps)) + 1
-    opened = maximum_filter1d(minimum_filter1d(lowest, reach, mode="nearest"), reach, mode="nearest")
+    opened = maximum_filter1d(
+        minimum_filter1d(lowest, reach, mode="nearest"), reach, mode="nearest"
+    )
     flies = (lowest - opened).max() > _JUMP_M
     floor = gaussian_filter1d(opened if flies else lowest, 0.1 * fps, mode="nearest")
     below = np.maximum(floor - lowest - 0.015, 0.0)  # lift people deep in the floor
@@ -164,7 +183,9 @@ def _toes_on_the_floor(rotations: Array, joints: Array, world: Array, lowest: Ar
     return bent
 
 
-def hold_hands(lead: Performance, follow: Performance, fps: float) -> tuple[Performance, Performance]:
+def hold_hands(
+    lead: Performance, follow: Performance, fps: float
+) -> tuple[Performance, Performance]:
     """Bring hands of two people together that are close for a while, each moving half of the
     distance.
 
@@ -178,7 +199,9 @@ def hold_hands(lead: Performance, follow: Performance, fps: float) -> tuple[Perf
         hands = [person.joints[:, [22, 23]] for person in (lead, follow)]
         apart = hands[1][:, None] - hands[0][:, :, None]  # (T, 2, 2, 3) lead's hands to follow's
         gap = np.linalg.norm(apart, axis=-1)
-        step = (pull * np.maximum(1.0 - _TOUCH_M / np.maximum(gap, 1e-6), 0.0) / 2)[..., None] * apart
+        step = (pull * np.maximum(1.0 - _TOUCH_M / np.maximum(gap, 1e-6), 0.0) / 2)[
+            ..., None
+        ] * apart
         lead = _reach(lead, step.sum(axis=2))
         follow = _reach(follow, -step.sum(axis=1))
     return lead, follow
@@ -211,13 +234,21 @@ def _reach(person: Performance, steps: Array) -> Performance:
         root, middle, end = (joints[:, joint] for joint in (shoulder, elbow, wrist))
         target = end + steps[:, side]
         bend = _bend(middle - root, end - middle, np.linalg.norm(target - root, axis=1))
-        swing = _shortest(middle - root + np.einsum("tij,tj->ti", bend, end - middle), target - root)
+        swing = _shortest(
+            middle - root + np.einsum("tij,tj->ti", bend, end - middle), target - root
+        )
         upper, fore = swing @ upper, swing @ bend @ fore
         rotations[:, shoulder] = np.swapaxes(girdle, -1, -2) @ upper
         rotations[:, elbow] = np.swapaxes(upper, -1, -2) @ fore
-        bones = ((shoulder, elbow, upper), (elbow, wrist, fore), (wrist, hand, fore @ rotations[:, wrist]))
+        bones = (
+            (shoulder, elbow, upper),
+            (elbow, wrist, fore),
+            (wrist, hand, fore @ rotations[:, wrist]),
+        )
         for parent, joint, turned in bones:
-            joints[:, joint] = joints[:, parent] + turned @ (person.rest[joint] - person.rest[parent])
+            joints[:, joint] = joints[:, parent] + turned @ (
+                person.rest[joint] - person.rest[parent]
+            )
     return replace(person, rotations=rotations, joints=joints)
 
 

@@ -1,4 +1,6 @@
-"""Scenes of people with ground truth and calibrated cameras; the built-in scene of `demo` and the tests."""
+"""Scenes of people with ground truth and calibrated cameras; the built-in scene of `demo` and the
+tests.
+"""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -60,9 +62,13 @@ class Scene:
         """The scene in the consecutive frames `span`."""
         # Segments that overlap the span, each from its cut (the first from frame 0) to the next.
         segments = zip((0, *self.cuts), (*self.cuts, len(self)), self.clips, strict=False)
-        clips = tuple(names for start, stop, names in segments if start < span.stop and stop > span.start)
+        clips = tuple(
+            names for start, stop, names in segments if start < span.stop and stop > span.start
+        )
         cuts = tuple(first - span.start for first in self.cuts if span.start < first < span.stop)
-        return replace(self, motion=self.motion.rows(slice(span.start, span.stop)), cuts=cuts, clips=clips)
+        return replace(
+            self, motion=self.motion.rows(slice(span.start, span.stop)), cuts=cuts, clips=clips
+        )
 
     def truth_at(self, frame: int) -> Array:
         """(P, 25, 3) true BODY_25 keypoints of one frame."""
@@ -93,7 +99,9 @@ def built_in_scene(
     package's.
     """
     if people < 0 or frames < 0 or cameras < 2:
-        raise ValueError(f"need people >= 0, frames >= 0, cameras >= 2; got {people}, {frames}, {cameras}")
+        raise ValueError(
+            f"need people >= 0, frames >= 0, cameras >= 2; got {people}, {frames}, {cameras}"
+        )
     if body is None:
         from shapepose_fg.body.model.body_model import BodyModel
 

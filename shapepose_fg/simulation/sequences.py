@@ -14,7 +14,13 @@ import numpy as np
 
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.core.arrays import Array
-from shapepose_fg.simulation.bystanders import stand, standing_clips, walk_along, walking_clips, way_through
+from shapepose_fg.simulation.bystanders import (
+    stand,
+    standing_clips,
+    walk_along,
+    walking_clips,
+    way_through,
+)
 from shapepose_fg.simulation.choices import comparable
 from shapepose_fg.simulation.limbs import turned_about
 from shapepose_fg.simulation.mocap import Clip, Mocap
@@ -70,9 +76,13 @@ class SequenceConfig:
 
     def __post_init__(self) -> None:
         if not (0 <= self.pairs <= 2 and self.standing >= 0 and self.walking >= 0):
-            raise ValueError(f"pairs must be 0, 1 or 2, standing and walking at least 0; got {self}")
+            raise ValueError(
+                f"pairs must be 0, 1 or 2, standing and walking at least 0; got {self}"
+            )
         if not (self.close_m > 0 and self.segment_frames > 0 and self.frames >= 0):
-            raise ValueError(f"close_m, segment_frames must be positive, frames at least 0; got {self}")
+            raise ValueError(
+                f"close_m, segment_frames must be positive, frames at least 0; got {self}"
+            )
 
     @property
     def people(self) -> int:
@@ -83,7 +93,14 @@ class SequenceConfig:
 class Room:
     """The people in the room between two cuts."""
 
-    def __init__(self, body: BodyModel, config: SequenceConfig, frames: int, fps: float, rng: np.random.Generator):
+    def __init__(
+        self,
+        body: BodyModel,
+        config: SequenceConfig,
+        frames: int,
+        fps: float,
+        rng: np.random.Generator,
+    ):
         self.body, self.config, self.frames, self.fps, self.rng = body, config, frames, fps, rng
         self.performed: list[Performance] = []
         """Motions of the people, in order of arrival."""
@@ -115,16 +132,23 @@ class Room:
 
     def add_standing(self, betas: Array, clip: Clip) -> None:
         """Add a person who stays at a free spot close to the others, facing them."""
-        one = stand(self.body, betas, clip, self.frames, self.fps, start=int(self.rng.integers(10_000)))
+        one = stand(
+            self.body, betas, clip, self.frames, self.fps, start=int(self.rng.integers(10_000))
+        )
         faces = one.rotations[:, 0, :2, 2].mean(axis=0)
         spots = self.rng.uniform(-_HALF_ROOM_M, _HALF_ROOM_M, (_SPOTS, 2))
         noise = self.rng.normal(0.0, 0.5, _SPOTS)
         others = self.points(_MIDDLES)
         if others.shape[1] > 0:
-            nearest = np.linalg.norm(others[None, ::3] - spots[:, None, None], axis=-1).min(axis=(1, 2))
+            nearest = np.linalg.norm(others[None, ::3] - spots[:, None, None], axis=-1).min(
+                axis=(1, 2)
+            )
             towards = others.mean(axis=(0, 1)) - spots
         else:
-            nearest, towards = np.full(_SPOTS, self.config.close_m), np.tile([1.0, 0.0], (_SPOTS, 1))
+            nearest, towards = (
+                np.full(_SPOTS, self.config.close_m),
+                np.tile([1.0, 0.0], (_SPOTS, 1)),
+            )
         turns = np.arctan2(towards[:, 1], towards[:, 0]) - np.arctan2(faces[1], faces[0]) + noise
         short = np.maximum(self.config.close_m + 0.1 - nearest, 0.0)
         far = comparable(20 * short + np.maximum(nearest - self.config.close_m, 0.0))
@@ -167,7 +191,9 @@ class Room:
             turns, side = self.rng.uniform(-np.pi, np.pi, _PAIR_OPTIONS), 0.0
         else:
             turns = (
-                self.rng.choice([0.0, np.pi], _PAIR_OPTIONS) - along + self.rng.normal(0.0, 0.25, _PAIR_OPTIONS)
+                self.rng.choice([0.0, np.pi], _PAIR_OPTIONS)
+                - along
+                + self.rng.normal(0.0, 0.25, _PAIR_OPTIONS)
             )
             side = -0.6 if len(self.performed) == 0 else 0.6
         return turns, np.array([0.0, side]) + self.rng.normal(0.0, 0.2, (_PAIR_OPTIONS, 2))
@@ -188,7 +214,9 @@ class Room:
         best, most = [], -np.inf
         for placed in options:
             reach = max(np.abs(one.joints[:, 0, :2]).max() for one in placed)
-            free = min((self._gap(one, other) for one in placed for other in self.performed), default=0.0)
+            free = min(
+                (self._gap(one, other) for one in placed for other in self.performed), default=0.0
+            )
             free = float(comparable(min(free, _HALF_ROOM_M - float(reach))))
             if free > most:
                 best, most = placed, free
@@ -261,7 +289,8 @@ SEQUENCES: dict[str, SequenceConfig] = {
     "crossing": SequenceConfig(pairs=1, standing=1, walking=4, seed=23, **_from_afar(10.0)),
     "crowd": SequenceConfig(pairs=2, standing=2, walking=2, seed=37, **_from_afar(7.0)),
 }
-"""Sequences by name: a pair with three standing and three walking people; mostly walkers; two pairs and others."""
+"""Sequences by name: a pair with three standing and three walking people; mostly walkers; two pairs
+and others."""
 
 
 def sequence(
@@ -285,12 +314,15 @@ def sequence(
     """
     if name not in SEQUENCES or split not in TAKES:
         raise ValueError(
-            f"name must be one of {', '.join(SEQUENCES)}, split one of {', '.join(TAKES)}; got {name}, {split}"
+            f"name must be one of {', '.join(SEQUENCES)}, split one of {', '.join(TAKES)}; got "
+            f"{name}, {split}"
         )
     config = SEQUENCES[name] if config is None else config
     takes = salsa_takes(mocap, split)
     if len(takes) == 0:
-        raise ValueError(f"these recordings hold no salsa take of split {split!r}: give the whole file")
+        raise ValueError(
+            f"these recordings hold no salsa take of split {split!r}: give the whole file"
+        )
     rng = np.random.default_rng([config.seed, list(TAKES).index(split)])
     body = BodyModel.default() if body is None else body
     frames = config.frames if frames is None else frames
@@ -330,7 +362,11 @@ def salsa_takes(mocap: Mocap, split: Split) -> list[tuple[int, int]]:
 
 
 def _dances(
-    mocap: Mocap, takes: list[tuple[int, int]], config: SequenceConfig, fps: float, rng: np.random.Generator
+    mocap: Mocap,
+    takes: list[tuple[int, int]],
+    config: SequenceConfig,
+    fps: float,
+    rng: np.random.Generator,
 ) -> Iterator[tuple[Clip, Clip]]:
     """Endless stream of segments from takes in random order, each as long as possible without a
     cut.
@@ -339,7 +375,9 @@ def _dances(
         drawn = [takes[index] for index in rng.permutation(len(takes))]
         segments = [segment for pair in drawn for segment in _together_in(mocap, pair, config, fps)]
         if len(segments) == 0:
-            raise ValueError("there is no salsa take in which the two dance together: give the whole file")
+            raise ValueError(
+                "there is no salsa take in which the two dance together: give the whole file"
+            )
         yield from segments
 
 
@@ -369,7 +407,9 @@ def _shapes(config: SequenceConfig, rng: np.random.Generator) -> Array:
 def _drawn(clips: list[int], count: int, rng: np.random.Generator) -> list[int]:
     """Draw `count` clips; none is repeated before all are drawn once."""
     if count > 0 and len(clips) == 0:
-        raise ValueError("there are no standing or walking people in these recordings: give the whole file")
+        raise ValueError(
+            "there are no standing or walking people in these recordings: give the whole file"
+        )
     rounds = -(-count // max(len(clips), 1))
     return [clips[index] for _ in range(rounds) for index in rng.permutation(len(clips))][:count]
 

@@ -24,8 +24,9 @@ NOBODY, ITSELF, BORDER = -1, -2, -3
 
 _BONES = (
     "head neck+left_collar+right_collar right_shoulder+right_collar right_elbow right_wrist "
-    "left_shoulder+left_collar left_elbow left_wrist pelvis right_hip right_knee right_ankle left_hip left_knee "
-    "left_ankle head head head head left_foot left_foot left_ankle right_foot right_foot right_ankle"
+    "left_shoulder+left_collar left_elbow left_wrist pelvis right_hip right_knee right_ankle "
+    "left_hip left_knee left_ankle head head head head left_foot left_foot left_ankle right_foot "
+    "right_foot right_ankle"
 ).split()
 """Bones of each joint of BODY_25: SMPL's that begin there; for face, toes and heels the nearest. A
 collar has hardly any skin and counts for the shoulder, so that the chest is adjacent to the
@@ -33,7 +34,9 @@ shoulder."""
 FACE = tuple(BODY_25.index(name) for name in ("Nose", "REye", "LEye", "REar", "LEar"))
 """Joints of the face, which lie on the skin, not inside a limb."""
 
-_RAYS = np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (0.7, 0.7), (-0.7, 0.7), (0.7, -0.7), (-0.7, -0.7)])
+_RAYS = np.array(
+    [(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (0.7, 0.7), (-0.7, 0.7), (0.7, -0.7), (-0.7, -0.7)]
+)
 """Directions of rays around a joint, in units of the probe's radius."""
 
 FramePeople = tuple[Array, NDArray[np.float32]] | tuple[Array, NDArray[np.float32], Rig]
@@ -95,11 +98,16 @@ class Skin:
         template = body.arrays.template
         vertices, faces, cell = thinned(template, body.faces, cell_m, template.min(axis=0))
         shown = body.arrays.weights @ _bones_near(body.parents).T
-        mean = np.stack([np.bincount(cell, share) for share in shown.T], axis=1) / np.bincount(cell)[:, None]
+        mean = (
+            np.stack([np.bincount(cell, share) for share in shown.T], axis=1)
+            / np.bincount(cell)[:, None]
+        )
         return cls(vertices, faces, mean >= 0.5)
 
 
-def see(rig: Rig, joints: Array, surfaces: Real, skin: Skin, config: VisibilityConfig) -> Visibility:
+def see(
+    rig: Rig, joints: Array, surfaces: Real, skin: Skin, config: VisibilityConfig
+) -> Visibility:
     """Visibility of BODY_25 `joints` (P, 25, 3) of people with `surfaces` (P, M, 3), the vertices
     of `skin`.
 
@@ -109,11 +117,15 @@ def see(rig: Rig, joints: Array, surfaces: Real, skin: Skin, config: VisibilityC
     """
     people, size = len(joints), surfaces.shape[1]
     xy, depth = rig.project(joints)
-    in_image = np.all((xy >= 0) & (xy <= rig.image_sizes[:, None, None] - 1), axis=-1)  # false for NaN
+    in_image = np.all(
+        (xy >= 0) & (xy <= rig.image_sizes[:, None, None] - 1), axis=-1
+    )  # false for NaN
     rays = _RAYS if config.probe_m > 0 else _RAYS[:1]
     met_depth = np.full((*depth.shape, len(rays)), np.inf)
     met = np.full(met_depth.shape, -1, dtype=np.intp)
-    faces = (skin.faces[None] + np.arange(people, dtype=np.int32)[:, None, None] * size).reshape(-1, 3)
+    faces = (skin.faces[None] + np.arange(people, dtype=np.int32)[:, None, None] * size).reshape(
+        -1, 3
+    )
     points = surfaces.reshape(-1, 3)
     for view in np.flatnonzero(in_image.any(axis=(1, 2))):
         camera = scaled(rig.cameras[view], config.image_scale)
@@ -121,7 +133,9 @@ def see(rig: Rig, joints: Array, surfaces: Real, skin: Skin, config: VisibilityC
         ratio = np.array(camera.image_size) / rig.image_sizes[view]
         pixels = (xy[view][..., None, :] + radius[..., None, None] * rays + 0.5) * ratio - 0.5
         last = np.array(camera.image_size) - 1
-        column, row = np.clip(np.rint(np.nan_to_num(pixels)), 0, last).astype(np.intp).transpose(3, 0, 1, 2)
+        column, row = (
+            np.clip(np.rint(np.nan_to_num(pixels)), 0, last).astype(np.intp).transpose(3, 0, 1, 2)
+        )
         met_depth[view], met[view] = first_surface_at(points, faces, camera, column, row)
     own = np.arange(people)[:, None, None]
     owner, place = np.divmod(met, max(size, 1))  # without a surface: owner -1
@@ -151,9 +165,13 @@ class VisibilityWorker:
     def one(self, people: FramePeople) -> Visibility:
         """Visibility in one frame."""
         joints, surfaces, *moved = people
-        return see(moved[0] if len(moved) > 0 else self.rig, joints, surfaces, self.skin, self.config)
+        return see(
+            moved[0] if len(moved) > 0 else self.rig, joints, surfaces, self.skin, self.config
+        )
 
-    def all(self, frames: Iterable[FramePeople], workers: int = 1) -> Generator[Visibility, None, None]:
+    def all(
+        self, frames: Iterable[FramePeople], workers: int = 1
+    ) -> Generator[Visibility, None, None]:
         """Yield the visibility of each frame; computed in `workers` processes, or here if that is
         1.
 
@@ -165,8 +183,8 @@ class VisibilityWorker:
 
 
 def facing(joints: Array, centres: Array) -> Array:
-    """Cosine (V, P, 5) of face `joints` (P, 25, 3) between the outward direction of the head and that to
-    cameras (V, 3).
+    """Cosine (V, P, 5) of face `joints` (P, 25, 3) between the outward direction of the head and
+    that to cameras (V, 3).
     """
     face = joints[:, FACE]
     outward = face - joints[:, FACE[3:]].mean(axis=1, keepdims=True)
@@ -199,5 +217,7 @@ def _bones_near(parents: tuple[int, ...]) -> Array:
     adjacent = np.eye(len(parents))
     child, parent = np.arange(1, len(parents)), np.array(parents[1:])
     adjacent[child, parent] = adjacent[parent, child] = 1
-    own = np.array([[name in names.split("+") for name in SMPL_24] for names in _BONES], dtype=np.float64)
+    own = np.array(
+        [[name in names.split("+") for name in SMPL_24] for names in _BONES], dtype=np.float64
+    )
     return np.minimum(own @ adjacent, 1.0)

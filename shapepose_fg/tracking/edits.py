@@ -53,9 +53,14 @@ class Edit:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "action", Action(self.action))
-        for what, value, actions in (("second person", self.other, _OTHER), ("frame", self.frame, _FRAME)):
+        for what, value, actions in (
+            ("second person", self.other, _OTHER),
+            ("frame", self.frame, _FRAME),
+        ):
             if (value is not None) != (self.action in actions):
-                raise ValueError(f"{self.action} needs {'a' if self.action in actions else 'no'} {what}")
+                raise ValueError(
+                    f"{self.action} needs {'a' if self.action in actions else 'no'} {what}"
+                )
 
     def __str__(self) -> str:
         """The correction as typed on the command line."""
@@ -136,12 +141,16 @@ def solve_anew(edited: Edited, solve: Solve) -> Reconstruction:
     if len(changed) == 0:
         return people
     if people.observations is None:
-        raise ValueError("people without observations cannot be solved again; reconstruct them again")
+        raise ValueError(
+            "people without observations cannot be solved again; reconstruct them again"
+        )
     touched = np.isin(people.person, changed)
     solved = solve(people.rows(touched))
     if not np.isin(solved.person, changed).all() or solved.observations is None:
         raise ValueError("solve must return rows of the given people, with their observations")
-    return in_order(Reconstruction.concatenate([people.rows(~touched), replace(solved, run=people.run)]))
+    return in_order(
+        Reconstruction.concatenate([people.rows(~touched), replace(solved, run=people.run)])
+    )
 
 
 def in_order(people: Reconstruction) -> Reconstruction:
@@ -153,8 +162,8 @@ def _merge(people: Reconstruction, edit: Edit, rows: Mask, others: Mask) -> Edit
     both = np.intersect1d(people.frame[rows], people.frame[others])
     if len(both) > 0:
         raise ValueError(
-            f"{edit.person} and {edit.other} are both present in {len(both)} frames, first in {both[0]}, so"
-            " they are two people; split one of them there, or drop one"
+            f"{edit.person} and {edit.other} are both present in {len(both)} frames, first in "
+            f"{both[0]}, so they are two people; split one of them there, or drop one"
         )
     return _relabelled(people, {_other(edit): edit.person}, others, changed={edit.person})
 
@@ -165,10 +174,12 @@ def _split(people: Reconstruction, edit: Edit, rows: Mask) -> Edited:
     if not later.any() or (later == rows).all():
         frames = people.frame[rows]
         raise ValueError(
-            f"{edit.person} is present in frames {frames.min()} to {frames.max()} and cannot be split at"
-            f" {edit.frame}; give a frame from {frames.min() + 1} to {frames.max()}"
+            f"{edit.person} is present in frames {frames.min()} to {frames.max()} and cannot be "
+            f"split at {edit.frame}; give a frame from {frames.min() + 1} to {frames.max()}"
         )
-    return _relabelled(people, {edit.person: _other(edit)}, later, changed={edit.person, _other(edit)})
+    return _relabelled(
+        people, {edit.person: _other(edit)}, later, changed={edit.person, _other(edit)}
+    )
 
 
 def _swap(people: Reconstruction, edit: Edit, rows: Mask, others: Mask) -> Edited:
@@ -177,22 +188,26 @@ def _swap(people: Reconstruction, edit: Edit, rows: Mask, others: Mask) -> Edite
     if not later.any():
         last = people.frame[rows | others].max()
         raise ValueError(
-            f"neither {edit.person} nor {edit.other} is present from frame {edit.frame} on; give a frame up to"
-            f" {last}"
+            f"neither {edit.person} nor {edit.other} is present from frame {edit.frame} on; give "
+            f"a frame up to {last}"
         )
     names = {edit.person: _other(edit), _other(edit): edit.person}
     only_names = later.sum() == (rows | others).sum()  # both begin at or after `frame`
     return _relabelled(people, names, later, changed=set() if only_names else set(names))
 
 
-def _relabelled(people: Reconstruction, names: dict[int, int], rows: Mask, changed: set[int]) -> Edited:
+def _relabelled(
+    people: Reconstruction, names: dict[int, int], rows: Mask, changed: set[int]
+) -> Edited:
     """Rename identities in `rows` (N,) of `people`; identities without any row left
     need no solve.
     """
     person = people.person.copy()
     for old, new in names.items():
         person[rows & (people.person == old)] = new
-    return Edited(in_order(people.relabelled(person)), frozenset(changed) & frozenset(person.tolist()))
+    return Edited(
+        in_order(people.relabelled(person)), frozenset(changed) & frozenset(person.tolist())
+    )
 
 
 def _rows_of(people: Reconstruction, person: int) -> Mask:
@@ -200,7 +215,9 @@ def _rows_of(people: Reconstruction, person: int) -> Mask:
     rows = people.person == person
     if not rows.any():
         known = np.unique(people.person).tolist()
-        listed = " ".join(map(str, known[:20])) + (f" and {len(known) - 20} more" if len(known) > 20 else "")
+        listed = " ".join(map(str, known[:20])) + (
+            f" and {len(known) - 20} more" if len(known) > 20 else ""
+        )
         raise ValueError(f"there is no person {person}; there are {listed or 'none'}")
     return rows
 
@@ -208,7 +225,9 @@ def _rows_of(people: Reconstruction, person: int) -> Mask:
 def _refuse_taken(people: Reconstruction, edit: Edit) -> None:
     """Raise ValueError if the new number is in use or out of range."""
     if not 0 <= _other(edit) <= MOST_NUMBER:
-        raise ValueError(f"{edit.other} is not a valid number of a person; give one from 0 to {MOST_NUMBER}")
+        raise ValueError(
+            f"{edit.other} is not a valid number of a person; give one from 0 to {MOST_NUMBER}"
+        )
     if (people.person == edit.other).any():
         raise ValueError(
             f"{edit.other} is the number of another person; give a free one such as"

@@ -3,8 +3,8 @@ both ends.
 
 A world is a global hypothesis: a set of tracks that share no detection. People are searched for in
 several frames, tracked from there forwards and backwards, and the tracks that explain most are
-selected (`track_selection.py`). The selected people are then joined in one world in the frames that show
-them best, and tracked again from there, so that they no longer take each other's detections.
+selected (`track_selection.py`). The selected people are then joined in one world in the frames that
+show them best, and tracked again from there, so that they no longer take each other's detections.
 """
 
 from collections.abc import Iterable, Sequence
@@ -78,7 +78,9 @@ class Hypotheses:
     @cached_property
     def account(self) -> EvidenceTable:
         """The hypotheses as weighted detections for the selection."""
-        return EvidenceTable.of(self.candidate, self.weight, self.price, self.there, self.counts, self.lasts_s)
+        return EvidenceTable.of(
+            self.candidate, self.weight, self.price, self.there, self.counts, self.lasts_s
+        )
 
     def __len__(self) -> int:
         return len(self.carried)
@@ -89,8 +91,12 @@ class Hypotheses:
         names = ("carried", "there", "candidate", "places", "weight", "price")
         columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
         first = np.cumsum([0, *(int(part.world.max(initial=-1)) + 1 for part in parts)])
-        columns["world"] = np.concatenate([part.world + n for part, n in zip(parts, first, strict=False)])
-        return replace(parts[0], **columns, joints=JointStates.concatenate([part.joints for part in parts]))
+        columns["world"] = np.concatenate(
+            [part.world + n for part, n in zip(parts, first, strict=False)]
+        )
+        return replace(
+            parts[0], **columns, joints=JointStates.concatenate([part.joints for part in parts])
+        )
 
 
 @dataclass(frozen=True)
@@ -119,12 +125,17 @@ def explained(
     `carried` are the people of the frame before; `keep` is the index of the frame from which they
     are carried on.
     """
-    times, unseen = times_of(frames), np.full((len(carried), len(tracker.skeleton), len(frames[0].rig)), -1)
+    times, unseen = (
+        times_of(frames),
+        np.full((len(carried), len(tracker.skeleton), len(frames[0].rig)), -1),
+    )
     on = Seed(-1, carried, unseen, backwards=False)
     found = follow_worlds(tracker, frames, [on], keep)
     if len(frames) == 1 or _plain(found, times):
         return found, found.account.choose(found.world)
-    found = Hypotheses.concatenate([found, follow_worlds(tracker, frames, _seeds(tracker, frames), keep)])
+    found = Hypotheses.concatenate(
+        [found, follow_worlds(tracker, frames, _seeds(tracker, frames), keep)]
+    )
     before = 0.0
     for _ in range(_ROUNDS):
         best, *others = found.account.ways(found.world, on_trial=True)
@@ -166,10 +177,19 @@ def _seeds(tracker: Tracker, frames: Sequence[Input]) -> list[Seed]:
     times, nobody = times_of(frames), tracker.nobody()
     none = np.zeros((0, len(tracker.skeleton), len(frames[0].rig)), dtype=np.intp)
     back = Seed(len(frames) - 1, nobody, none, forwards=False)
-    parts = np.array_split(np.arange(len(frames)), max(1, round((times[-1] - times[0]) / (2 * _SEARCH_S))))
+    parts = np.array_split(
+        np.arange(len(frames)), max(1, round((times[-1] - times[0]) / (2 * _SEARCH_S)))
+    )
     keys = [int(part[len(part) // 2]) for part in parts if len(part) > 0]
     found = [(key, *_newcomers(tracker, nobody, none, frames[key])) for key in keys]
-    return [back, *(_seed(tracker, frames, key, places, own) for key, places, own in found if len(places) > 0)]
+    return [
+        back,
+        *(
+            _seed(tracker, frames, key, places, own)
+            for key, places, own in found
+            if len(places) > 0
+        ),
+    ]
 
 
 def _newcomers(
@@ -180,14 +200,20 @@ def _newcomers(
     return tracker.newcomers(tracks, candidate, frame.detections, frame.rig)
 
 
-def _seed(tracker: Tracker, frames: Sequence[Input], key: int, places: Array, candidate: NDArray[np.intp]) -> Seed:
+def _seed(
+    tracker: Tracker, frames: Sequence[Input], key: int, places: Array, candidate: NDArray[np.intp]
+) -> Seed:
     """A world of people at `places` (A, J, 3) with their detections in a frame."""
     zero = np.zeros(len(places), dtype=np.intp)
     return Seed(key, tracker.at(places, zero, zero, float(frames[key].time_s.mean())), candidate)
 
 
 def _restarts(
-    tracker: Tracker, frames: Sequence[Input], times: Array, found: Hypotheses, chosen: SelectedTracks
+    tracker: Tracker,
+    frames: Sequence[Input],
+    times: Array,
+    found: Hypotheses,
+    chosen: SelectedTracks,
 ) -> list[Seed]:
     """Worlds of all selected people, each from the frame of a `_RESTART_S` interval that shows them
     best.
@@ -212,7 +238,9 @@ Followed = tuple[int, Seed, NDArray[np.intp]]
 """A world's number, its seed, and the numbers of the people in it."""
 
 
-def follow_worlds(tracker: Tracker, frames: Sequence[Input], seeds: Sequence[Seed], keep: int) -> Hypotheses:
+def follow_worlds(
+    tracker: Tracker, frames: Sequence[Input], seeds: Sequence[Seed], keep: int
+) -> Hypotheses:
     """Track all `seeds` forwards and backwards through T frames, in parallel.
 
     People found on the forward pass are also tracked backwards.
@@ -229,7 +257,12 @@ def follow_worlds(tracker: Tracker, frames: Sequence[Input], seeds: Sequence[See
 
 
 def _follow(
-    tracker: Tracker, frames: Sequence[Input], seeds: Iterable[Followed], log: "_Log", *, forwards: bool
+    tracker: Tracker,
+    frames: Sequence[Input],
+    seeds: Iterable[Followed],
+    log: "_Log",
+    *,
+    forwards: bool,
 ) -> list[Followed]:
     """One pass through the frames, each seed from its frame on; returns the people found on the
     way.
@@ -258,33 +291,54 @@ def _follow(
         tracks = replace(tracks, time_s=time_s)
         for own, theirs in begins.get(t, []):
             log.add(t, own, theirs)
-            tracks, candidate = Tracks.concatenate([tracks, own]), np.concatenate([candidate, theirs])
+            tracks, candidate = (
+                Tracks.concatenate([tracks, own]),
+                np.concatenate([candidate, theirs]),
+            )
         if abs(time_s - looked_s) < _TWINS_S:
             continue
         looked_s = time_s
         gone, same = _twins(tracks, candidate)
         if len(gone) > 0:
-            log.twins.append((slice(t + 1, None) if forwards else slice(0, t), tracks.ids[gone], tracks.ids[same]))
-            births = {world: since for world, since in births.items() if world not in tracks.world[gone]}
+            log.twins.append(
+                (
+                    slice(t + 1, None) if forwards else slice(0, t),
+                    tracks.ids[gone],
+                    tracks.ids[same],
+                )
+            )
+            births = {
+                world: since for world, since in births.items() if world not in tracks.world[gone]
+            }
             rest = np.setdiff1d(np.arange(len(tracks)), gone)
             tracks, candidate = tracks.rows(rest), candidate[rest]
         if abs(time_s - sought_s) < _SEARCH_S:
             continue
         sought_s = time_s
-        for world in [world for world, since in births.items() if (since <= t if forwards else since >= t)]:
+        for world in [
+            world for world, since in births.items() if (since <= t if forwards else since >= t)
+        ]:
             here = tracks.world == world
             places, theirs = _newcomers(tracker, tracks.rows(here), candidate[here], frame)
             if len(places) > 0:
                 new = tracker.at(
-                    places, log.more(len(places), world), np.full(len(places), world, dtype=np.intp), time_s
+                    places,
+                    log.more(len(places), world),
+                    np.full(len(places), world, dtype=np.intp),
+                    time_s,
                 )
                 log.add(t, new, theirs)
                 born.append((world, Seed(t, new, theirs, births=False), new.ids))
-                tracks, candidate = Tracks.concatenate([tracks, new]), np.concatenate([candidate, theirs])
+                tracks, candidate = (
+                    Tracks.concatenate([tracks, new]),
+                    np.concatenate([candidate, theirs]),
+                )
     return born
 
 
-def _twins(tracks: Tracks, candidate: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _twins(
+    tracks: Tracks, candidate: NDArray[np.intp]
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Rows of `tracks` (A) of duplicate worlds, and the rows of the same people in the world that
     is kept.
 
@@ -312,9 +366,13 @@ class _Log:
         self.carried, self.world = list[int](), list[int]()
         self.parts = list[tuple[int, NDArray[np.intp], NDArray[np.intp], Array, Array, Array]]()
         self.kept = list[tuple[NDArray[np.intp], JointStates]]()
-        self.twins = list[tuple[slice, NDArray[np.intp], NDArray[np.intp]]]()  # frames, duplicates, kept
+        self.twins = list[
+            tuple[slice, NDArray[np.intp], NDArray[np.intp]]
+        ]()  # frames, duplicates, kept
 
-    def more(self, count: int, world: int, carried: NDArray[np.intp] | None = None) -> NDArray[np.intp]:
+    def more(
+        self, count: int, world: int, carried: NDArray[np.intp] | None = None
+    ) -> NDArray[np.intp]:
         """Numbers for `count` new people of a world."""
         first = len(self.carried)
         self.world += [world] * count
@@ -337,7 +395,10 @@ class _Log:
         """Everything recorded, as hypotheses."""
         H, T, (J, V) = len(self.carried), len(self.frames), self.shape
         there = np.zeros((H, T), dtype=bool)
-        candidate, price = np.full((H, T, J, V), -1, dtype=np.int32), np.zeros((H, T), dtype=np.float32)
+        candidate, price = (
+            np.full((H, T, J, V), -1, dtype=np.int32),
+            np.zeros((H, T), dtype=np.float32),
+        )
         places, weight = np.full((H, T, J, 3), np.nan), np.zeros((H, T, J, V), dtype=np.float32)
         for t, ids, own, at, counts, costs in self.parts:
             there[ids, t], candidate[ids, t], places[ids, t] = True, own, at
@@ -355,4 +416,6 @@ class _Log:
         joints = JointStates(mean, covariance)
         counts = np.array([len(frame.detections) for frame in self.frames], dtype=np.intp)
         lasts_s = lasting(times_of(self.frames))
-        return Hypotheses(carried, world, there, candidate, places, weight, price, joints, counts, lasts_s)
+        return Hypotheses(
+            carried, world, there, candidate, places, weight, price, joints, counts, lasts_s
+        )

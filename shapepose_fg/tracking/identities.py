@@ -107,10 +107,14 @@ def _decide(tracker: Tracker, state: FollowState, own: int) -> tuple[FollowState
         tracker.drop(_UNLIKELY, [frame.frame for frame in frames[start : min(stop, own)]])
     chosen = _with_detections(found, chosen, first=len(state.people) == 0, last=own == len(frames))
     identity, next_id = _identities(found, chosen, state, times_of(frames), own, tracker.skeleton)
-    rows = {keys[t]: _rows(frame, t, found, chosen, identity) for t, frame in enumerate(frames[:own])}
+    rows = {
+        keys[t]: _rows(frame, t, found, chosen, identity) for t, frame in enumerate(frames[:own])
+    }
     nobody = next(iter(rows.values())).rows(slice(0, 0))
     held = dict(zip(keys, frames, strict=True))
-    decided = [(held.get(n, frame), rows.get(n, nobody)) for n, frame in enumerate(state.pending[:until])]
+    decided = [
+        (held.get(n, frame), rows.get(n, nobody)) for n, frame in enumerate(state.pending[:until])
+    ]
     last = chosen.during(own - 1) & (identity >= 0)
     who = chosen.hypothesis[last]
     people = people_at(frames[own - 1], identity[last], found.joints.rows(who))
@@ -123,7 +127,9 @@ def people_at(frame: Input, ids: Index, joints: JointStates) -> Tracks:
     return Tracks(time_s, ids, zero, joints, np.full(len(ids), time_s))
 
 
-def _with_detections(found: Hypotheses, chosen: SelectedTracks, *, first: bool, last: bool) -> SelectedTracks:
+def _with_detections(
+    found: Hypotheses, chosen: SelectedTracks, *, first: bool, last: bool
+) -> SelectedTracks:
     """Trim people to their first detection, if nobody precedes the `first` frame, and to their last
     detection, if nothing follows the `last` frame: at these ends, unseen frames would cost less
     than a birth or death.
@@ -138,7 +144,10 @@ def _with_detections(found: Hypotheses, chosen: SelectedTracks, *, first: bool, 
 
 def alone(tracker: Tracker, given: Input, next_id: int) -> Decided:
     """Process an isolated frame: people found by stage I, numbered from `next_id` on."""
-    nobody, none = tracker.nobody(), np.zeros((0, len(tracker.skeleton), len(given.rig)), dtype=np.intp)
+    nobody, none = (
+        tracker.nobody(),
+        np.zeros((0, len(tracker.skeleton), len(given.rig)), dtype=np.intp),
+    )
     for _ in range(_ROUNDS):
         places, candidate = tracker.newcomers(nobody, none, given.detections, given.rig)
         there = np.arange(len(places))
@@ -149,7 +158,9 @@ def alone(tracker: Tracker, given: Input, next_id: int) -> Decided:
     return given, observed(given, candidate, places, next_id + np.arange(len(places)))
 
 
-def _rows(given: Input, t: int, found: Hypotheses, chosen: SelectedTracks, identity: Index) -> Observations:
+def _rows(
+    given: Input, t: int, found: Hypotheses, chosen: SelectedTracks, identity: Index
+) -> Observations:
     """The people of a frame as observations, each identity once; uncertain joints are NaN."""
     here = np.flatnonzero(chosen.during(t) & (identity >= 0))
     _, first = np.unique(identity[here], return_index=True)
@@ -166,13 +177,21 @@ def observed(
     """Observations of people at `places` (P, J, 3), m, in a frame, with detections (P, J, V), -1
     for none.
     """
-    frame, time_s = np.full(len(track), given.frame), np.repeat(given.time_s[None], len(track), axis=0)
+    frame, time_s = (
+        np.full(len(track), given.frame),
+        np.repeat(given.time_s[None], len(track), axis=0),
+    )
     told = {"track": track, "frame": frame, "time_s": time_s, "evidence": evidence}
     return Observations.of(candidate, given.detections, places, **told)
 
 
 def _identities(
-    found: Hypotheses, chosen: SelectedTracks, state: FollowState, times: Array, own: int, skeleton: Skeleton
+    found: Hypotheses,
+    chosen: SelectedTracks,
+    state: FollowState,
+    times: Array,
+    own: int,
+    skeleton: Skeleton,
 ) -> tuple[Index, int]:
     """(K,) identity of each chosen person, -1 if present only in later frames; and the next unused
     identity.
@@ -185,7 +204,9 @@ def _identities(
     needed = chosen.start < own
     early = np.flatnonzero(needed & (chosen.start == 0))
     carried = np.flatnonzero((found.carried >= 0) & found.there[:, 0])
-    apart = core_distance(found.places[chosen.hypothesis[early], 0], found.places[carried, 0], skeleton)
+    apart = core_distance(
+        found.places[chosen.hypothesis[early], 0], found.places[carried, 0], skeleton
+    )
     for row, column in zip(*least_cost_pairs(np.minimum(apart, 2 * _SAME_M)), strict=True):
         if apart[row, column] < _SAME_M:
             identity[early[row]] = found.carried[carried[column]]
@@ -200,7 +221,12 @@ def _identities(
 
 
 def _returned(
-    found: Hypotheses, chosen: SelectedTracks, k: int, identity: Index, times: Array, skeleton: Skeleton
+    found: Hypotheses,
+    chosen: SelectedTracks,
+    k: int,
+    identity: Index,
+    times: Array,
+    skeleton: Skeleton,
 ) -> int:
     """Identity of the nearest person who disappeared before the `k`-th chosen appears;
     -1 for none.
@@ -211,7 +237,9 @@ def _returned(
         again = (identity == identity[j]) & (chosen.stop > chosen.stop[j])
         gap_s = times[start] - times[chosen.stop[j] - 1]
         there = _left_at(
-            found.places[chosen.hypothesis[j], chosen.start[j] : chosen.stop[j]], times[chosen.start[j] :], gap_s
+            found.places[chosen.hypothesis[j], chosen.start[j] : chosen.stop[j]],
+            times[chosen.start[j] :],
+            gap_s,
         )
         apart = float(core_distance(here, there, skeleton)[0, 0])
         if not again.any() and apart < min(nearest_m, _SAME_M + _WALK_MPS * gap_s):
@@ -231,7 +259,11 @@ def _left_at(places: Array, times: Array, later_s: float) -> Array:
     known = np.isfinite(moved).all(axis=-1)
     if not known.any():
         return places[[last]]
-    pace = np.median(moved[known], axis=0) / (times[last] - times[first]) if first < last else np.zeros(3)
+    pace = (
+        np.median(moved[known], axis=0) / (times[last] - times[first])
+        if first < last
+        else np.zeros(3)
+    )
     return (places[last] + min(later_s, _COASTS_S) * pace)[None]
 
 

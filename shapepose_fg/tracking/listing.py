@@ -45,18 +45,24 @@ _TOGETHER = 40_000
 """Maximum number of rows of a saved result in memory at once, plus those of one person."""
 
 
-def list_saved_tracks(opened: OpenedReconstruction, body: SmplArrays | None = None) -> list[TrackSummary]:
+def list_saved_tracks(
+    opened: OpenedReconstruction, body: SmplArrays | None = None
+) -> list[TrackSummary]:
     """`list_tracks` of a saved result, loading a few people at a time."""
     numbers, counts = np.unique(opened.person, return_counts=True)
     group = (np.cumsum(counts) - counts) // _TOGETHER
     return [
         track
         for n in np.unique(group)
-        for track in list_tracks(opened.people(numbers[group == n].tolist(), observations=False), body)
+        for track in list_tracks(
+            opened.people(numbers[group == n].tolist(), observations=False), body
+        )
     ]
 
 
-def list_tracks(people: Reconstruction, body: SmplArrays | None = None, every: int = 1) -> list[TrackSummary]:
+def list_tracks(
+    people: Reconstruction, body: SmplArrays | None = None, every: int = 1
+) -> list[TrackSummary]:
     """Summaries of the identities of `people`, by number; statures need the model `body` and are
     NaN without it.
 
@@ -81,7 +87,9 @@ def _mean_betas(betas: Array) -> Array:
     return betas[fitted].mean(axis=0) if fitted.any() else np.full(betas.shape[1], np.nan)
 
 
-def _summary(people: Reconstruction, person: int, rows: Index, stature_m: float, every: int) -> TrackSummary:
+def _summary(
+    people: Reconstruction, person: int, rows: Index, stature_m: float, every: int
+) -> TrackSummary:
     """Summary of the identity in `rows`, sorted by frame."""
     frame, known = people.frame[rows], people.known[rows]
     placed = np.isfinite(people.joints[rows]).all(axis=-1)

@@ -55,7 +55,13 @@ class Trust(NamedTuple):
 
 
 def measured(
-    joints: JointStates, lost: Mask, candidate: Index, weight: Array, sight: Sight, trust: Trust, bones: Bones
+    joints: JointStates,
+    lost: Mask,
+    candidate: Index,
+    weight: Array,
+    sight: Sight,
+    trust: Trust,
+    bones: Bones,
 ) -> tuple[JointStates, Index, Mask]:
     """Update people's joints with the detections `candidate` (A, J, V) of a frame, -1 for none.
 
@@ -77,13 +83,24 @@ def _measure(mean, covariance, lost, candidate, confident, sight, trust, bones, 
     `candidate` to -1, and fill in `evident` (A,).
     """
     people, joints, views = candidate.shape
-    sigma_px, depths, sure, room = np.empty(views), np.empty(views), np.empty(views), np.empty(views)
+    sigma_px, depths, sure, room = (
+        np.empty(views),
+        np.empty(views),
+        np.empty(views),
+        np.empty(views),
+    )
     at, uv, inlier = np.empty(3), np.empty((views, 2)), np.empty((joints, views), dtype=np.bool_)
     L, g, M, gain = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty((3, mean.shape[2], 3))
     trusted, torn = np.empty(joints, dtype=np.bool_), np.empty(joints, dtype=np.bool_)
     seen_by, above = np.empty(joints, dtype=np.intp), np.empty(joints, dtype=np.intp)
     way_m, count, too_long = np.empty(joints), np.empty(joints), np.empty(joints)
-    cameras, focal, xy, core, scatter = sight.cameras, sight.focal, sight.xy, bones.core, trust.scatter
+    cameras, focal, xy, core, scatter = (
+        sight.cameras,
+        sight.focal,
+        sight.xy,
+        bones.core,
+        trust.scatter,
+    )
     numbers, fixed_m = trust[1:], trust.fixed_depth_m
     longest_m, parents = bones.longest_m, bones.parents
     for a in range(people):
@@ -93,7 +110,9 @@ def _measure(mean, covariance, lost, candidate, confident, sight, trust, bones, 
         for j in range(joints):
             for v in range(views if not sight.swings[j] else 0):
                 d = candidate[a, j, v]
-                trunk += d >= 0 and _apart_m(mean[a, j], cameras[v], focal[v], xy[d]) < trust.rho_2d_m
+                trunk += (
+                    d >= 0 and _apart_m(mean[a, j], cameras[v], focal[v], xy[d]) < trust.rho_2d_m
+                )
         for j in range(joints):
             seen, near, at[0], at[1], at[2] = 0, 0, mean[a, j, 0], mean[a, j, 1], mean[a, j, 2]
             for v in range(views):
@@ -112,15 +131,32 @@ def _measure(mean, covariance, lost, candidate, confident, sight, trust, bones, 
                     sure[v] = sight.confidence[d] if d >= 0 else 0.0
                     uv[v, 0], uv[v, 1] = xy[d, 0], xy[d, 1]
                 scale_m, reach_m = 2.0 * trust.sigma_m, trust.rho_2d_m
-                if triangulated(cameras, focal, uv, sure, scale_m, reach_m, MIN_DEPTH_M, room, at) < 2:
+                if (
+                    triangulated(cameras, focal, uv, sure, scale_m, reach_m, MIN_DEPTH_M, room, at)
+                    < 2
+                ):
                     at[0], at[1], at[2] = mean[a, j, 0], mean[a, j, 1], mean[a, j, 2]
             if seen > 0:
                 for _ in range(_ITERATIONS):
-                    _linearise(at, candidate[a, j], sigma_px, cameras, focal, xy, numbers, L, g, inlier[j])
+                    _linearise(
+                        at, candidate[a, j], sigma_px, cameras, focal, xy, numbers, L, g, inlier[j]
+                    )
                     _move(mean[a, j], covariance[a, j], at, L, g, M, gain)
                 _update(mean[a, j], covariance[a, j], L, M, gain)
             trusted[j], seen_by[j] = sigma(covariance[a, j]) < TRUSTED_M, inlier[j].sum()
-        tear(mean[a], trusted, seen_by, longest_m, parents, FARTHEST_M, above, way_m, count, too_long, torn)
+        tear(
+            mean[a],
+            trusted,
+            seen_by,
+            longest_m,
+            parents,
+            FARTHEST_M,
+            above,
+            way_m,
+            count,
+            too_long,
+            torn,
+        )
         twice, most = 0, 0
         for j in range(joints):
             for v in range(views):
@@ -167,7 +203,9 @@ def _linearise(place, candidate, sigma_px, cameras, focal, xy, numbers, L, g, in
         inlier[v] = False
         if sigma_px[v] > 0:
             of_view = place, cameras[v], focal[v], xy[candidate[v]], sigma_px[v]
-            inlier[v] = add_detection(*of_view, fixed_m, MIN_DEPTH_M, rho_m, False, robust, width, L, g)[0]
+            inlier[v] = add_detection(
+                *of_view, fixed_m, MIN_DEPTH_M, rho_m, False, robust, width, L, g
+            )[0]
 
 
 @part
@@ -179,7 +217,9 @@ def _move(mean, P, place, L, g, M, gain):
     """
     for i in range(3):
         for k in range(3):
-            M[i, k] = L[i, 0] * P[0, k] + L[i, 1] * P[1, k] + L[i, 2] * P[2, k] + (1.0 if i == k else 0.0)
+            M[i, k] = (
+                L[i, 0] * P[0, k] + L[i, 1] * P[1, k] + L[i, 2] * P[2, k] + (1.0 if i == k else 0.0)
+            )
     _invert(M)
     for i in range(len(mean)):
         for k in range(3):
@@ -188,7 +228,9 @@ def _move(mean, P, place, L, g, M, gain):
     for i in range(3):
         M[0, i] = L[i, 0] * x + L[i, 1] * y + L[i, 2] * z - g[i]
     for i in range(3):
-        place[i] = mean[i] + gain[0, i, 0] * M[0, 0] + gain[0, i, 1] * M[0, 1] + gain[0, i, 2] * M[0, 2]
+        place[i] = (
+            mean[i] + gain[0, i, 0] * M[0, 0] + gain[0, i, 1] * M[0, 1] + gain[0, i, 2] * M[0, 2]
+        )
 
 
 @part
@@ -197,7 +239,9 @@ def _update(mean, P, L, M, gain):
     for i in range(len(mean)):
         mean[i] += gain[0, i, 0] * M[0, 0] + gain[0, i, 1] * M[0, 1] + gain[0, i, 2] * M[0, 2]
         for k in range(3):
-            gain[1, i, k] = gain[0, i, 0] * L[0, k] + gain[0, i, 1] * L[1, k] + gain[0, i, 2] * L[2, k]
+            gain[1, i, k] = (
+                gain[0, i, 0] * L[0, k] + gain[0, i, 1] * L[1, k] + gain[0, i, 2] * L[2, k]
+            )
             gain[2, i, k] = P[i, k]
     for i in range(len(mean)):
         for k in range(i + 1):
@@ -211,7 +255,17 @@ def _update(mean, P, L, M, gain):
 @part
 def _invert(M):
     """Invert a matrix (3, 3) in place."""
-    a, b, c, d, e, f, g, h, i = M[0, 0], M[0, 1], M[0, 2], M[1, 0], M[1, 1], M[1, 2], M[2, 0], M[2, 1], M[2, 2]
+    a, b, c, d, e, f, g, h, i = (
+        M[0, 0],
+        M[0, 1],
+        M[0, 2],
+        M[1, 0],
+        M[1, 1],
+        M[1, 2],
+        M[2, 0],
+        M[2, 1],
+        M[2, 2],
+    )
     first, second, third = e * i - f * h, f * g - d * i, d * h - e * g
     over = 1.0 / (a * first + b * second + c * third)
     M[0, 0], M[0, 1], M[0, 2] = first * over, (c * h - b * i) * over, (b * f - c * e) * over

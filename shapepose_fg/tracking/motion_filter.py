@@ -78,10 +78,17 @@ class Bones(NamedTuple):
     @classmethod
     def of(cls, skeleton: Skeleton, longest_m: Array) -> "Bones":
         """Build it from a detector's skeleton."""
-        core, order = np.zeros(len(skeleton), dtype=bool), np.concatenate(skeleton.tree_levels).astype(np.intp)
+        core, order = (
+            np.zeros(len(skeleton), dtype=bool),
+            np.concatenate(skeleton.tree_levels).astype(np.intp),
+        )
         core[list(skeleton.core)] = True
         return cls(
-            core, order, np.array(skeleton.parents), np.array(skeleton.hips), np.array(longest_m, dtype=float)
+            core,
+            order,
+            np.array(skeleton.parents),
+            np.array(skeleton.hips),
+            np.array(longest_m, dtype=float),
         )
 
 
@@ -99,7 +106,19 @@ def predicted(
     lost, room = np.empty(mean.shape[:2], dtype=bool), np.empty((2, mean.shape[2]))
     F, noise = _step(motion, step_s)
     decay = float(np.exp(-abs(step_s) / _FOLLOW_S))
-    _predict(joints.mean, joints.covariance, F, noise, density, decay, bones, room, mean, covariance, lost)
+    _predict(
+        joints.mean,
+        joints.covariance,
+        F,
+        noise,
+        density,
+        decay,
+        bones,
+        room,
+        mean,
+        covariance,
+        lost,
+    )
     return JointStates(mean, covariance), lost
 
 
@@ -126,7 +145,9 @@ def _across(P):
 
 
 @kernel("f3 f4 f2 f2 f1 f0", Bones, "f2 f3 f4 b2")
-def _predict(mean, covariance, F, noise, density, decay, bones, room, mean_after, covariance_after, lost):
+def _predict(
+    mean, covariance, F, noise, density, decay, bones, room, mean_after, covariance_after, lost
+):
     """Predict all joints: F m and F P F^T + q Q, with F and Q (n, n) per axis; `room` (2, S) is
     workspace.
     """
@@ -164,16 +185,28 @@ def _predict(mean, covariance, F, noise, density, decay, bones, room, mean_after
                     for k in range(row % 3, size, 3):
                         half[column] += F[row // 3, k // 3] * covariance[a, j, k, column]
                 for column in range(row + 1):
-                    total = density[j] * noise[row // 3, column // 3] if row % 3 == column % 3 else 0.0
+                    total = (
+                        density[j] * noise[row // 3, column // 3] if row % 3 == column % 3 else 0.0
+                    )
                     for k in range(column % 3, size, 3):
                         total += half[k] * F[column // 3, k // 3]
-                    covariance_after[a, j, row, column] = covariance_after[a, j, column, row] = total
+                    covariance_after[a, j, row, column] = covariance_after[a, j, column, row] = (
+                        total
+                    )
             lost[a, j] = _across(covariance_after[a, j]) > LOST_M and was_m > TRUSTED_M
             any_placed = any_placed or (core[j] and not lost[a, j])
         for j in order:
             lost[a, j] = lost[a, j] and any_placed  # else no parent is placed
             if lost[a, j]:
-                _put_beside(mean_after[a], covariance_after[a], j, parents[j], right, left, bones.longest_m[j])
+                _put_beside(
+                    mean_after[a],
+                    covariance_after[a],
+                    j,
+                    parents[j],
+                    right,
+                    left,
+                    bones.longest_m[j],
+                )
 
 
 @part

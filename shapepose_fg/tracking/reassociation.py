@@ -69,7 +69,9 @@ def changed(before: Observations, now: Observations) -> float:
     return float((before.candidate != now.candidate)[seen].sum() / max(seen.sum(), 1))
 
 
-def _given_out(frame: Input, joints: Array, sigma_m: Array, skeleton: Skeleton) -> tuple[Index, Array]:
+def _given_out(
+    frame: Input, joints: Array, sigma_m: Array, skeleton: Skeleton
+) -> tuple[Index, Array]:
     """(P, J, V) detections assigned to one frame's people, and their probabilities."""
     predicted = Predicted(joints, sigma_m, lost=~np.isfinite(sigma_m))
     return assign_with_probability(predicted, Sight.of(frame.detections, frame.rig, skeleton))
@@ -78,10 +80,14 @@ def _given_out(frame: Input, joints: Array, sigma_m: Array, skeleton: Skeleton) 
 def probabilities_of(frame: Input, candidate: Index, joints: Array, skeleton: Skeleton) -> Array:
     """(P,) existence probability of each person of a frame."""
     there = Frame(frame.detections, frame.rig, skeleton, longest_bones(skeleton))
-    return existence(PossiblePeople(joints, candidate, gaps(joints, candidate, there)), there, PRIOR_WITH_BODY)
+    return existence(
+        PossiblePeople(joints, candidate, gaps(joints, candidate, there)), there, PRIOR_WITH_BODY
+    )
 
 
-def who_goes(sure: Array, joints: Array, skeleton: Skeleton, least: float, double_m: float = _DOUBLE_M) -> Mask:
+def who_goes(
+    sure: Array, joints: Array, skeleton: Skeleton, least: float, double_m: float = _DOUBLE_M
+) -> Mask:
     """(P,) whether to remove: the least probable person below `least`, and the less probable of
     duplicates.
     """

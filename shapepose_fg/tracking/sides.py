@@ -62,22 +62,33 @@ class _Compared:
     @classmethod
     def of(cls, given: Input, ids: Index, joints: JointStates, skeleton: Skeleton) -> "_Compared":
         """Match the 2D people of a frame with the people `ids` (A,) of predicted `joints` (A)."""
-        found, rig, mirror, part = given.detections, given.rig, np.array(skeleton.mirror), paired_parts(skeleton)
+        found, rig, mirror, part = (
+            given.detections,
+            given.rig,
+            np.array(skeleton.mirror),
+            paired_parts(skeleton),
+        )
         states = exchanges(skeleton)
         if len(ids) == 0:
             return cls((), ids[:0], np.zeros((0, len(states))))
         groups = [group for group in group_people(found) if len(group) >= len(skeleton.core) // 2]
         who, log = np.full(len(groups), -1), np.zeros((len(groups), len(states)))
         xy, depth = rig.project(joints.position)  # (V, A, J, 2), (V, A, J)
-        unit_px = rig.focal_px[:, None, None] / np.maximum(depth, 0.2) * np.hypot(_NEAR_M, joints.sigma_m)
+        unit_px = (
+            rig.focal_px[:, None, None] / np.maximum(depth, 0.2) * np.hypot(_NEAR_M, joints.sigma_m)
+        )
         for number, group in enumerate(groups):
             view, joint = int(found.view[group[0]]), found.joint[group]
             apart = [
-                np.square((xy[view][:, each] - found.xy[group]) / unit_px[view][:, each, None]).sum(axis=-1)
+                np.square((xy[view][:, each] - found.xy[group]) / unit_px[view][:, each, None]).sum(
+                    axis=-1
+                )
                 for each in (joint, mirror[joint])
             ]
             of_part = np.eye(states.shape[1] + 1)[part[joint]]
-            same, turned = np.minimum(np.nan_to_num(apart, nan=_FARTHEST), _FARTHEST) @ of_part  # (A, parts)
+            same, turned = (
+                np.minimum(np.nan_to_num(apart, nan=_FARTHEST), _FARTHEST) @ of_part
+            )  # (A, parts)
             apart_of = np.minimum(same, turned).sum(axis=1) / len(group)
             best = int(apart_of.argmin())
             if apart_of[best] < _FITS:
@@ -101,15 +112,23 @@ class _Compared:
         """(G', S) `log` of the 2D people of one person."""
         return self.log[self.who == number]
 
-    def corrected(self, given: Input, own: Mapping[int, tuple[Mask, Array]], skeleton: Skeleton) -> Input:
+    def corrected(
+        self, given: Input, own: Mapping[int, tuple[Mask, Array]], skeleton: Skeleton
+    ) -> Input:
         """The frame with left-right swaps corrected.
 
         `own` has, by number, the people who are swapped themselves: which parts (K,), and the
         probability (K,) that this is wrong. All others are assumed to be right.
         """
         found, mirror, part = given.detections, np.array(skeleton.mirror), paired_parts(skeleton)
-        wrong, mirrored, right = np.zeros(len(found), dtype=bool), found.mirrored.copy(), np.zeros(part.max())
-        for group, who, exchanged in zip(self.groups, self.who.tolist(), self.exchanged(skeleton), strict=True):
+        wrong, mirrored, right = (
+            np.zeros(len(found), dtype=bool),
+            found.mirrored.copy(),
+            np.zeros(part.max()),
+        )
+        for group, who, exchanged in zip(
+            self.groups, self.who.tolist(), self.exchanged(skeleton), strict=True
+        ):
             if who >= 0:
                 of, (turned, doubt) = part[found.joint[group]], own.get(who, (right, right))
                 if who in own:
@@ -162,25 +181,38 @@ def hold(tracker: Tracker, frames: Sequence[Input], carried: Tracks) -> list[Inp
             if len(places) > 0:
                 new = count + np.arange(len(places))
                 others = tracker.at(places, new, 0 * new, time_s)
-                tracks, count = Tracks.concatenate([replace(tracks, time_s=time_s), others]), count + len(new)
+                tracks, count = (
+                    Tracks.concatenate([replace(tracks, time_s=time_s), others]),
+                    count + len(new),
+                )
                 seen = _Compared.of(each, tracks.ids, tracks.joints, skeleton)
         compared.append(seen)
         for row, number in enumerate(tracks.ids.tolist()):
             views, before = seen.of_person(number), looks.get(number, [])
             if views.argmax(axis=1).any() and (not before or time_s - before[-1].time_s >= _LOOK_S):
-                looks[number] = [*before, _Look(n, time_s, tracks.joints.rows(np.array([row])), views)]
-    own = {name: _own_sides(tracker, found, followed=name < len(carried)) for name, found in looks.items()}
+                looks[number] = [
+                    *before,
+                    _Look(n, time_s, tracks.joints.rows(np.array([row])), views),
+                ]
+    own = {
+        name: _own_sides(tracker, found, followed=name < len(carried))
+        for name, found in looks.items()
+    }
     held = list[Input]()
     for n, (each, seen) in enumerate(zip(frames, compared, strict=True)):
         now = dict[int, tuple[Mask, Array]]()
         for number, (turned, doubt) in own.items():
-            at = max(int(np.searchsorted([look.frame for look in looks[number]], n, side="right")) - 1, 0)
+            at = max(
+                int(np.searchsorted([look.frame for look in looks[number]], n, side="right")) - 1, 0
+            )
             now[number] = turned[at], doubt[at]
         held.append(seen.corrected(each, now, tracker.skeleton))
     return held
 
 
-def hold_now(tracker: Tracker, tracks: Tracks, given: Input, *, followed: bool = True) -> tuple[Tracks, Input]:
+def hold_now(
+    tracker: Tracker, tracks: Tracks, given: Input, *, followed: bool = True
+) -> tuple[Tracks, Input]:
     """Correct left-right swaps in the tracks and the next frame; returns both.
 
     `followed`: people most probably had their sides right before this frame.
@@ -196,7 +228,9 @@ def hold_now(tracker: Tracker, tracks: Tracks, given: Input, *, followed: bool =
             own[number], order = (turned, doubt), _order(turned, skeleton)
             if not _doubtful(doubt, skeleton):
                 mean[row], covariance[row] = mean[row, order], covariance[row, order]
-    return replace(tracks, joints=JointStates(mean, covariance)), seen.corrected(given, own, skeleton)
+    return replace(tracks, joints=JointStates(mean, covariance)), seen.corrected(
+        given, own, skeleton
+    )
 
 
 def _own_sides(tracker: Tracker, looks: Sequence[_Look], *, followed: bool) -> tuple[Mask, Array]:
@@ -255,7 +289,9 @@ def _doubtful(doubt: Array, skeleton: Skeleton) -> bool:
 def _order(exchanged: Array, skeleton: Skeleton) -> Index:
     """(J,) order of the joints with the sides of some parts (K,) exchanged."""
     mirror = np.array(skeleton.mirror)
-    return np.where(np.append(False, exchanged)[paired_parts(skeleton)], mirror, np.arange(len(mirror)))
+    return np.where(
+        np.append(False, exchanged)[paired_parts(skeleton)], mirror, np.arange(len(mirror))
+    )
 
 
 def _prior(count: int) -> Array:
@@ -271,7 +307,9 @@ def exchanges(skeleton: Skeleton) -> Mask:
 
 @cache
 def paired_parts(skeleton: Skeleton) -> Index:
-    """(J,) number of the part (arms, legs, face) that each joint belongs to; 0 for joints in the middle."""
+    """(J,) number of the part (arms, legs, face) that each joint belongs to; 0 for joints in the
+    middle.
+    """
     top = np.arange(len(skeleton))
     for level in skeleton.tree_levels[1:]:
         for j in level.tolist():

@@ -59,7 +59,9 @@ class Trace(Rows):
         core = list(skeleton.core)
         bone = np.array([(j, p) for j, p in enumerate(skeleton.parents) if j in core and p in core])
         known = np.asarray(np.isfinite(joints[:, core]).all(axis=-1))[..., None]
-        centre = np.where(known, joints[:, core], 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
+        centre = np.where(known, joints[:, core], 0.0).sum(axis=1) / np.maximum(
+            known.sum(axis=1), 1
+        )
         length = np.linalg.norm(joints[:, bone[:, 0]] - joints[:, bone[:, 1]], axis=-1)
         return cls(track, time_s, centre, length)
 
@@ -86,9 +88,13 @@ class Ends:
     @classmethod
     def of(cls, traces: Iterable[Trace]) -> "Ends":
         """Summarise tracks one at a time, to save memory."""
-        rows = [(each.track, each.time_s[[0, -1]], each.centre[[0, -1]], each.build) for each in traces]
+        rows = [
+            (each.track, each.time_s[[0, -1]], each.centre[[0, -1]], each.build) for each in traces
+        ]
         if len(rows) == 0:
-            return cls(np.zeros(0, np.intp), np.zeros((0, 2)), np.zeros((0, 2, 3)), np.zeros((0, 0)))
+            return cls(
+                np.zeros(0, np.intp), np.zeros((0, 2)), np.zeros((0, 2, 3)), np.zeros((0, 0))
+            )
         return cls(*map(np.array, zip(*rows, strict=True)))
 
 
@@ -108,7 +114,9 @@ def stitch(ends: Ends, config: StitchingConfig, cuts_s: Sequence[float] = ()) ->
     return {int(ends.track[place]): int(name) for place, name in names.items()}
 
 
-def _pairs(ends: Ends, config: StitchingConfig, cuts_s: Sequence[float]) -> tuple[Index, Index, Array]:
+def _pairs(
+    ends: Ends, config: StitchingConfig, cuts_s: Sequence[float]
+) -> tuple[Index, Index, Array]:
     """Possible pairs: tracks (K,), possible successors (K,), and the cost of each pair
     (`_costs`).
     """

@@ -97,7 +97,8 @@ def weighed(
 
 @kernel("i3 f3 b2 i1", Sight, "i2 i2 f1 f3 f3 f2 f1 f3 f1")
 def _weigh(
-    candidate, places, known, world, sight, limbs, lists, tied, at, seen, box, expected, weight, price
+    candidate, places, known, world, sight, limbs, lists, tied, at, seen, box, expected, weight,
+    price
 ):  # fmt: skip
     """Fill in the results of `weighed`, zero before; `expected` (A,) counts the expected
     detections.
@@ -248,12 +249,23 @@ class EvidenceTable:
         """
         shape = (*there.shape, candidate[0, 0].size if there.size > 0 else 0)
         first, count = (np.cumsum(counts) - counts).astype(np.int32), int(counts.sum())
-        place = np.where(candidate >= 0, candidate + first[:, None, None], np.int32(count)).reshape(shape)
+        place = np.where(candidate >= 0, candidate + first[:, None, None], np.int32(count)).reshape(
+            shape
+        )
         weights = np.where(candidate >= 0, weight, np.float32(0)).reshape(shape)
         place, weights = place.astype(np.int32, copy=False), weights.astype(np.float32, copy=False)
         seen = np.append(np.flatnonzero(counts), 0)
         span, least_s = (int(seen[0]), int(seen.max())), min(LEAST_S, _EVEN * float(lasts_s.sum()))
-        return cls(place, weights, np.asarray(price, dtype=np.float64), there, lasts_s, count, *span, least_s)
+        return cls(
+            place,
+            weights,
+            np.asarray(price, dtype=np.float64),
+            there,
+            lasts_s,
+            count,
+            *span,
+            least_s,
+        )
 
     def choose(self, world: Index) -> SelectedTracks:
         """The best selection of `ways`."""
@@ -286,7 +298,9 @@ class EvidenceTable:
         """
         owners = np.full((2, self.detections + 1), -1)
         for owner, chosen in zip(owners, (one, other), strict=True):
-            for n, (h, start, stop) in enumerate(zip(chosen.hypothesis, chosen.start, chosen.stop, strict=True)):
+            for n, (h, start, stop) in enumerate(
+                zip(chosen.hypothesis, chosen.start, chosen.stop, strict=True)
+            ):
                 owner[self.place[h, start:stop]] = n
         owners = owners[:, :-1][:, (owners[:, :-1] >= 0).any(axis=0)]
         shared = np.zeros((len(one.start) + 1, len(other.start) + 1))
@@ -315,7 +329,9 @@ class EvidenceTable:
         _holders(self.place, self.weight, begin, who, what)
         return begin[:-1], who, what
 
-    def in_turn(self, first: Mask, asked: float = 1.0, besides: SelectedTracks | None = None) -> SelectedTracks:
+    def in_turn(
+        self, first: Mask, asked: float = 1.0, besides: SelectedTracks | None = None
+    ) -> SelectedTracks:
         """Select tracks greedily, those in `first` (H,) with priority, while they have the minimum
         evidence times `asked`.
 
@@ -338,8 +354,8 @@ class EvidenceTable:
 
 @kernel("w3 s3 i1 w1 s1")
 def _holders(place, weight, begin, who, what):
-    """Fill in `EvidenceTable.holders` from indices and weights (H, T, K); `begin` (D + 2,) starts with
-    two zeros.
+    """Fill in `EvidenceTable.holders` from indices and weights (H, T, K); `begin` (D + 2,) starts
+    with two zeros.
     """
     people, frames, places = place.shape
     for h in range(people):
@@ -354,8 +370,8 @@ def _holders(place, weight, begin, who, what):
 
 @kernel("f2 w3 i1 w1 s1 f1 b1 i2 f0 i0 i0 f0 b1 b1 i2 f1 i2 f1")
 def _in_turn(
-    gains, place, begin, who, what, lasts, first, besides, appears, begins, ends, least, free, changed, segment,
-    value, chosen, evidence,
+    gains, place, begin, who, what, lasts, first, besides, appears, begins, ends, least, free,
+    changed, segment, value, chosen, evidence,
 ):  # fmt: skip
     """Fill in hypothesis, start and stop, `chosen` (N, 3), and `evidence` (N,) of the tracks that
     `EvidenceTable.in_turn` selects; returns their number.

@@ -1,8 +1,9 @@
 """Tracking from frame to frame: prediction, assignment of detections in all views, Kalman update.
 
 The detections around a track's predicted joints are its observations, whether or not stage I would
-find the person in this frame. Several worlds are tracked at once (`global_hypotheses.py`): a world is a global
-hypothesis, a set of tracks that share no detection; worlds are independent of each other.
+find the person in this frame. Several worlds are tracked at once (`global_hypotheses.py`): a world
+is a global hypothesis, a set of tracks that share no detection; worlds are independent of each
+other.
 """
 
 from collections.abc import Callable, Sequence
@@ -60,7 +61,8 @@ class BodyScale:
     """(J,) maximum distance of each joint from its parent on the skeleton, metres; unused for the
     root."""
     density: Array
-    """(J,) density of the noise in each joint's motion (`factors.Motion`): of the acceleration, m²/s³."""
+    """(J,) density of the noise in each joint's motion (`factors.Motion`): of the acceleration,
+    m²/s³."""
     motion: Motion = CONSTANT_VELOCITY
     """Motion model of the joints."""
 
@@ -113,19 +115,27 @@ class Tracker:
         """Tracks of no people."""
         return Tracks.none(self.skeleton, self.scale.motion)
 
-    def step(self, tracks: Tracks, detections: Detections, rig: Rig, time_s: float) -> tuple[Tracks, Index]:
+    def step(
+        self, tracks: Tracks, detections: Detections, rig: Rig, time_s: float
+    ) -> tuple[Tracks, Index]:
         """Advance the tracks to the frame at `time_s` (earlier than the last if time runs
         backwards); returns them and their detections (A, J, V), -1 for none. No track ends here.
         """
         if len(tracks) == 0:
-            return replace(tracks, time_s=time_s), np.zeros((0, len(self.skeleton), len(rig)), dtype=np.intp)
+            return replace(tracks, time_s=time_s), np.zeros(
+                (0, len(self.skeleton), len(rig)), dtype=np.intp
+            )
         sight, bones = Sight.of(detections, rig, self.skeleton), self._bones
         step_s = time_s - tracks.time_s
-        joints, lost = predicted(tracks.joints, step_s, self.scale.motion, self.scale.density, bones)
+        joints, lost = predicted(
+            tracks.joints, step_s, self.scale.motion, self.scale.density, bones
+        )
         candidate = assign(Predicted(joints.position, joints.sigma_m, lost, tracks.world), sight)
         certain = detections.confidence
         weight = np.where(certain > 0, self.observation.weight(certain), 0.0)
-        joints, candidate, evident = measured(joints, lost, candidate, weight, sight, self._trust, bones)
+        joints, candidate, evident = measured(
+            joints, lost, candidate, weight, sight, self._trust, bones
+        )
         evident_s = np.where(evident, time_s, tracks.evident_s)
         return replace(tracks, time_s=time_s, joints=joints, evident_s=evident_s), candidate
 
@@ -134,7 +144,9 @@ class Tracker:
         if len(tracks) == 0:
             return tracks.joints
         step_s = time_s - tracks.time_s
-        return predicted(tracks.joints, step_s, self.scale.motion, self.scale.density, self._bones)[0]
+        return predicted(tracks.joints, step_s, self.scale.motion, self.scale.density, self._bones)[
+            0
+        ]
 
     @cached_property
     def _bones(self) -> Bones:
@@ -156,15 +168,23 @@ class Tracker:
         count = np.maximum(known.sum(axis=1), 1)[:, None]
         centre = (np.where(known[..., None], places, 0.0).sum(axis=1) / count)[:, None]
         sigma = np.where(known, _BIRTH_SIGMA_M, 2 * LOST_M)
-        joints = JointStates.at(np.where(known[..., None], places, centre), sigma, self.scale.motion.start)
+        joints = JointStates.at(
+            np.where(known[..., None], places, centre), sigma, self.scale.motion.start
+        )
         return Tracks(time_s, ids, world, joints, np.full(len(places), time_s))
 
-    def newcomers(self, tracks: Tracks, candidate: Index, detections: Detections, rig: Rig) -> tuple[Array, Index]:
+    def newcomers(
+        self, tracks: Tracks, candidate: Index, detections: Detections, rig: Rig
+    ) -> tuple[Array, Index]:
         """New people among the detections not assigned to the `tracks` of one world: positions (P,
         J, 3), metres, NaN where unknown, and detections (P, J, V).
         """
         core, J = list(self.skeleton.core), len(self.skeleton)
-        there, found, theirs = tracks.joints.position, [np.zeros((0, J, 3))], [np.zeros((0, J, len(rig)), np.intp)]
+        there, found, theirs = (
+            tracks.joints.position,
+            [np.zeros((0, J, 3))],
+            [np.zeros((0, J, len(rig)), np.intp)],
+        )
         free = np.ones(len(detections), dtype=bool)
         free[candidate[candidate >= 0]] = False
         for find in self.find:

@@ -122,12 +122,16 @@ def _assigned(predicted: Predicted, sight: Sight) -> tuple[Index, Scored]:
     chosen, first = np.empty((2, A, J, V), dtype=np.intp), np.empty((2, J * V + 1), dtype=np.intp)
     count, near = 4 * A * J * V, None
     while near is None or count > len(near.person):
-        whole, real, flag = np.empty((3, count), np.intp), np.empty((5, count)), np.empty((2, count), dtype=bool)
+        whole, real, flag = (
+            np.empty((3, count), np.intp),
+            np.empty((5, count)),
+            np.empty((2, count), dtype=bool),
+        )
         near = Scored(first[0], whole[0], whole[1], real[0], real[1], flag[0])
         gates, taken = np.empty((2, A, J)), np.empty(len(sight.of_view), np.intp)
         count = _assign(
-            given, predicted.sigma_m, predicted.lost, world, people, sight, near, gates, first[1], whole[2], taken,
-            real[2:], flag[1], chosen,
+            given, predicted.sigma_m, predicted.lost, world, people, sight, near, gates, first[1],
+            whole[2], taken, real[2:], flag[1], chosen,
         )  # fmt: skip
     begins, person, detection, distance_m, score, possible = near
     ends = distance_m[:count], score[:count], possible[:count]
@@ -136,7 +140,8 @@ def _assigned(predicted: Predicted, sight: Sight) -> tuple[Index, Scored]:
 
 @kernel("f3 f2 b2 i1 i1", Sight, Scored, "f3 i1 i1 i1 f2 b1 i4")
 def _assign(
-    places, sigma_m, lost, world, people, sight, near, gates, first, queue, taken, reals, sought, both
+    places, sigma_m, lost, world, people, sight, near, gates, first, queue, taken, reals, sought,
+    both
 ):  # fmt: skip
     """Fill in `near` and the first of `both` (2, A, J, V), as far as the arrays reach; returns the
     number of near pairs.
@@ -149,7 +154,9 @@ def _assign(
             gate_m[a, j] = 0.0 if lost[a, j] else min(_FAR_M + 2 * sigma_m[a, j], FARTHEST_M)
             for v in range(views):
                 before[a, j, v] = -1
-            reach_m[a, j] = _REACH_M if lost[a, j] or sight.swings[j] else max(gate_m[a, j], OVERLAP_M)
+            reach_m[a, j] = (
+                _REACH_M if lost[a, j] or sight.swings[j] else max(gate_m[a, j], OVERLAP_M)
+            )
     begins, person, detection, distance_m, score, possible = near
     count = find_near(places, reach_m, people, sight, first, begins, person, detection, distance_m)
     if count > len(person):
@@ -170,8 +177,8 @@ def _assign(
                     trunk += before[a, k, v] >= 0 and not sight.swings[k]
                 nearness[e] = 0.0 if trunk >= _TRUNK_JOINTS else -np.inf
         claim(
-            begins, person, detection, nearness, sought, LEAST_AFFINITY, before, world, sight, tied, score,
-            possible, key, queue, taken, chosen,
+            begins, person, detection, nearness, sought, LEAST_AFFINITY, before, world, sight, tied,
+            score, possible, key, queue, taken, chosen,
         )  # fmt: skip
         changed = False
         for a in range(people_count):
@@ -188,7 +195,9 @@ def _assign(
 
 
 @kernel("i1 i1 i1 f1 i0 f1 f1 f1 f1")
-def _marginals(first, person, detection, weight, rounds, of_person, of_detection, unclaimed, probable):
+def _marginals(
+    first, person, detection, weight, rounds, of_person, of_detection, unclaimed, probable
+):
     """Fill in `probable` (N,) from `weight` (N,) for each joint and view; `of_person` and
     `of_detection` must be zeros, `unclaimed` (N,) ones.
     """

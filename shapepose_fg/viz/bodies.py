@@ -28,4 +28,6 @@ def joined(vertices: Real, faces: Whole) -> tuple[Array, Index]:
     """
     people, count = vertices.shape[:2]
     every = faces[None] + count * np.arange(people)[:, None, None]
-    return vertices.reshape(people * count, 3).astype(np.float64), every.reshape(people * len(faces), 3)
+    return vertices.reshape(people * count, 3).astype(np.float64), every.reshape(
+        people * len(faces), 3
+    )

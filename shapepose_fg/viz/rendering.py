@@ -1,6 +1,7 @@
 """Renders triangle meshes into a camera with a z-buffer, for visibility tests and for pictures.
 
-Pixels follow OpenCV: the centre of the first pixel is (0, 0). A surface nearer than `NEAR_M` is not drawn.
+Pixels follow OpenCV: the centre of the first pixel is (0, 0). A surface nearer than `NEAR_M` is not
+drawn.
 """
 
 import threading
@@ -40,18 +41,24 @@ class Surface:
 
 
 def look_at(eye: Array, target: Array, up: Array) -> Array:
-    """Pose `wTc` (4, 4) of a camera at `eye` (3,) that looks at `target` (3,), image up towards `up` (3,)."""
+    """Pose `wTc` (4, 4) of a camera at `eye` (3,) that looks at `target` (3,), image up towards
+    `up` (3,).
+    """
     forward = np.asarray(target, dtype=np.float64) - eye
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, up)
     if np.linalg.norm(right) < 1e-9:
-        raise ValueError("look_at: the line of sight must not be parallel to up; move the eye or the target")
+        raise ValueError(
+            "look_at: the line of sight must not be parallel to up; move the eye or the target"
+        )
     right /= np.linalg.norm(right)
     return rigid(np.column_stack([right, np.cross(forward, right), forward]), eye)
 
 
 def zoom(camera: Camera, box: tuple[float, float, float, float], width: int) -> Camera:
-    """The camera of an enlarged window of the image: `box` (left, top, right, bottom) px, `width` px wide."""
+    """The camera of an enlarged window of the image: `box` (left, top, right, bottom) px, `width`
+    px wide.
+    """
     left, top, right, bottom = box
     scale = width / (right - left)
     K = camera.K.copy()
@@ -87,7 +94,9 @@ def first_surface_at(
         return np.full(row.shape, np.inf, dtype=np.float32), np.full(row.shape, -1, dtype=np.intp)
     colour, depth = _canvas.blank(height, width)
     corners, number = _as_opengl(points, camera), _numbers(points.shape[1])
-    cv2.triangleRasterize(corners, faces, number, colour, depth, np.eye(4), 1.0, NEAR_M, _FAR_M, _FLAT)
+    cv2.triangleRasterize(
+        corners, faces, number, colour, depth, np.eye(4), 1.0, NEAR_M, _FAR_M, _FLAT
+    )
     met = colour[row, column, 0]
     vertex = np.where(met >= 0, np.rint(met / _NUMBER), -1).astype(np.intp)
     return np.where(met >= 0, depth[row, column], np.float32(np.inf)), vertex
@@ -141,8 +150,8 @@ def _numbers(count: int) -> NDArray[np.float32]:
 
 
 def rasterise(xy: Real, depth: Real, faces: Whole, size: tuple[int, int]) -> Surface:
-    """Draw triangles with corners at pixels `xy` (N, 2) and `depth` (N,) into an image of `size` (W, H), by
-    OpenCV.
+    """Draw triangles with corners at pixels `xy` (N, 2) and `depth` (N,) into an image of `size`
+    (W, H), by OpenCV.
 
     1/depth is interpolated linearly in the image, so depth is exact inside a face. Faces with a
     corner that is NaN, or nearer than `NEAR_M`, are dropped. Back faces are culled, which is
@@ -166,5 +175,7 @@ def rasterise(xy: Real, depth: Real, faces: Whole, size: tuple[int, int]) -> Sur
     each = np.arange(len(corners), dtype=np.int32).reshape(-1, 3)
     cv2.triangleRasterize(corners, each, number, colour, met, np.eye(4), 1.0, NEAR_M, _FAR_M, _FLAT)
     hit = colour[..., 0] >= 0
-    face = np.where(hit, index[np.where(hit, np.rint(colour[..., 0] / _NUMBER), 0).astype(np.intp)], -1)
+    face = np.where(
+        hit, index[np.where(hit, np.rint(colour[..., 0] / _NUMBER), 0).astype(np.intp)], -1
+    )
     return Surface(np.where(hit, met, np.float32(np.inf)), face.astype(np.int32))

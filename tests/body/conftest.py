@@ -1,5 +1,5 @@
-"""A tiny random body in SMPL's file format: joints are roughly where a person's are, and nothing else is human: no
-symmetry hides a mistake.
+"""A tiny random body in SMPL's file format: joints are roughly where a person's are, and nothing
+else is human: no symmetry hides a mistake.
 """
 
 import numpy as np
@@ -13,7 +13,9 @@ from tests.conftest import read_body
 NUM_VERTICES = 60
 
 
-def make_smpl_arrays(num_betas: int = 10, num_vertices: int = NUM_VERTICES) -> dict[str, np.ndarray]:
+def make_smpl_arrays(
+    num_betas: int = 10, num_vertices: int = NUM_VERTICES
+) -> dict[str, np.ndarray]:
     rng = np.random.default_rng(0)
     person = read_body()
     joints = np.concatenate([person.joint_regressor, person.keypoint_regressor]) @ person.template
@@ -37,7 +39,9 @@ def make_smpl_arrays(num_betas: int = 10, num_vertices: int = NUM_VERTICES) -> d
 
 def random_parameters(batch: int = 5) -> BodyParameters:
     rng = np.random.default_rng(0)
-    return BodyParameters(*(rng.normal(size=(batch, *shape)) for shape in ((10,), (3,), (23, 3), (3,))))
+    return BodyParameters(
+        *(rng.normal(size=(batch, *shape)) for shape in ((10,), (3,), (23, 3), (3,)))
+    )
 
 
 @pytest.fixture(name="make_smpl_arrays")

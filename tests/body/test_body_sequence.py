@@ -1,4 +1,6 @@
-"""Bodies over time, every fitter: one shape, smooth poses, joints, rows without targets, shapes carried on."""
+"""Bodies over time, every fitter: one shape, smooth poses, joints, rows without targets, shapes
+carried on.
+"""
 
 from dataclasses import replace
 
@@ -8,7 +10,13 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from shapepose_fg.body.fitting import body_sequence, optimisers
-from shapepose_fg.body.fitting.fitter import BodyConfig, FitStatus, JointTargets, SequenceFit, Shapes
+from shapepose_fg.body.fitting.fitter import (
+    BodyConfig,
+    FitStatus,
+    JointTargets,
+    SequenceFit,
+    Shapes,
+)
 from shapepose_fg.body.fitting.fitters import SmplFitter, make_fitter
 from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
@@ -39,7 +47,9 @@ def bodies() -> BodyParameters:
     factor = np.linalg.cholesky(prior.covariance)
     poses = np.clip(prior.mean + 0.7 * smooth(69, rng) @ factor.T, prior.lower, prior.upper)
     upright = Rotation.from_rotvec([np.pi / 2, 0, 0])
-    turn = Rotation.from_euler("z", (1.0 * smooth(1, rng) + np.arange(PEOPLE)[:, None, None]).reshape(-1, 1))
+    turn = Rotation.from_euler(
+        "z", (1.0 * smooth(1, rng) + np.arange(PEOPLE)[:, None, None]).reshape(-1, 1)
+    )
     betas = np.repeat(np.clip(rng.normal(size=(PEOPLE, 10)), -2, 2), FRAMES, axis=0)
     place = (0.3 * smooth(3, rng) + 2 * np.arange(PEOPLE)[:, None, None]).reshape(-1, 3)
     parts = (betas, (turn * upright).as_rotvec(), poses.reshape(-1, 23, 3), place)
@@ -59,7 +69,9 @@ TIME_S = np.tile(np.arange(FRAMES) / FPS, PEOPLE)
 def targets(truth) -> JointTargets:
     information = np.broadcast_to(np.eye(3) / NOISE_M**2, (*truth.shape, 3)).copy()
     information[HIDDEN, ARM] = 0
-    return JointTargets(truth + np.random.default_rng(1).normal(0, NOISE_M, truth.shape), information)
+    return JointTargets(
+        truth + np.random.default_rng(1).normal(0, NOISE_M, truth.shape), information
+    )
 
 
 def some(targets: JointTargets, rows: np.ndarray) -> JointTargets:
@@ -78,14 +90,18 @@ def found(fitter, targets) -> SequenceFit:
 
 def acceleration(xyz: np.ndarray) -> np.ndarray:
     """(PEOPLE, FRAMES - 2, ...) lengths, m/s²."""
-    return np.linalg.norm(np.diff(xyz.reshape(PEOPLE, FRAMES, -1, 3), n=2, axis=1), axis=-1) * FPS**2
+    return (
+        np.linalg.norm(np.diff(xyz.reshape(PEOPLE, FRAMES, -1, 3), n=2, axis=1), axis=-1) * FPS**2
+    )
 
 
 def turns_deg(poses: np.ndarray) -> np.ndarray:
     """(PEOPLE, FRAMES - 1, 23) how far each joint turns from frame to frame."""
     R = Rotation.from_rotvec(poses.reshape(-1, 3)).as_matrix().reshape(PEOPLE, FRAMES, 23, 3, 3)
     step = R[:, :-1].swapaxes(-1, -2) @ R[:, 1:]
-    return np.degrees(Rotation.from_matrix(step.reshape(-1, 3, 3)).magnitude()).reshape(PEOPLE, FRAMES - 1, 23)
+    return np.degrees(Rotation.from_matrix(step.reshape(-1, 3, 3)).magnitude()).reshape(
+        PEOPLE, FRAMES - 1, 23
+    )
 
 
 def stature_m(betas: np.ndarray) -> np.ndarray:
@@ -107,7 +123,9 @@ def test_joints_are_where_they_are(found, truth):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [0.65, *slow(1.2)])
-def test_bodies_far_from_an_adult_s_size_are_as_tall_as_they_are(fitter, found, truth, targets, size):
+def test_bodies_far_from_an_adult_s_size_are_as_tall_as_they_are(
+    fitter, found, truth, targets, size
+):
     small = fitter.fit_sequence(targets.larger(np.full(len(targets), size)), GROUP, TIME_S)
     expected = size * stature_m(found.shapes.mean)
     np.testing.assert_allclose(stature_m(small.shapes.mean), expected, atol=0.03)
@@ -122,7 +140,9 @@ def test_bodies_move_as_the_truth_does(fitter, found, truth, targets):
     # Noise adds to it; frame by frame it is over four times as much.
     assert true.mean() / 1.5 < ours.mean() < 2 * true.mean()
     assert before.mean() > 4 * true.mean()
-    off = np.linalg.norm(np.diff((found.fit.joints - truth).reshape(PEOPLE, FRAMES, 25, 3), n=2, axis=1), axis=-1)
+    off = np.linalg.norm(
+        np.diff((found.fit.joints - truth).reshape(PEOPLE, FRAMES, 25, 3), n=2, axis=1), axis=-1
+    )
     assert FPS**2 * off.mean() < 10
 
 
@@ -141,16 +161,21 @@ def test_one_person_has_one_shape_and_two_halves_agree(fitter, found, targets, b
     assert np.abs(stature_m(found.shapes.mean) - true).max() < 0.03
     first = TIME_S < FRAMES / 2 / FPS
     halves = [
-        fitter.fit_sequence(some(targets, rows), GROUP[rows], TIME_S[rows]).shapes.mean for rows in (first, ~first)
+        fitter.fit_sequence(some(targets, rows), GROUP[rows], TIME_S[rows]).shapes.mean
+        for rows in (first, ~first)
     ]
     assert np.abs(stature_m(halves[0]) - stature_m(halves[1])).max() < 0.02
 
 
 def test_what_is_known_of_a_shape_holds_the_true_one(found, bodies):
-    apart = found.shapes.mean - np.stack([bodies.betas[number == GROUP][0] for number in found.groups])
+    apart = found.shapes.mean - np.stack(
+        [bodies.betas[number == GROUP][0] for number in found.groups]
+    )
     squared = np.einsum("gi,gij,gj->g", apart, found.shapes.information, apart)
     assert (squared < 23.2).all()  # 99 % of a chi-squared of 10
-    assert (np.linalg.eigvalsh(found.shapes.information) > 0.99).all()  # never less than about anybody
+    assert (
+        np.linalg.eigvalsh(found.shapes.information) > 0.99
+    ).all()  # never less than about anybody
 
 
 def test_more_frames_in_the_same_time_tell_no_more_of_the_shape(fitter, truth):
@@ -171,10 +196,13 @@ def test_shapes_are_carried_on_and_count_once(fitter, targets):
     one = fitter.fit_sequence(some(targets, first), GROUP[first], TIME_S[first])
     two = fitter.fit_sequence(some(targets, second), GROUP[second], TIME_S[second], one.shapes)
     alone = fitter.fit_sequence(some(targets, second), GROUP[second], TIME_S[second])
-    # What the second second tells is added to what the first told; about nobody in particular is in it once.
+    # What the second second tells is added to what the first told; about nobody in particular is in
+    # it once.
     added = two.shapes.information - one.shapes.information
     told = alone.shapes.information - np.eye(10)
-    np.testing.assert_allclose(np.trace(added, axis1=1, axis2=2), np.trace(told, axis1=1, axis2=2), rtol=0.1)
+    np.testing.assert_allclose(
+        np.trace(added, axis1=1, axis2=2), np.trace(told, axis1=1, axis2=2), rtol=0.1
+    )
     # Somebody of whom everything is known stays as he is.
     sure = Shapes(one.shapes.mean, np.tile(1e8 * np.eye(10), (PEOPLE, 1, 1)))
     kept = fitter.fit_sequence(some(targets, second), GROUP[second], TIME_S[second], sure)
@@ -198,7 +226,9 @@ def test_rows_that_no_view_saw_follow_those_around_them(fitter, targets, truth):
     assert found.fit.ok.all()
     # 0.2 s of somebody who moves by 0.6 m/s and turns: joints between those before and after.
     assert np.linalg.norm((found.fit.joints - truth)[gone], axis=-1).mean() < 0.08
-    assert np.isnan(found.fit.residual_m[gone]).all() and np.isfinite(found.fit.residual_m[:40]).all()
+    assert (
+        np.isnan(found.fit.residual_m[gone]).all() and np.isfinite(found.fit.residual_m[:40]).all()
+    )
 
 
 def test_order_groups_and_other_people_do_not_matter(fitter, targets, found):
@@ -236,12 +266,16 @@ def test_what_cannot_be_fitted_has_a_status(fitter, targets):
     nobody = fitter.fit_sequence(some(targets, np.zeros(0, dtype=int)), GROUP[:0], TIME_S[:0])
     assert len(nobody.fit) == 0 and len(nobody.groups) == 0 and nobody.shapes.mean.shape == (0, 10)
     # One row is a sequence too, and one whose neighbours are an hour away.
-    single = fitter.fit_sequence(some(targets, np.array([0, 1])), GROUP[:2], np.array([0.0, 3600.0]))
+    single = fitter.fit_sequence(
+        some(targets, np.array([0, 1])), GROUP[:2], np.array([0.0, 3600.0])
+    )
     assert single.fit.ok.all()
 
 
 def test_rows_that_never_settle_have_no_body_and_say_so(targets, monkeypatch):
-    """After one step from a cold start energy is still falling in most rows: they have nothing to start from."""
+    """After one step from a cold start energy is still falling in most rows: they have nothing to
+    start from.
+    """
     monkeypatch.setattr(optimisers, "MAX_ITERATIONS", 1)
     found = SmplFitter().fit_sequence(targets, GROUP, TIME_S)
     lost = found.fit.status == FitStatus.NOT_CONVERGED

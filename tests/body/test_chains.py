@@ -1,4 +1,6 @@
-"""Chains of rows: the motion prior along them, the solver for their linear systems, and how they are cut."""
+"""Chains of rows: the motion prior along them, the solver for their linear systems, and how they
+are cut.
+"""
 
 import numpy as np
 import pytest
@@ -20,7 +22,10 @@ def test_poses_are_eliminated_from_a_chain(length, bands):
     """Against the whole of the system at once; a few unknowns a row and as many as bodies have."""
     for N in (5, 69):
         A = draw(length, N + 10, N + 10)
-        hessian, gradient = A @ A.swapaxes(1, 2) + 2 * N * np.eye(N + 10), draw(length, N + 10, seed=1)
+        hessian, gradient = (
+            A @ A.swapaxes(1, 2) + 2 * N * np.eye(N + 10),
+            draw(length, N + 10, seed=1),
+        )
         diagonal, pull = np.abs(draw(length, N, seed=2)), draw(length, N, seed=3)
         beyond, turn = 0.2 * draw(length, N, bands, seed=4), exp_so3(draw(length, 3, seed=5))
         M = (bands + 1) * N + 11
@@ -58,7 +63,11 @@ class Damped(Motion):
         return matrices([[1 + 0 * h, 1 - np.exp(-h)], [0 * h, np.exp(-h)]])
 
 
-LAWS = {"constant velocity": CONSTANT_VELOCITY, "constant acceleration": CONSTANT_ACCELERATION, "damped": Damped()}
+LAWS = {
+    "constant velocity": CONSTANT_VELOCITY,
+    "constant acceleration": CONSTANT_ACCELERATION,
+    "damped": Damped(),
+}
 
 
 @pytest.fixture(params=LAWS.values(), ids=LAWS)
@@ -101,7 +110,9 @@ def test_even_motion_costs_its_speed_alone():
     motion = Links(CONSTANT_VELOCITY, np.full(6, 2.0), np.full(6, 0.5), np.full(9, 0.1))
     time = 0.1 * np.arange(10)[:, None]
     energy, _ = motion.at(exp_so3(time * [0.0, 0.0, 0.7]), time * [0.3, 0.0, 0.0])
-    assert energy == pytest.approx((0.7**2 + 0.3**2) / 0.5 * 0.9)  # v² h / density, 9 steps of 0.1 s
+    assert energy == pytest.approx(
+        (0.7**2 + 0.3**2) / 0.5 * 0.9
+    )  # v² h / density, 9 steps of 0.1 s
 
 
 def test_chains_end_at_gaps_and_long_ones_are_cut_with_overlap():

@@ -4,8 +4,19 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from shapepose_fg.body.fitting.descent import BodyState, LearnedDescent, Sight, gradient_scale, moved
-from shapepose_fg.body.fitting.network import NUM_PARAMETERS, NetworkConfig, UpdateNetwork, layer_shapes
+from shapepose_fg.body.fitting.descent import (
+    BodyState,
+    LearnedDescent,
+    Sight,
+    gradient_scale,
+    moved,
+)
+from shapepose_fg.body.fitting.network import (
+    NUM_PARAMETERS,
+    NetworkConfig,
+    UpdateNetwork,
+    layer_shapes,
+)
 from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel
@@ -46,7 +57,9 @@ def states(count: int = ROWS) -> BodyState:
 
 
 def targets_of(places: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Random targets: those of `places` known to 1 to 10 cm, along some directions better than along others."""
+    """Random targets: those of `places` known to 1 to 10 cm, along some directions better than
+    along others.
+    """
     rng = np.random.default_rng(0)
     root = rng.uniform(-60, 60, (ROWS, 50, 3, 3))
     information = np.zeros((ROWS, 50, 3, 3))
@@ -83,7 +96,12 @@ def test_a_mirrored_person_is_turned_and_not_mirrored(frame):
 def test_the_frame_has_the_pelvis_at_its_origin_and_trusts_the_trunk(frame):
     assert np.linalg.norm(frame.rest_xyz[BODY_POINTS.index("pelvis")]) < 1e-6
     variance = dict(zip(BODY_POINTS, frame.rest_variance.tolist(), strict=True))
-    assert variance["spine1"] < variance["left_shoulder"] < variance["left_elbow"] < variance["left_wrist"]
+    assert (
+        variance["spine1"]
+        < variance["left_shoulder"]
+        < variance["left_elbow"]
+        < variance["left_wrist"]
+    )
     assert variance["left_hip"] < variance["left_knee"] < variance["left_ankle"]
     # Wrists go about half a metre to all sides; the pelvis is where it is but for the shape.
     assert 0.1 < np.sqrt(variance["left_wrist"]) < 0.5
@@ -121,7 +139,10 @@ def test_points_that_are_no_targets_must_be_given(model):
 
 def test_targets_without_information_change_nothing(model):
     places = slots(TARGET_SKELETONS["BODY_25"])
-    (xyz, information), descent = targets_of(places), LearnedDescent(model.points, ALL, network(random=True), 6.0)
+    (xyz, information), descent = (
+        targets_of(places),
+        LearnedDescent(model.points, ALL, network(random=True), 6.0),
+    )
     elsewhere = xyz.copy()
     elsewhere[:, 25:] += 100.0
     *_, one = descent.unroll(states(), xyz, information)
@@ -132,7 +153,10 @@ def test_targets_without_information_change_nothing(model):
 
 
 def test_rows_are_independent_and_steps_are_rotations(model):
-    (xyz, information), descent = targets_of(ALL), LearnedDescent(model.points, ALL, network(random=True), 6.0)
+    (xyz, information), descent = (
+        targets_of(ALL),
+        LearnedDescent(model.points, ALL, network(random=True), 6.0),
+    )
     *_, all_rows = descent.unroll(states(), xyz, information)
     row = slice(2, 3)
     alone = BodyState(*(value[row] for value in vars(states()).values()))
@@ -155,18 +179,24 @@ def test_networks_know_their_step_and_refuse_nonsense():
 
 @pytest.mark.parametrize("name", ["BODY_25", "COCO_17"])
 def test_what_the_network_sees(any_body, name):
-    """Against dense inverses and the points' Jacobian; the detector's joints lie elsewhere than the body's."""
+    """Against dense inverses and the points' Jacobian; the detector's joints lie elsewhere than the
+    body's.
+    """
     offsets = KeypointOffsets.symmetric({"LHip": (0.05, 0.06, 0.0), "LWrist": (0.0, 0.0, -0.05)})
     model, places = any_body.with_keypoints(TARGET_SKELETONS[name]), slots(TARGET_SKELETONS[name])
     model = model.with_keypoint_offsets(offsets)
     rest, state = [place for place in ALL if place not in places], states()
-    see = Sight(model.keypoint_points, places, 60.0, any_body.points.part(rest), model.offsets_of_keypoints)
+    see = Sight(
+        model.keypoint_points, places, 60.0, any_body.points.part(rest), model.offsets_of_keypoints
+    )
     xyz, information = (each[:, list(places)] for each in targets_of(places))
     information[:, 3] = 0
     inputs = see(state, xyz, information, np.full(79, 1e-4))
     given = state.local, state.betas, state.transl
     placed, jacobian = model.keypoint_points.positions_with_jacobian(*given)
-    reach, trust = (information @ np.linalg.inv(information + np.eye(3) / sigma**2) for sigma in (0.1, 0.03))
+    reach, trust = (
+        information @ np.linalg.inv(information + np.eye(3) / sigma**2) for sigma in (0.1, 0.03)
+    )
     away = (reach @ (xyz - placed)[..., None])[..., 0]
     away /= 1 + np.linalg.norm(away, axis=-1, keepdims=True) / 0.5
     seen = inputs[:, :350].reshape(ROWS, 50, 7)
@@ -174,7 +204,9 @@ def test_what_the_network_sees(any_body, name):
     expected[:, list(places)] += away
     np.testing.assert_allclose(seen[..., :3], expected, atol=1e-6)
     np.testing.assert_allclose(seen[:, list(places), 3:6], 5 * away, atol=1e-6)
-    np.testing.assert_allclose(seen[:, list(places), 6], np.trace(trust, axis1=2, axis2=3) / 3, atol=1e-6)
+    np.testing.assert_allclose(
+        seen[:, list(places), 6], np.trace(trust, axis1=2, axis2=3) / 3, atol=1e-6
+    )
     assert not seen[:, rest, 3:].any() and not seen[:, places[3], 3:].any()
     np.testing.assert_allclose(inputs[:, 350:360], state.betas / 3, atol=1e-6)
     columns = state.local[:, :22, :, :2].swapaxes(2, 3).reshape(ROWS, -1)
@@ -189,7 +221,10 @@ def test_what_the_network_sees(any_body, name):
 
 def turned(columns: np.ndarray) -> np.ndarray:
     """(N, 3, 3) what becomes of two columns (N, 6)."""
-    change, local = np.zeros((len(columns), NUM_PARAMETERS), np.float32), np.zeros((len(columns), 24, 3, 3))
+    change, local = (
+        np.zeros((len(columns), NUM_PARAMETERS), np.float32),
+        np.zeros((len(columns), 24, 3, 3)),
+    )
     change[:, 16:22] = columns
     moved(change, 1.0, np.zeros((len(columns), 10)), local, np.zeros((len(columns), 3)))
     return local[:, 1]
@@ -198,10 +233,14 @@ def turned(columns: np.ndarray) -> np.ndarray:
 def test_any_two_columns_become_a_rotation_with_the_first_ones_direction():
     columns = np.random.default_rng(0).normal(0, 3, (200, 6)).astype(np.float32).astype(float)
     R = turned(columns)
-    np.testing.assert_allclose((R.swapaxes(-1, -2) @ R), np.tile(np.eye(3), (200, 1, 1)), atol=1e-12)
+    np.testing.assert_allclose(
+        (R.swapaxes(-1, -2) @ R), np.tile(np.eye(3), (200, 1, 1)), atol=1e-12
+    )
     np.testing.assert_allclose(np.linalg.det(R), 1, atol=1e-12)
     first, second = columns[:, :3], columns[:, 3:]
-    np.testing.assert_allclose(R[..., 0], first / np.linalg.norm(first, axis=1, keepdims=True), atol=1e-15)
+    np.testing.assert_allclose(
+        R[..., 0], first / np.linalg.norm(first, axis=1, keepdims=True), atol=1e-15
+    )
     # The second column is spanned by both and leans to its own side: nothing of it along the third.
     np.testing.assert_allclose((R[..., 2] * second).sum(1), 0, atol=1e-12)
     assert ((R[..., 1] * second).sum(1) > 0).all()

@@ -3,7 +3,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from shapepose_fg.body.fitting import optimisers
-from shapepose_fg.body.fitting.fitter import BodyConfig, BodyFit, FitStatus, JointTargets, check_fitter
+from shapepose_fg.body.fitting.fitter import (
+    BodyConfig,
+    BodyFit,
+    FitStatus,
+    JointTargets,
+    check_fitter,
+)
 from shapepose_fg.body.fitting.fitters import SmplFitter
 from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
@@ -76,7 +82,9 @@ def test_hidden_forearm_is_filled_in_at_its_length(fitter, joints):
     assert np.abs(length - truth).mean() < 0.015  # the other bones tell the size
     seen = np.setdiff1d(np.arange(25), [ELBOW, WRIST])
     assert distance_mm(fit.joints[:, seen], joints[:, seen]).mean() < 10
-    assert np.median(distance_mm(fit.joints[:, WRIST], joints[:, WRIST])) < 300  # a guess, but on the right side
+    assert (
+        np.median(distance_mm(fit.joints[:, WRIST], joints[:, WRIST])) < 300
+    )  # a guess, but on the right side
     sigma = np.sqrt(np.trace(fit.covariance, axis1=-2, axis2=-1) / 3)
     assert (sigma[:, WRIST] > 3 * sigma[:, BODY_25.index("LWrist")]).all()
 
@@ -93,7 +101,10 @@ def test_a_ray_holds_a_joint_across_but_not_along(fitter, joints):
     assert fit.ok.all()
     error = fit.joints[:, WRIST] - joints[:, WRIST]
     along = np.abs(np.einsum("bx,bx->b", error, ray))
-    assert np.median(np.linalg.norm(error - np.einsum("bx,bx,by->by", error, ray, ray), axis=1)) < 0.015
+    assert (
+        np.median(np.linalg.norm(error - np.einsum("bx,bx,by->by", error, ray, ray), axis=1))
+        < 0.015
+    )
     assert np.median(along) < 0.15  # the body's bones, not the ray, say how far
     variance_along = np.einsum("bx,bxy,by->b", ray, fit.covariance[:, WRIST], ray)
     rest = (np.trace(fit.covariance[:, WRIST], axis1=-2, axis2=-1) - variance_along) / 2
@@ -133,7 +144,8 @@ def test_degenerate_rows_get_a_name_and_no_nan_in_parameters(fitter, joints):
     targets, expected = degenerate_targets(joints)
     good = make_targets(joints[8:10], 0.01)
     both = JointTargets(
-        np.concatenate([targets.xyz, good.xyz]), np.concatenate([targets.information, good.information])
+        np.concatenate([targets.xyz, good.xyz]),
+        np.concatenate([targets.information, good.information]),
     )
     fit = fitter.fit(both)
     assert fit.status.tolist() == [*expected, FitStatus.OK, FitStatus.OK]
@@ -168,9 +180,12 @@ def test_alone_in_a_batch_and_in_any_order_is_the_same(fitter, joints):
     assert distance_mm(shuffled.joints, together.joints[order]).max() < 1
     for row in range(0, len(joints), 8):
         alone = fitter.fit(JointTargets(targets.xyz[[row]], targets.information[[row]]))
-        # Rounding differs with the batch, and a row stops within 0.1 sigma of its optimum: under 1 mm.
+        # Rounding differs with the batch, and a row stops within 0.1 sigma of its optimum: under 1
+        # mm.
         assert distance_mm(alone.joints[0], together.joints[row]).max() < 1
-        np.testing.assert_allclose(alone.covariance[0], together.covariance[row], rtol=0.02, atol=1e-6)
+        np.testing.assert_allclose(
+            alone.covariance[0], together.covariance[row], rtol=0.02, atol=1e-6
+        )
 
 
 @pytest.mark.slow
@@ -188,7 +203,9 @@ def test_turning_and_moving_the_world_changes_nothing_else(fitter, joints):
 def test_warm_start_is_quicker_and_ends_at_the_same_place(joints, monkeypatch):
     fitter, evaluations = SmplFitter(), []
     solve, linearise = fitter.optimiser.solve, fitter.energy.linearise
-    monkeypatch.setattr(fitter.optimiser, "solve", lambda *args: evaluations.append(0) or solve(*args))
+    monkeypatch.setattr(
+        fitter.optimiser, "solve", lambda *args: evaluations.append(0) or solve(*args)
+    )
 
     def counted(free, *rest):
         if evaluations:
@@ -204,7 +221,8 @@ def test_warm_start_is_quicker_and_ends_at_the_same_place(joints, monkeypatch):
     cold_evaluations = evaluations.copy()
     evaluations.clear()
     warm = fitter.fit(targets, initial=first)
-    # All 48 rows are solved at once; the passes that leave targets out come after, and always start cold.
+    # All 48 rows are solved at once; the passes that leave targets out come after, and always start
+    # cold.
     assert evaluations[0] < 0.7 * cold_evaluations[0]
     assert evaluations[1:] == cold_evaluations[1:]
     assert np.quantile(distance_mm(warm.joints, cold.joints), 0.95) < 1
@@ -220,7 +238,9 @@ def test_rows_without_an_earlier_body_start_afresh(fitter, joints):
 
 def test_a_failed_row_takes_any_other_status():
     """`invalid_targets` is longer than the text that the rows were made with."""
-    before, after = (BodyFit.failed(np.full(2, each), 25) for each in ("too_few_joints", "invalid_targets"))
+    before, after = (
+        BodyFit.failed(np.full(2, each), 25) for each in ("too_few_joints", "invalid_targets")
+    )
     changed = before.with_rows(np.array([1]), after.rows(np.array([1])))
     assert changed.status.tolist() == [FitStatus.TOO_FEW_JOINTS, FitStatus.INVALID_TARGETS]
 
@@ -238,5 +258,7 @@ def test_misuse_is_told(fitter, joints):
         BodyConfig(kernel_scale=0)
     with pytest.raises(ValueError, match="model_sigma_m must be positive"):
         BodyConfig(model_sigma_m=-1)
-    with pytest.raises(TypeError, match=r"object must inherit from .*BodyFitter, which makes the other methods"):
+    with pytest.raises(
+        TypeError, match=r"object must inherit from .*BodyFitter, which makes the other methods"
+    ):
         check_fitter(object())

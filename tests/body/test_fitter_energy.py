@@ -69,10 +69,14 @@ def test_gradient_is_the_slope_of_the_energy(energy, free, targets):
         delta = np.zeros_like(free)
         delta[:, column] = step
         ahead, behind = (
-            energy.linearise(energy.retract(free, sign * delta), targets, 6.0, held).energy for sign in (1, -1)
+            energy.linearise(energy.retract(free, sign * delta), targets, 6.0, held).energy
+            for sign in (1, -1)
         )
-        # Half the slope, for the energy has no factor 1/2; central differences leave step² and rounding.
-        np.testing.assert_allclose((ahead - behind) / (4 * step), gradient[:, column], rtol=1e-5, atol=1e-3)
+        # Half the slope, for the energy has no factor 1/2; central differences leave step² and
+        # rounding.
+        np.testing.assert_allclose(
+            (ahead - behind) / (4 * step), gradient[:, column], rtol=1e-5, atol=1e-3
+        )
 
 
 def test_jacobian_of_the_free_parameters_is_the_numeric_one(energy, free, targets):
@@ -82,7 +86,8 @@ def test_jacobian_of_the_free_parameters_is_the_numeric_one(energy, free, target
         delta = np.zeros_like(free)
         delta[:, column] = step
         ahead, behind = (
-            energy.model.keypoints(energy.complete(energy.retract(free, sign * delta))) for sign in (1, -1)
+            energy.model.keypoints(energy.complete(energy.retract(free, sign * delta)))
+            for sign in (1, -1)
         )
         numeric = ((ahead - behind) / (2 * step)).reshape(ROWS, -1)
         np.testing.assert_allclose(jacobian[:, :, column], numeric, rtol=1e-6, atol=1e-7)
@@ -109,7 +114,15 @@ def test_weight_is_the_slope_of_the_robust_cost():
 def test_hands_are_invisible_and_limbs_are_not(model):
     names = {SMPL_24[1:][index] for index in visible_joints(model, PosePrior.default())}
     assert not names & {"left_hand", "right_hand"}
-    assert {"left_hip", "right_knee", "left_ankle", "right_shoulder", "left_elbow", "neck", "spine2"} <= names
+    assert {
+        "left_hip",
+        "right_knee",
+        "left_ankle",
+        "right_shoulder",
+        "left_elbow",
+        "neck",
+        "spine2",
+    } <= names
 
 
 def test_invisible_joints_are_where_the_prior_expects_them(model, apart):
@@ -121,7 +134,9 @@ def test_invisible_joints_are_where_the_prior_expects_them(model, apart):
     np.testing.assert_allclose(pose[:, energy.angles], free[:, 13:-3])
     seen, S, mean = energy.angles, apart.covariance, apart.mean
     pull = np.linalg.solve(S[np.ix_(seen, seen)], (free[:, 13:-3] - mean[seen]).T)
-    np.testing.assert_allclose(pose[:, hidden], mean[hidden] + (S[np.ix_(hidden, seen)] @ pull).T, atol=1e-9)
+    np.testing.assert_allclose(
+        pose[:, hidden], mean[hidden] + (S[np.ix_(hidden, seen)] @ pull).T, atol=1e-9
+    )
 
 
 def test_pose_energy_is_the_squared_distance_of_the_visible_angles(model, apart):
@@ -153,7 +168,10 @@ def test_orientation_moves_on_the_sphere_of_rotations(energy, free):
 @pytest.mark.parametrize("seen", ["all", "trunk", "legs"])
 def test_alignment_of_the_mean_pose_is_exact(model, seen):
     prior = PosePrior.default()
-    rotation, transl = Rotation.random(4, random_state=0), np.random.default_rng(0).normal(size=(4, 3))
+    rotation, transl = (
+        Rotation.random(4, random_state=0),
+        np.random.default_rng(0).normal(size=(4, 3)),
+    )
     pose = np.tile(prior.mean.reshape(1, 23, 3), (4, 1, 1))
     parts = (np.zeros((4, 10)), rotation.as_rotvec(), pose, transl)
     xyz = model.keypoints(BodyParameters(*(parts)))
@@ -184,7 +202,9 @@ def test_model_error_is_added_to_covariances_and_rays_stay_rays():
     full = np.setdiff1d(np.arange(25), [5, 6])
     expected = np.linalg.inv(covariance[0, full] + 0.02**2 * np.eye(3))
     np.testing.assert_allclose(weighed[0, full], expected, rtol=1e-7)
-    np.testing.assert_allclose(weighed[0, 5], np.diag([2000.0, 2000.0, 0.0]), atol=1e-8)  # 1 / (1e-4 + 4e-4)
+    np.testing.assert_allclose(
+        weighed[0, 5], np.diag([2000.0, 2000.0, 0.0]), atol=1e-8
+    )  # 1 / (1e-4 + 4e-4)
     assert not weighed[0, 6].any()
 
 

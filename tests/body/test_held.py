@@ -23,7 +23,9 @@ def draw(*shape: int, seed: int = 0) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def targets() -> EnergyTargets:
-    return EnergyTargets(0.4 * draw(ROWS, 25, 3, seed=1), np.tile(400 * np.eye(3), (ROWS, 25, 1, 1)))
+    return EnergyTargets(
+        0.4 * draw(ROWS, 25, 3, seed=1), np.tile(400 * np.eye(3), (ROWS, 25, 1, 1))
+    )
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +35,11 @@ def free(energy) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def held(energy) -> Held:
-    return Held(draw(ROWS, 10, seed=2), np.exp(draw(ROWS, seed=3)), 0.2 * draw(ROWS, energy.num_angles, seed=4))
+    return Held(
+        draw(ROWS, 10, seed=2),
+        np.exp(draw(ROWS, seed=3)),
+        0.2 * draw(ROWS, energy.num_angles, seed=4),
+    )
 
 
 def test_the_gradient_is_that_of_the_energy(energy, targets, free, held):
@@ -42,7 +48,8 @@ def test_the_gradient_is_that_of_the_energy(energy, targets, free, held):
         nudge = np.zeros((ROWS, energy.num_free))
         nudge[:, column] = step
         ahead, behind = (
-            energy.linearise(energy.retract(free, sign * nudge), targets, SCALE, held).energy for sign in (1, -1)
+            energy.linearise(energy.retract(free, sign * nudge), targets, SCALE, held).energy
+            for sign in (1, -1)
         )
         # Half the gradient; central differences of energies about 1e4: rounding 1e-12 / 1e-5.
         numeric = (ahead - behind) / (4 * step)
@@ -54,7 +61,8 @@ def test_where_it_is_held_it_is_not_pulled(energy, free):
     nothing = EnergyTargets(np.zeros((ROWS, 25, 3)), np.zeros((ROWS, 25, 3, 3)))
     here = energy.linearise(free, nothing, SCALE, held)
     assert not here.gradient.any() and not here.energy.any()
-    # As tightly as the priors: the stiffness on betas, positive definite on angles, nothing on where it stands.
+    # As tightly as the priors: the stiffness on betas, positive definite on angles, nothing on
+    # where it stands.
     hessian = here.hessian
     np.testing.assert_allclose(hessian[:, :10, :10], np.tile(5 * np.eye(10), (ROWS, 1, 1)))
     assert np.linalg.eigvalsh(hessian[:, 13:-3, 13:-3]).min() > 0
@@ -73,7 +81,10 @@ def test_settled_shapes_stay_and_poses_go_on(energy, targets, free, held):
 
 
 def test_a_step_moves_rows_and_keeps_their_linearisation(energy, targets, free, held):
-    body, here = energy.evaluate(free, targets, SCALE, held), energy.linearise(free, targets, SCALE, held)
+    body, here = (
+        energy.evaluate(free, targets, SCALE, held),
+        energy.linearise(free, targets, SCALE, held),
+    )
     P, root = energy.num_free, np.isin(np.arange(energy.num_free), [10, 11, 12, *range(76, 79)])
     factor = np.tril(body.system[:, :P])
     H = factor @ factor.swapaxes(1, 2)
@@ -83,9 +94,13 @@ def test_a_step_moves_rows_and_keeps_their_linearisation(energy, targets, free, 
     body.move(np.array([False, True, False]), there, slope)
     for name in ("gradient", "squared", "energy", "xyz"):
         one, two = getattr(here, name), getattr(slope, name)
-        np.testing.assert_allclose(getattr(body, name), [one[0], two[1], one[2]], atol=1e-8, rtol=1e-9)
+        np.testing.assert_allclose(
+            getattr(body, name), [one[0], two[1], one[2]], atol=1e-8, rtol=1e-9
+        )
     # What the Newton step would gain, worked out the long way.
-    gain = np.einsum("bi,bi->b", body.gradient, np.linalg.solve(H, body.gradient[..., None])[..., 0])
+    gain = np.einsum(
+        "bi,bi->b", body.gradient, np.linalg.solve(H, body.gradient[..., None])[..., 0]
+    )
     np.testing.assert_allclose(body.left, gain, rtol=1e-8)
     rows = np.array([2, 0])
     alone = energy.linearise(free[rows], targets.rows(rows), SCALE, held.rows(rows))
@@ -93,12 +108,17 @@ def test_a_step_moves_rows_and_keeps_their_linearisation(energy, targets, free, 
 
 
 def test_covariances_are_the_inverse_hessian_s_and_the_sag_of_a_limb(energy, targets, free, held):
-    body, here = energy.evaluate(free, targets, SCALE, held), energy.linearise(free, targets, SCALE, held)
+    body, here = (
+        energy.evaluate(free, targets, SCALE, held),
+        energy.linearise(free, targets, SCALE, held),
+    )
     root = np.isin(np.arange(energy.num_free), [10, 11, 12, *range(76, 79)]).astype(float)
     inverse = np.linalg.inv(here.hessian + np.diag(root))
     J = here.jacobian.reshape(ROWS, 25, 3, -1)
     C = np.einsum("bkxp,bpq,bkyq->bkxy", J, inverse, J)
     sag = np.trace(C, axis1=-2, axis2=-1) / (2 * LIMB_M)
     covariance, shape = body.covariances()
-    np.testing.assert_allclose(covariance, C + sag[..., None, None] ** 2 * np.eye(3), atol=1e-12, rtol=1e-9)
+    np.testing.assert_allclose(
+        covariance, C + sag[..., None, None] ** 2 * np.eye(3), atol=1e-12, rtol=1e-9
+    )
     np.testing.assert_allclose(shape, inverse[:, :10, :10], atol=1e-12, rtol=1e-9)

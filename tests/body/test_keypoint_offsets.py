@@ -51,7 +51,9 @@ def test_the_jacobian_knows_of_the_offsets(tiny_model, random_parameters):
     np.testing.assert_allclose(keypoints, moved.keypoints(parameters), atol=1e-12)
     step = 1e-6
     for column in range(85):
-        ahead, behind = (moved.keypoints(nudged(parameters, column, sign * step)) for sign in (1, -1))
+        ahead, behind = (
+            moved.keypoints(nudged(parameters, column, sign * step)) for sign in (1, -1)
+        )
         numeric = (ahead - behind) / (2 * step)
         # Central differences in double precision: truncation 1e-12, rounding 1e-16 / 1e-6.
         np.testing.assert_allclose(jacobian[..., column], numeric, atol=1e-7)
@@ -61,7 +63,8 @@ def test_offsets_outlast_a_change_of_type_and_replace_each_other(tiny_model, ran
     parameters = random_parameters()
     single = tiny_model.with_keypoint_offsets(random_offsets())
     double = tiny_model.with_keypoint_offsets(random_offsets())
-    # Single precision, some metres from the origin and through a chain of eight turns: some micrometres.
+    # Single precision, some metres from the origin and through a chain of eight turns: some
+    # micrometres.
     expected = double.keypoints(random_parameters())
     np.testing.assert_allclose(single.keypoints(parameters), expected, atol=2e-5)
     back = double.with_keypoint_offsets(KeypointOffsets.identity())
@@ -116,10 +119,14 @@ def test_nonsense_is_refused(name, value, message):
 def test_files_give_back_what_was_written(tmp_path):
     offsets = random_offsets()
     offsets.save(tmp_path / "offsets.json")
-    (tmp_path / "run.json").write_text(json.dumps({"seconds": {}, "keypoint_offsets": offsets.as_dict()}))
+    (tmp_path / "run.json").write_text(
+        json.dumps({"seconds": {}, "keypoint_offsets": offsets.as_dict()})
+    )
     for name in ("offsets.json", "run.json"):
         again = KeypointOffsets.load(tmp_path / name)
-        np.testing.assert_allclose(again.xyz_m, offsets.xyz_m, atol=5.1e-7)  # written to a micrometre
+        np.testing.assert_allclose(
+            again.xyz_m, offsets.xyz_m, atol=5.1e-7
+        )  # written to a micrometre
         np.testing.assert_allclose(again.sigma_m, offsets.sigma_m, atol=5.1e-7)
         np.testing.assert_array_equal(again.count, offsets.count)
         np.testing.assert_array_equal(again.bones, offsets.bones)

@@ -1,6 +1,7 @@
 """The learned fitter with the weights that ship: errors, independence, groups, offsets, bad input.
 
-Bounds on errors leave room for other weights: they say that the fitter works, `docs/evaluation.md` how well.
+Bounds on errors leave room for other weights: they say that the fitter works, `docs/evaluation.md`
+how well.
 """
 
 from dataclasses import replace
@@ -53,7 +54,9 @@ def joints() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def uneven(joints) -> JointTargets:
-    """Noisy targets, surer along some directions than along others, forearms missing from every third row."""
+    """Noisy targets, surer along some directions than along others, forearms missing from every
+    third row.
+    """
     rng = np.random.default_rng(1)
     A = 0.02 * rng.normal(size=(*joints.shape, 3))
     information = np.linalg.inv(0.01**2 * np.eye(3) + A @ A.swapaxes(-1, -2))
@@ -69,7 +72,8 @@ def fit(fitter, uneven) -> BodyFit:
 def test_clean_joints_come_back(fitter, joints):
     fit = fitter.fit(known_to(joints, 0.005))
     assert fit.ok.all()
-    # 6.3 mm with weights that were a third trained; a tenth of the prior's poses are wilder than any recorded.
+    # 6.3 mm with weights that were a third trained; a tenth of the prior's poses are wilder than
+    # any recorded.
     assert distance_mm(fit.joints, joints).mean() < 8
     assert np.median(distance_mm(fit.joints, joints)) < 6
 
@@ -80,7 +84,8 @@ def test_clean_joints_of_other_skeletons_come_back(shipped_weights, name):
     truth = model.keypoints(draw_bodies(COUNT))
     fit = SmplFitter(model, weights=shipped_weights).fit(known_to(truth, 0.005))
     assert fit.ok.all() and fit.joints.shape == truth.shape
-    # COCO has neither feet nor neck, SMPL has a spine and hands that no prior bends far: a little more room.
+    # COCO has neither feet nor neck, SMPL has a spine and hands that no prior bends far: a little
+    # more room.
     assert distance_mm(fit.joints, truth).mean() < 12
 
 
@@ -121,7 +126,9 @@ def test_a_world_turned_and_moved_has_the_same_bodies_turned_and_moved(fitter, u
 def test_a_row_alone_is_the_row_of_a_batch(fitter, uneven, fit):
     for row in (0, 7):
         alone = fitter.fit(JointTargets(uneven.xyz[[row]], uneven.information[[row]]))
-        np.testing.assert_allclose(alone.joints[0], fit.joints[row], atol=1e-4)  # products in another order
+        np.testing.assert_allclose(
+            alone.joints[0], fit.joints[row], atol=1e-4
+        )  # products in another order
         np.testing.assert_allclose(alone.betas[0], fit.betas[row], atol=1e-3)
 
 
@@ -133,7 +140,9 @@ def test_where_a_fit_starts_does_not_matter(fitter, uneven, fit):
 def test_the_place_of_a_missing_joint_is_not_looked_at(fitter, uneven, fit, anything):
     xyz = uneven.xyz.copy()
     xyz[::3, [ELBOW, WRIST]] = anything
-    np.testing.assert_array_equal(fitter.fit(JointTargets(xyz, uneven.information)).joints, fit.joints)
+    np.testing.assert_array_equal(
+        fitter.fit(JointTargets(xyz, uneven.information)).joints, fit.joints
+    )
 
 
 def test_missing_joints_are_filled_in_and_known_to_be_guesses(fit, joints):
@@ -192,7 +201,9 @@ def test_where_the_network_goes_wild_the_plain_optimiser_fits(shipped_weights, j
     network = type(trained)(
         trained.config, {**trained.weights, "leave.bias": trained.weights["leave.bias"] + 1e30}
     )
-    fit = SmplFitter(weights=replace(shipped_weights, network=network)).fit(known_to(joints[:3], 0.01))
+    fit = SmplFitter(weights=replace(shipped_weights, network=network)).fit(
+        known_to(joints[:3], 0.01)
+    )
     plain = SmplFitter().fit(known_to(joints[:3], 0.01))
     assert fit.ok.all()
     np.testing.assert_array_equal(fit.joints, plain.joints)
@@ -209,16 +220,21 @@ def test_rows_of_one_person_share_a_shape_that_is_nearer_to_the_true_one(fitter)
     truth = BodyModel.default().keypoints(bodies)
     targets = known_to(truth + np.random.default_rng(1).normal(0, 0.01, truth.shape), 0.01)
     alone = fitter.fit(targets)
-    order = np.random.default_rng(2).permutation(people * rows)  # rows of a person need not lie together
+    order = np.random.default_rng(2).permutation(
+        people * rows
+    )  # rows of a person need not lie together
     shuffled = JointTargets(targets.xyz[order], targets.information[order])
     together = fitter.fit(shuffled, groups=order // rows * 7 - 3).rows(np.argsort(order))
     shapes = together.betas.reshape(people, rows, 10)
     ok = (alone.ok & together.ok).reshape(people, rows)
     assert ok.mean() > 0.9
     spread = np.array([np.ptp(shapes[p][ok[p]], axis=0).max() for p in range(people)])
-    # Held by a precision of 1e6, against some hundreds of what a row's joints say; alone they differ by ones.
+    # Held by a precision of 1e6, against some hundreds of what a row's joints say; alone they
+    # differ by ones.
     assert spread.max() < 1e-3
-    error = [np.linalg.norm(f.betas - bodies.betas, axis=1)[ok.ravel()].mean() for f in (alone, together)]
+    error = [
+        np.linalg.norm(f.betas - bodies.betas, axis=1)[ok.ravel()].mean() for f in (alone, together)
+    ]
     # 2.6 and 2.1: joints tell little of girth; those directions stay near zero, as they must.
     assert error[1] < 0.9 * error[0]
 
@@ -235,7 +251,12 @@ def test_a_person_with_bad_rows_keeps_the_shape_of_the_good_ones(fitter, joints)
     information = targets.information.copy()
     information[1] = 0
     fit = fitter.fit(JointTargets(targets.xyz, information), groups=np.array([0, 0, 0, 1]))
-    assert fit.status.tolist() == [FitStatus.OK, FitStatus.TOO_FEW_JOINTS, FitStatus.OK, FitStatus.OK]
+    assert fit.status.tolist() == [
+        FitStatus.OK,
+        FitStatus.TOO_FEW_JOINTS,
+        FitStatus.OK,
+        FitStatus.OK,
+    ]
     np.testing.assert_allclose(fit.betas[0], fit.betas[2], atol=1e-3)
 
 
@@ -244,12 +265,15 @@ def test_a_detector_that_puts_joints_elsewhere_is_followed(fitter, shipped_weigh
     elsewhere = fitter.with_keypoint_offsets(offsets)
     truth = elsewhere.model.keypoints(draw_bodies(COUNT))
     hip = BODY_25.index("LHip")
-    assert distance_mm(truth[:, hip], joints[:, hip]) == pytest.approx(1000 * np.hypot(0.05, 0.06), abs=0.01)
+    assert distance_mm(truth[:, hip], joints[:, hip]) == pytest.approx(
+        1000 * np.hypot(0.05, 0.06), abs=0.01
+    )
     targets = known_to(truth, 0.005)
     informed, naive = elsewhere.fit(targets), fitter.fit(targets)
     assert distance_mm(informed.joints, truth).mean() < 8
     assert (
-        distance_mm(informed.joints, truth)[:, hip].mean() < 0.5 * distance_mm(naive.joints, truth)[:, hip].mean()
+        distance_mm(informed.joints, truth)[:, hip].mean()
+        < 0.5 * distance_mm(naive.joints, truth)[:, hip].mean()
     )
     body = fitter.model.keypoints(
         BodyParameters(*((informed.betas, informed.global_orient, informed.body_pose,
@@ -278,5 +302,6 @@ def test_a_row_alone_in_its_group_is_as_unsure_as_without_groups(fitter, joints)
     targets = known_to(joints[:4], 0.01)
     alone, grouped = fitter.fit(targets), fitter.fit(targets, groups=np.arange(4))
     np.testing.assert_allclose(grouped.joints, alone.joints, atol=2e-3)  # one more polishing step
-    # A settled shape would take 5 % off every joint; the extra step moves entries of (3 mm)² by a tenth of that.
+    # A settled shape would take 5 % off every joint; the extra step moves entries of (3 mm)² by a
+    # tenth of that.
     np.testing.assert_allclose(grouped.covariance, alone.covariance, rtol=0.02, atol=2e-6)

@@ -1,4 +1,6 @@
-"""The model against SMPL's formulas written out bone by bone, and its shortcuts against the mesh."""
+"""The model against SMPL's formulas written out bone by bone, and its shortcuts against the
+mesh.
+"""
 
 import numpy as np
 import pytest
@@ -10,7 +12,9 @@ from shapepose_fg.body.model.smpl_file import SMPL_PARENTS
 
 
 def smpl_by_hand(arrays, parameters, b):
-    """Vertices and joints of body b, as in the SMPL paper: 4 x 4 transforms, one bone after the other."""
+    """Vertices and joints of body b, as in the SMPL paper: 4 x 4 transforms, one bone after the
+    other.
+    """
     betas, transl = parameters.betas[b], parameters.transl[b]
     poses = np.concatenate((parameters.global_orient[b][None], parameters.body_pose[b]))
     R = Rotation.from_rotvec(poses).as_matrix()
@@ -46,19 +50,25 @@ def test_keypoints_are_the_regressor_on_the_mesh(tiny_model, random_parameters):
     np.testing.assert_allclose(tiny_model.keypoints(parameters), expected, atol=1e-12)
 
 
-def test_some_vertices_are_those_of_the_mesh_whatever_the_type_of_their_numbers(tiny_model, random_parameters):
+def test_some_vertices_are_those_of_the_mesh_whatever_the_type_of_their_numbers(
+    tiny_model, random_parameters
+):
     """[1, 0] of 32 bits has the bytes of [1] of 64."""
     parameters = random_parameters()
     whole = tiny_model.vertices(parameters)
     for only in (np.array([1, 0], dtype=np.int32), np.array([1]), np.array([4, 2, 0])[::-1]):
-        np.testing.assert_allclose(tiny_model.vertices(parameters, only), whole[:, only], atol=1e-12)
+        np.testing.assert_allclose(
+            tiny_model.vertices(parameters, only), whole[:, only], atol=1e-12
+        )
     with pytest.raises(ValueError, match=r"only must be \(M,\)"):
         tiny_model.vertices(parameters, np.array([[1, 0]]))
 
 
 def test_rows_that_do_not_sum_to_one(tmp_path, make_smpl_arrays, random_parameters):
     arrays = make_smpl_arrays()
-    arrays["keypoint_regressor"] *= np.linspace(0.985, 1.015, 25)[:, None]  # as printed with few digits
+    arrays["keypoint_regressor"] *= np.linspace(0.985, 1.015, 25)[
+        :, None
+    ]  # as printed with few digits
     np.savez(tmp_path / "odd.npz", **arrays)
     model = BodyModel.load(tmp_path / "odd.npz")
     expected = arrays["keypoint_regressor"] @ model.vertices(random_parameters())

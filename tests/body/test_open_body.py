@@ -1,4 +1,6 @@
-"""The body that ships: is it a human, in SMPL's pose, on SMPL's joints, with keypoints where people have them?"""
+"""The body that ships: is it a human, in SMPL's pose, on SMPL's joints, with keypoints where people
+have them?
+"""
 
 from pathlib import Path
 
@@ -36,7 +38,9 @@ def volume(body: BodyModel, parameters: BodyParameters) -> float:
 
 
 def winding(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """How often a mesh (F, 3, 3) goes round each point: 1 inside, 0 outside (van Oosterom and Strackee 1983)."""
+    """How often a mesh (F, 3, 3) goes round each point: 1 inside, 0 outside (van Oosterom and
+    Strackee 1983).
+    """
     a, b, c = (triangles[None, :, i] - points[:, None] for i in range(3))
     la, lb, lc = (np.linalg.norm(v, axis=-1) for v in (a, b, c))
     dot = [np.einsum("pfx,pfx->pf", u, v) for u, v in ((a, b), (b, c), (c, a))]
@@ -57,16 +61,26 @@ def test_heights_are_those_of_adults(body):
     parameters.betas[:, 0] = np.arange(-2, 3)
     heights = np.ptp(body.vertices(parameters)[..., 1], axis=1)
     assert 1.66 < heights[2] < 1.74
-    np.testing.assert_allclose(np.diff(heights), 0.1, atol=0.02)  # a standard deviation over women and men
+    np.testing.assert_allclose(
+        np.diff(heights), 0.1, atol=0.02
+    )  # a standard deviation over women and men
 
 
 def test_betas_are_standard_deviations_of_many_lengths(body):
     """Limbs vary by some 3 % about what stature foretells, as people's do."""
     betas = np.random.default_rng(0).normal(size=(2000, 10))
     parameters = zeros(2000)
-    joints = body.joints(BodyParameters(betas, parameters.global_orient, parameters.body_pose, parameters.transl))
-    for first, second in (("left_hip", "left_knee"), ("left_knee", "left_ankle"), ("left_elbow", "left_wrist")):
-        length = np.linalg.norm(joints[:, SMPL_24.index(first)] - joints[:, SMPL_24.index(second)], axis=-1)
+    joints = body.joints(
+        BodyParameters(betas, parameters.global_orient, parameters.body_pose, parameters.transl)
+    )
+    for first, second in (
+        ("left_hip", "left_knee"),
+        ("left_knee", "left_ankle"),
+        ("left_elbow", "left_wrist"),
+    ):
+        length = np.linalg.norm(
+            joints[:, SMPL_24.index(first)] - joints[:, SMPL_24.index(second)], axis=-1
+        )
         beside_stature = length - np.polyval(np.polyfit(betas[:, 0], length, 1), betas[:, 0])
         assert 0.02 < beside_stature.std() / length.mean() < 0.05
 
@@ -99,7 +113,10 @@ def test_it_is_symmetric(body):
 def test_joints_and_keypoints_lie_within(body):
     triangles = body.vertices(zeros())[0][body.faces]
     assert (winding(body.joints(zeros())[0], triangles) > 0.5).all()
-    skin = [BODY_25.index(name) for name in "Nose REye LEye REar LEar LBigToe LSmallToe RBigToe RSmallToe".split()]
+    skin = [
+        BODY_25.index(name)
+        for name in "Nose REye LEye REar LEar LBigToe LSmallToe RBigToe RSmallToe".split()
+    ]
     inside = winding(np.delete(body.keypoints(zeros())[0], skin, axis=0), triangles)
     assert (inside > 0.5).all()
     face = body.keypoints(zeros())[0][skin]
@@ -112,14 +129,17 @@ def test_volume_is_a_persons_and_survives_bending(body):
     assert 0.055 < rest < 0.085  # m^3, about as many tonnes
     sitting = posed(
         left_hip=(-90, 0, 0), right_hip=(-90, 0, 0), left_knee=(90, 0, 0), right_knee=(90, 0, 0),
-        left_shoulder=(0, 0, -70), right_shoulder=(0, 0, 70), left_elbow=(0, -90, 0), right_elbow=(0, 90, 0),
+        left_shoulder=(0, 0, -70), right_shoulder=(0, 0, 70), left_elbow=(0, -90, 0),
+        right_elbow=(0, 90, 0),
     )  # fmt: skip
     # Linear blend skinning loses volume in bent joints, here 7.6 %; wrong weights would take half.
     assert 0.9 < volume(body, sitting) / rest < 1.02
 
 
 def test_turning_a_joint_turns_what_hangs_on_it(body):
-    """SMPL's signs: -x at the hip lifts the thigh forwards, -y at the left elbow folds the fore-arm forwards."""
+    """SMPL's signs: -x at the hip lifts the thigh forwards, -y at the left elbow folds the fore-arm
+    forwards.
+    """
     at = joints_by_name(body, zeros())
     lifted = joints_by_name(body, posed(left_hip=(-90, 0, 0)))
     thigh = np.linalg.norm(at["left_knee"] - at["left_hip"])
@@ -142,7 +162,9 @@ def test_neck_and_midhip_are_the_middles_that_openpose_learned(body, random_para
     keypoints = body.keypoints(random_parameters(4))
     for middle, part in (("Neck", "Shoulder"), ("MidHip", "Hip")):
         sides = [BODY_25.index(side + part) for side in "RL"]
-        np.testing.assert_allclose(keypoints[:, BODY_25.index(middle)], keypoints[:, sides].mean(1), atol=1e-6)
+        np.testing.assert_allclose(
+            keypoints[:, BODY_25.index(middle)], keypoints[:, sides].mean(1), atol=1e-6
+        )
 
 
 def test_few_bones_move_a_vertex(body):

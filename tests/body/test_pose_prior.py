@@ -40,7 +40,10 @@ def test_left_and_right_are_mirror_images(prior):
 def test_every_angle_has_play_and_none_is_free(prior):
     sigma = np.sqrt(np.diag(prior.covariance))
     assert sigma.min() > 0.05 and sigma.max() < 1.2
-    assert np.sqrt(np.linalg.eigvalsh(prior.covariance)[0]) > 0.04 and np.linalg.cond(prior.covariance) < 1e4
+    assert (
+        np.sqrt(np.linalg.eigvalsh(prior.covariance)[0]) > 0.04
+        and np.linalg.cond(prior.covariance) < 1e4
+    )
 
 
 def test_samples_have_the_moments_and_obey_the_limits(prior):
@@ -50,7 +53,8 @@ def test_samples_have_the_moments_and_obey_the_limits(prior):
     assert (flat >= prior.lower).all() and (flat <= prior.upper).all()
     free = np.isinf(prior.lower) & np.isinf(prior.upper)
     sigma = np.sqrt(np.diag(prior.covariance))
-    # The mean of 4,000 draws is within 4 sigma / sqrt(4000); their sigma within 10 %, for tails are heavy.
+    # The mean of 4,000 draws is within 4 sigma / sqrt(4000); their sigma within 10 %, for tails are
+    # heavy.
     assert (np.abs(flat.mean(axis=0) - prior.mean)[free] < 4 * sigma[free] / np.sqrt(4000)).all()
     np.testing.assert_allclose(flat.std(axis=0)[free], sigma[free], rtol=0.1)
 
@@ -93,12 +97,17 @@ def test_bad_priors_are_refused(prior, change, message):
 @pytest.mark.slow
 def test_predicts_hidden_joints_of_people_it_never_saw(prior, shared_data):
     motions = load_motions(shared_data / "cmu_mocap" / "cmu_smpl24.npz").of("test")
-    motions = motions.rows(~np.isin(motions.subject, ["60", "61"]))  # salsa would be three frames in four
+    motions = motions.rows(
+        ~np.isin(motions.subject, ["60", "61"])
+    )  # salsa would be three frames in four
     poses = motions.poses[::10, 1:].reshape(-1, 69).astype(float)
     for joint, gain in (("left_knee", 0.75), ("right_elbow", 0.9)):
         asked = np.array([angle(joint, axis) for axis in range(3)])
         given = np.setdiff1d(np.arange(69), asked)
-        guess = prior.mean[asked] + (poses[:, given] - prior.mean[given]) @ prior.regression(given, asked).T
+        guess = (
+            prior.mean[asked]
+            + (poses[:, given] - prior.mean[given]) @ prior.regression(given, asked).T
+        )
         by_rest = np.linalg.norm(poses[:, asked] - guess, axis=1).mean()
         by_mean = np.linalg.norm(poses[:, asked] - prior.mean[asked], axis=1).mean()
         assert by_rest < gain * by_mean

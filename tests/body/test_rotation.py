@@ -16,7 +16,9 @@ ANGLES = (0.0, 1e-12, 1e-7, 1e-4, 0.0999, 0.1001, 1.0, 3.0, np.pi - 1e-4, np.pi 
 
 def axis_angles() -> np.ndarray:
     axes = np.random.default_rng(0).normal(size=(40, 3))
-    axes = np.concatenate((axes / np.linalg.norm(axes, axis=1, keepdims=True), np.eye(3), -np.eye(3)))
+    axes = np.concatenate(
+        (axes / np.linalg.norm(axes, axis=1, keepdims=True), np.eye(3), -np.eye(3))
+    )
     return (np.array(ANGLES)[:, None, None] * axes).reshape(-1, 3)
 
 

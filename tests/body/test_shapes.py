@@ -14,7 +14,10 @@ def two_shapes(body: str = "a body") -> SubjectShapes:
     rng = np.random.default_rng(0)
     root = rng.normal(size=(2, 10, 10))
     return SubjectShapes(
-        np.array(["Ann", "3"]), rng.normal(size=(2, 10)), root @ root.swapaxes(-1, -2) + np.eye(10), body
+        np.array(["Ann", "3"]),
+        rng.normal(size=(2, 10)),
+        root @ root.swapaxes(-1, -2) + np.eye(10),
+        body,
     )
 
 
@@ -24,21 +27,27 @@ def test_saved_and_loaded_is_the_same(tmp_path):
     assert loaded.names.tolist() == ["Ann", "3"]
     np.testing.assert_array_equal(loaded.betas, two_shapes().betas)
     np.testing.assert_array_equal(loaded.information, two_shapes().information)
-    np.testing.assert_allclose(loaded.covariance @ loaded.information, np.tile(np.eye(10), (2, 1, 1)), atol=1e-9)
+    np.testing.assert_allclose(
+        loaded.covariance @ loaded.information, np.tile(np.eye(10), (2, 1, 1)), atol=1e-9
+    )
     SubjectShapes.empty("a body").save(tmp_path / "nobody.npz")
     assert len(SubjectShapes.load(tmp_path / "nobody.npz", "a body")) == 0
 
 
 def test_shapes_of_another_body_are_refused(tmp_path):
     two_shapes("their body").save(tmp_path / "subjects.npz")
-    with pytest.raises(InputError, match=r"subjects.npz: these are shapes of another body model, .* with --body"):
+    with pytest.raises(
+        InputError, match=r"subjects.npz: these are shapes of another body model, .* with --body"
+    ):
         SubjectShapes.load(tmp_path / "subjects.npz", fingerprint(BodyModel.default()))
     with pytest.raises(ValueError, match="same body model"):
         two_shapes().updated(two_shapes("their body"))
 
 
 def test_a_newer_shape_takes_the_place_of_the_older():
-    newer = SubjectShapes(np.array(["3", "Bob"]), np.ones((2, 10)), np.tile(5 * np.eye(10), (2, 1, 1)), "a body")
+    newer = SubjectShapes(
+        np.array(["3", "Bob"]), np.ones((2, 10)), np.tile(5 * np.eye(10), (2, 1, 1)), "a body"
+    )
     both = two_shapes().updated(newer)
     assert both.names.tolist() == ["Ann", "3", "Bob"]
     np.testing.assert_array_equal(both.betas[0], two_shapes().betas[0])
@@ -50,12 +59,27 @@ def test_a_newer_shape_takes_the_place_of_the_older():
     ("changed", "sentence"),
     [
         ({"names": np.array(["Ann", "Ann"])}, "names must differ, but 'Ann' occurs twice"),
-        ({"betas": np.full((2, 10), np.nan)}, "betas and information must be finite, but those of 'Ann' are not"),
+        (
+            {"betas": np.full((2, 10), np.nan)},
+            "betas and information must be finite, but those of 'Ann' are not",
+        ),
         ({"betas": np.zeros((2, 11))}, "betas must be (2, 10), got (2, 11)"),
-        ({"information": np.tile(-np.eye(10), (2, 1, 1))}, "information must be symmetric and positive definite"),
-        ({"information": np.tile(1e-9 * np.eye(10), (2, 1, 1))}, "information must be symmetric and positive"),
-        ({"information": np.tile(1e150 * np.eye(10), (2, 1, 1))}, "betas and information must be at most 1e+12"),
-        ({"information": np.tile(np.triu(np.ones((10, 10))), (2, 1, 1))}, "information must be symmetric"),
+        (
+            {"information": np.tile(-np.eye(10), (2, 1, 1))},
+            "information must be symmetric and positive definite",
+        ),
+        (
+            {"information": np.tile(1e-9 * np.eye(10), (2, 1, 1))},
+            "information must be symmetric and positive",
+        ),
+        (
+            {"information": np.tile(1e150 * np.eye(10), (2, 1, 1))},
+            "betas and information must be at most 1e+12",
+        ),
+        (
+            {"information": np.tile(np.triu(np.ones((10, 10))), (2, 1, 1))},
+            "information must be symmetric",
+        ),
         ({"body": np.zeros(3)}, "these are shapes of another body model"),
         ({"information": None}, "column information is missing"),
     ],
@@ -90,7 +114,9 @@ def test_damaged_files_are_one_sentence_or_none(tmp_path):
 def test_stature_is_that_of_the_mesh():
     model, betas = BodyModel.default(), np.random.default_rng(0).normal(size=(4, 10))
     pose = BodyParameters.zeros(4)
-    vertices = model.vertices(BodyParameters(betas, pose.global_orient, pose.body_pose, pose.transl))
+    vertices = model.vertices(
+        BodyParameters(betas, pose.global_orient, pose.body_pose, pose.transl)
+    )
     tall = np.ptp(vertices[..., 1], axis=1)
     found = statures_m(betas, read_body())
     np.testing.assert_allclose(found, tall, atol=1e-5)  # the mesh is float32
@@ -98,7 +124,9 @@ def test_stature_is_that_of_the_mesh():
 
 
 def drawn(seed: int, people: int, sigma: float) -> tuple[SubjectShapes, SubjectShapes]:
-    """What two recordings told of adults' betas: as of betas that were seen with an error of `sigma`."""
+    """What two recordings told of adults' betas: as of betas that were seen with an error of
+    `sigma`.
+    """
     rng = np.random.default_rng(seed)
     betas = rng.normal(size=(people, 10))
     information = np.tile((1 + sigma**-2) * np.eye(10), (people, 1, 1))
@@ -107,7 +135,9 @@ def drawn(seed: int, people: int, sigma: float) -> tuple[SubjectShapes, SubjectS
     for _ in range(2):
         seen = betas + sigma * rng.normal(size=betas.shape)
         # The prior over adults pulls the estimate to 0.
-        recordings.append(SubjectShapes(names, seen * sigma**-2 / (1 + sigma**-2), information, "a body"))
+        recordings.append(
+            SubjectShapes(names, seen * sigma**-2 / (1 + sigma**-2), information, "a body")
+        )
     first, second = recordings
     return first, second
 
@@ -129,7 +159,9 @@ def test_the_evidence_is_that_of_gaussians():
 
     first, second = drawn(1, people=1, sigma=0.5)
     measured = second.betas[0] * (1 + 0.5**-2) / 0.5**-2  # without the prior
-    same = multivariate_normal(first.betas[0], 0.5**2 * np.eye(10) + first.covariance[0]).logpdf(measured)
+    same = multivariate_normal(first.betas[0], 0.5**2 * np.eye(10) + first.covariance[0]).logpdf(
+        measured
+    )
     stranger = multivariate_normal(np.zeros(10), (0.5**2 + 1) * np.eye(10)).logpdf(measured)
     threshold = np.exp(same - stranger)
     assert recognise(second, first, ratio=0.99 * threshold).tolist() == [0]
@@ -145,7 +177,9 @@ def test_where_nothing_was_seen_nobody_is_recognised():
 
 
 def test_how_often_people_are_confused():
-    """40 rooms of six people and three strangers, shapes known to 0.3 sigma: nobody is taken for another."""
+    """40 rooms of six people and three strangers, shapes known to 0.3 sigma: nobody is taken for
+    another.
+    """
     wrong = missed = 0
     for seed in range(40):
         first, second = drawn(seed, people=9, sigma=0.3)

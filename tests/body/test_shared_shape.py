@@ -26,8 +26,12 @@ def solved_alone(A: np.ndarray, y: np.ndarray, centre: np.ndarray, stiffness: fl
     return np.linalg.solve(H, right), H
 
 
-def solved_jointly(A: np.ndarray, y: np.ndarray, centre: np.ndarray, stiffness: float) -> np.ndarray:
-    """The betas (10,) of sum_i |A_i (betas, rest_i) - y_i|² + stiffness |betas - centre|², solved as one."""
+def solved_jointly(
+    A: np.ndarray, y: np.ndarray, centre: np.ndarray, stiffness: float
+) -> np.ndarray:
+    """The betas (10,) of sum_i |A_i (betas, rest_i) - y_i|² + stiffness |betas - centre|², solved
+    as one.
+    """
     n = len(A)
     big = np.zeros((n * 30, BETAS + n * REST))
     for row in range(n):
@@ -87,7 +91,9 @@ def test_rows_that_do_not_vote_take_the_others_shape():
     assert shared(pools, votes).tolist() == [True, True, True, False, False]
 
 
-@pytest.mark.parametrize("groups", [[0, 1], [[0], [1], [2]], [0.0, 1.0, 2.0], ["a", "b", "c"], [True] * 3])
+@pytest.mark.parametrize(
+    "groups", [[0, 1], [[0], [1], [2]], [0.0, 1.0, 2.0], ["a", "b", "c"], [True] * 3]
+)
 def test_groups_that_are_not_one_number_a_row_are_refused(groups):
     with pytest.raises(ValueError, match="groups must be 3 whole numbers"):
         check_groups(np.array(groups), 3)

@@ -9,7 +9,9 @@ from shapepose_fg.body.model.rotation import exp_so3
 def test_the_jacobian_is_that_of_the_positions(any_body, random_parameters):
     points, body, step = any_body.points, random_parameters(3), 1e-6
     xyz, jacobian = points.positions_with_jacobian(body.local, body.betas, body.transl)
-    np.testing.assert_allclose(points.positions(body.local, body.betas, body.transl), xyz, atol=1e-12)
+    np.testing.assert_allclose(
+        points.positions(body.local, body.betas, body.transl), xyz, atol=1e-12
+    )
     for column in range(0, 85, 4):
 
         def moved(by: float, column: int = column) -> np.ndarray:
@@ -40,7 +42,9 @@ def test_parts_are_rows_of_the_whole_and_join_to_it_again(any_body, random_param
     np.testing.assert_allclose(joined.positions(*given), xyz, atol=1e-13)
 
 
-def test_points_with_pose_blend_shapes_join_points_without(make_smpl_arrays, tmp_path, random_parameters):
+def test_points_with_pose_blend_shapes_join_points_without(
+    make_smpl_arrays, tmp_path, random_parameters
+):
     np.savez(tmp_path / "tiny.npz", **make_smpl_arrays())
     model = BodyModel.load(tmp_path / "tiny.npz")
     assert model.points.offsets_pose is not None

@@ -25,7 +25,9 @@ def test_missing_key(name, save, make_smpl_arrays):
         BodyModel.load(save(arrays))
 
 
-@pytest.mark.parametrize("name", "v_template shapedirs posedirs J_regressor weights keypoint_regressor".split())
+@pytest.mark.parametrize(
+    "name", "v_template shapedirs posedirs J_regressor weights keypoint_regressor".split()
+)
 def test_nan(name, save, make_smpl_arrays):
     arrays = make_smpl_arrays()
     arrays[name].flat[3] = np.nan
@@ -33,7 +35,9 @@ def test_nan(name, save, make_smpl_arrays):
         BodyModel.load(save(arrays))
 
 
-@pytest.mark.parametrize("name", "v_template shapedirs posedirs J_regressor weights keypoint_regressor f".split())
+@pytest.mark.parametrize(
+    "name", "v_template shapedirs posedirs J_regressor weights keypoint_regressor f".split()
+)
 def test_wrong_shape(name, save, make_smpl_arrays):
     arrays = make_smpl_arrays()
     arrays[name] = arrays[name][..., :-1]
@@ -110,7 +114,13 @@ def test_keypoints_of_smpls_own_mesh(save, make_smpl_arrays):
     tolerance = {"atol": 1e-6}  # float32
     # Vertices as the community's SMPL tools have them (smplx, `vertex_ids`).
     vertices = {"Nose": 332, "REye": 6260, "LEye": 2800, "REar": 4071, "LEar": 583, "LBigToe": 3216}
-    vertices |= {"LSmallToe": 3226, "LHeel": 3387, "RBigToe": 6617, "RSmallToe": 6624, "RHeel": 6787}
+    vertices |= {
+        "LSmallToe": 3226,
+        "LHeel": 3387,
+        "RBigToe": 6617,
+        "RSmallToe": 6624,
+        "RHeel": 6787,
+    }
     for name, vertex in vertices.items():
         np.testing.assert_allclose(keypoints[name], arrays["v_template"][vertex], **tolerance)
     np.testing.assert_allclose(keypoints["RKnee"], joints["right_knee"], **tolerance)

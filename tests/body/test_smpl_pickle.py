@@ -1,4 +1,6 @@
-"""Pickles as Python 2 and 3 write them, with chumpy and scipy inside, and pickles that want to run something."""
+"""Pickles as Python 2 and 3 write them, with chumpy and scipy inside, and pickles that want to run
+something.
+"""
 
 import io
 import os
@@ -70,7 +72,11 @@ def assert_same(path, arrays):
 @pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
 def test_numpy_and_scipy(protocol, tmp_path, make_smpl_arrays):
     arrays = make_smpl_arrays()
-    content = {**arrays, "J_regressor": scipy.sparse.csr_matrix(arrays["J_regressor"]), "bs_type": "lrotmin"}
+    content = {
+        **arrays,
+        "J_regressor": scipy.sparse.csr_matrix(arrays["J_regressor"]),
+        "bs_type": "lrotmin",
+    }
     (tmp_path / "body.pkl").write_bytes(pickle.dumps(content, protocol=protocol))
     assert_same(tmp_path / "body.pkl", arrays)
 
@@ -119,7 +125,9 @@ def test_a_pickle_that_runs_a_command_is_refused(protocol, tmp_path, make_smpl_a
     proof = tmp_path / "ran"
     content = {**make_smpl_arrays(), "bs_type": Calls(os.system, f"touch {proof}")}
     (tmp_path / "body.pkl").write_bytes(pickle.dumps(content, protocol=protocol))
-    with pytest.raises(InputError, match=r"body\.pkl: cannot be read safely \(it asks for (posix|nt)\.system"):
+    with pytest.raises(
+        InputError, match=r"body\.pkl: cannot be read safely \(it asks for (posix|nt)\.system"
+    ):
         BodyModel.load(tmp_path / "body.pkl")
     assert not proof.exists()
 
@@ -164,7 +172,9 @@ def test_not_a_dict(tmp_path):
 
 def test_an_array_that_claims_more_than_it_holds(tmp_path, make_smpl_arrays):
     content = pickle.dumps({**make_smpl_arrays(), "v_template": np.zeros((61, 3))}, protocol=2)
-    claims = content.replace(b"K=K\x03\x86", b"K>K\x03\x86")  # shape (62, 3) over the bytes of (61, 3)
+    claims = content.replace(
+        b"K=K\x03\x86", b"K>K\x03\x86"
+    )  # shape (62, 3) over the bytes of (61, 3)
     assert claims != content
     (tmp_path / "body.pkl").write_bytes(claims)
     with pytest.raises(InputError, match="v_template is not an array"):

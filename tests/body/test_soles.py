@@ -11,7 +11,12 @@ UP = np.array([0.0, 1.0, 0.0])
 
 def standing(count: int, lift_m: float = 0.0):
     """T-poses whose soles are `lift_m` above y = 0."""
-    bodies = (np.zeros((count, 10)), np.zeros((count, 3)), np.zeros((count, 23, 3)), np.zeros((count, 3)))
+    bodies = (
+        np.zeros((count, 10)),
+        np.zeros((count, 3)),
+        np.zeros((count, 23, 3)),
+        np.zeros((count, 3)),
+    )
     bodies[3][:, 1] = lift_m - vertices(bodies)[0, :, 1].min()
     return bodies
 
@@ -26,7 +31,9 @@ def test_lowest_points_are_those_of_the_mesh():
     low = lowest_of_feet(MODEL, bodies, UP)
     assert low[1, 1, 1] < low[1, 0, 1] - 0.02
     # Every third vertex of a foot is looked at: a millimetre or two.
-    np.testing.assert_allclose(low[..., 1].min(axis=1), vertices(bodies)[..., 1].min(axis=1), atol=0.003)
+    np.testing.assert_allclose(
+        low[..., 1].min(axis=1), vertices(bodies)[..., 1].min(axis=1), atol=0.003
+    )
 
 
 def test_who_stands_on_the_floor_stays():

@@ -1,4 +1,6 @@
-"""The points that a body can be fitted to: each against the mesh and the joints, mirrored, with offsets."""
+"""The points that a body can be fitted to: each against the mesh and the joints, mirrored, with
+offsets.
+"""
 
 import numpy as np
 import pytest
@@ -36,7 +38,15 @@ def test_skeletons_have_the_joints_that_their_names_promise():
     assert count == {"BODY_25": 25, "COCO_17": 17, "HALPE_26": 26, "SMPL_24": 24}
     for joints in TARGET_SKELETONS.values():
         assert len(set(joints)) == len(joints)
-    assert TARGET_SKELETONS["COCO_17"][:7] == ("Nose", "LEye", "REye", "LEar", "REar", "LShoulder", "RShoulder")
+    assert TARGET_SKELETONS["COCO_17"][:7] == (
+        "Nose",
+        "LEye",
+        "REye",
+        "LEar",
+        "REar",
+        "LShoulder",
+        "RShoulder",
+    )
     assert TARGET_SKELETONS["HALPE_26"][17:20] == ("Head", "Neck", "MidHip")
 
 
@@ -54,7 +64,8 @@ def test_the_mirror_swaps_sides_and_comes_back():
 def test_a_mirrored_point_is_where_the_mirror_shows_it():
     model = BodyModel.default().with_keypoints(BODY_POINTS)
     xyz = model.keypoints(BodyParameters.zeros(1))[0]
-    # The shipped body's two sides are alike to some millimetres; neighbouring joints are centimetres apart.
+    # The shipped body's two sides are alike to some millimetres; neighbouring joints are
+    # centimetres apart.
     np.testing.assert_allclose(xyz[list(MIRROR)] * [-1, 1, 1], xyz, atol=0.01)
 
 
@@ -75,7 +86,9 @@ def test_bodies_turn_about_the_pelvis_of_the_rest_pose(any_body, random_paramete
 
 def test_offsets_go_with_the_keypoints_that_are_chosen(any_body, random_parameters):
     rng, parameters = np.random.default_rng(0), random_parameters()
-    offsets = KeypointOffsets(rng.normal(0, 0.03, (25, 3)), np.full(25, 0.01), np.arange(25), RIDES_ON)
+    offsets = KeypointOffsets(
+        rng.normal(0, 0.03, (25, 3)), np.full(25, 0.01), np.arange(25), RIDES_ON
+    )
     plain = any_body.with_keypoints(TARGET_SKELETONS["HALPE_26"])
     assert plain.offsets_of_keypoints is None
     moved = plain.with_keypoint_offsets(offsets)

@@ -1,4 +1,6 @@
-"""Files of weights: read as written, refused where damaged or for another body; which fitter is made of them."""
+"""Files of weights: read as written, refused where damaged or for another body; which fitter is
+made of them.
+"""
 
 import json
 from pathlib import Path
@@ -24,12 +26,18 @@ from shapepose_fg.pipeline.config import PipelineConfig
 def weights() -> FitterWeights:
     """Untrained weights of a small network on the shipped body."""
     config, rng = NetworkConfig(width=16, blocks=1, steps=2), np.random.default_rng(0)
-    network = UpdateNetwork(config, {name: rng.normal(size=shape) for name, shape in layer_shapes(config).items()})
+    network = UpdateNetwork(
+        config, {name: rng.normal(size=shape) for name, shape in layer_shapes(config).items()}
+    )
     model, prior = BodyModel.default(), PosePrior.default()
-    poses = np.concatenate((np.zeros((50, 1, 3)), prior.sample(np.random.default_rng(0), 50)), axis=1)
+    poses = np.concatenate(
+        (np.zeros((50, 1, 3)), prior.sample(np.random.default_rng(0), 50)), axis=1
+    )
     frame = PersonFrame.of(model, poses, np.ones(50))
     spread = np.linspace(0.5, 2.0, len(BODY_POINTS))
-    return FitterWeights(network, frame, fingerprint(model), spread, {"data": "none", "command": "python"})
+    return FitterWeights(
+        network, frame, fingerprint(model), spread, {"data": "none", "command": "python"}
+    )
 
 
 @pytest.fixture
@@ -62,7 +70,9 @@ def test_files_give_back_what_was_written(weights, file):
     assert again.body == weights.body and again.card == weights.card
     np.testing.assert_allclose(again.spread, weights.spread, atol=1e-6)
     for name, value in vars(weights.frame).items():
-        np.testing.assert_allclose(getattr(again.frame, name), value, atol=1e-6)  # in single precision
+        np.testing.assert_allclose(
+            getattr(again.frame, name), value, atol=1e-6
+        )  # in single precision
     inputs = np.ones((3, UpdateNetwork.num_inputs), np.float32)
     np.testing.assert_array_equal(again.network(inputs, 1), weights.network(inputs, 1))
 
@@ -82,11 +92,15 @@ def test_what_is_no_safetensors_file_is_refused(tmp_path, file):
         FitterWeights.load(tmp_path)
 
 
-@pytest.mark.parametrize("metadata", [None, {}, {"format": "pt"}, {"format": "shapepose-fg fitter 0"}])
+@pytest.mark.parametrize(
+    "metadata", [None, {}, {"format": "pt"}, {"format": "shapepose-fg fitter 0"}]
+)
 def test_other_safetensors_files_are_refused(file, metadata):
     tensors, _ = contents(file)
     save_file(tensors, file, metadata=metadata)
-    assert_refused(file, r"not weights of the learned fitter; train some with shapepose-fg train-fitter")
+    assert_refused(
+        file, r"not weights of the learned fitter; train some with shapepose-fg train-fitter"
+    )
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
@@ -99,7 +113,8 @@ def test_numbers_that_are_not_finite_are_refused(file, name, value):
 
 
 @pytest.mark.parametrize(
-    "damage", ["no spread", "no bias", "no frame", "half a frame", "odd size", "odd setting", "text", "no body",
+    "damage", ["no spread", "no bias", "no frame", "half a frame", "odd size", "odd setting",
+               "text", "no body",
                "list", "short spread", "short frame"]
 )  # fmt: skip
 def test_weights_of_another_version_are_refused(file, damage):
@@ -128,7 +143,9 @@ def test_weights_of_another_version_are_refused(file, damage):
 
 
 def test_weights_belong_to_one_body(weights, tiny_body, file):
-    with pytest.raises(InputError, match=r"trained on another body model: train weights for yours .* --body"):
+    with pytest.raises(
+        InputError, match=r"trained on another body model: train weights for yours .* --body"
+    ):
         SmplFitter(tiny_body, weights=weights)
     with pytest.raises(InputError, match="another body model"):
         make_fitter(BodyConfig(method="learned", weights=str(file)), tiny_body)
@@ -155,11 +172,15 @@ def test_the_fitter_is_the_one_that_is_asked_for(weights, file, tiny_body, shipp
 def test_the_shipped_weights_are_for_the_shipped_body_and_say_where_they_are_from(shipped_weights):
     shipped_weights.check(BodyModel.default())
     assert shipped_weights.card
-    assert shipped_weights.spread.shape == (len(BODY_POINTS),) and (shipped_weights.spread > 0).all()
+    assert (
+        shipped_weights.spread.shape == (len(BODY_POINTS),) and (shipped_weights.spread > 0).all()
+    )
 
 
 @pytest.mark.parametrize("table", ["learned", "plain"])
 def test_settings_of_before_are_told_what_took_their_place(tmp_path, table):
     (tmp_path / "settings.toml").write_text(f"[body.{table}]\nkernel_scale = 5.0\n")
-    with pytest.raises(InputError, match=rf"body\.{table} is one with \[body\] now, which has model_sigma_m"):
+    with pytest.raises(
+        InputError, match=rf"body\.{table} is one with \[body\] now, which has model_sigma_m"
+    ):
         read_config(tmp_path / "settings.toml", PipelineConfig)

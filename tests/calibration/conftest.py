@@ -14,8 +14,12 @@ from tests.setup_check.conftest import seen_by, walkers
 FPS = 25.0
 
 
-def disturbed(rig: Rig, seed: int, degrees: float = 1.0, metres: float = 0.02, focal: float = 0.0) -> Rig:
-    """The rig with every camera turned and moved by so much, in a random way, and its focal length off."""
+def disturbed(
+    rig: Rig, seed: int, degrees: float = 1.0, metres: float = 0.02, focal: float = 0.0
+) -> Rig:
+    """The rig with every camera turned and moved by so much, in a random way, and its focal length
+    off.
+    """
     rng, cameras = np.random.default_rng(seed), []
     for camera in rig.cameras:
         axis, way = rng.normal(size=(2, 3))
@@ -29,13 +33,18 @@ def disturbed(rig: Rig, seed: int, degrees: float = 1.0, metres: float = 0.02, f
 
 
 def off_by(rig: Rig, truth: Rig) -> tuple[np.ndarray, np.ndarray]:
-    """Degrees and metres (V,) by which cameras are off, once the rig as a whole is laid on the true one."""
+    """Degrees and metres (V,) by which cameras are off, once the rig as a whole is laid on the true
+    one.
+    """
     a, b = rig.centres - rig.centres.mean(axis=0), truth.centres - truth.centres.mean(axis=0)
     near, far = (np.stack([each.wTc[:3, :3] for each in one.cameras]) for one in (rig, truth))
     size = np.linalg.norm(a) * np.linalg.norm(b) / len(rig)
     U, _, Vt = np.linalg.svd(b.T @ a / size + np.einsum("vij,vkj->ik", far, near))
     R = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
-    turns = [Rotation.from_matrix((R @ one).T @ other).magnitude() for one, other in zip(near, far, strict=True)]
+    turns = [
+        Rotation.from_matrix((R @ one).T @ other).magnitude()
+        for one, other in zip(near, far, strict=True)
+    ]
     return np.degrees(turns), np.linalg.norm(a @ R.T - b, axis=1)
 
 
@@ -69,16 +78,24 @@ def late(rig, two_people) -> Recording:
 def filmed(body: np.ndarray, offset: float, drift: float = 0.0) -> np.ndarray:
     """(300, 3, 25, 3) people before a camera that began so late, and falls behind."""
     times = np.arange(300) / FPS
-    return np.stack([moving(body + np.array([0.45, 0.0, 0.0]), t) for t in offset + times * (1 + drift)])
+    return np.stack(
+        [moving(body + np.array([0.45, 0.0, 0.0]), t) for t in offset + times * (1 + drift)]
+    )
 
 
 def moving(body: np.ndarray, time: float) -> np.ndarray:
     """(3, 25, 3) three people on ways that never come again, waving at rates of their own."""
     people = []
     for number in range(3):
-        place = [np.sin(0.31 * time + 2 * number) + 0.4 * np.sin(0.83 * time), np.cos(0.23 * time + number), 0.0]
+        place = [
+            np.sin(0.31 * time + 2 * number) + 0.4 * np.sin(0.83 * time),
+            np.cos(0.23 * time + number),
+            0.0,
+        ]
         turn = 0.5 * time + 0.7 * np.sin(0.6 * time + number)
-        R = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1.0]])
+        R = np.array(
+            [[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1.0]]
+        )
         one = body * (0.94 + 0.05 * number)
         one = one.copy()
         one[4, 2] += 0.3 * (1 + np.sin(4.1 * time + number + np.sin(0.9 * time)))
@@ -94,7 +111,12 @@ def merged(rig: Rig, parts: list[np.ndarray]) -> Recording:
     for each in zip(*(one.frames for one in seen), strict=True):
         chosen = [part.only(part.view == view) for view, part in enumerate(each)]
         begin = np.cumsum([0, *(len(part) for part in chosen)])[:-1]
-        columns = [np.concatenate([getattr(p, n) for p in chosen]) for n in ("view", "joint", "xy", "confidence")]
+        columns = [
+            np.concatenate([getattr(p, n) for p in chosen])
+            for n in ("view", "joint", "xy", "confidence")
+        ]
         pairs = np.concatenate([part.pairs + at for part, at in zip(chosen, begin, strict=True)])
-        frames.append(type(chosen[0])(*columns, pairs, np.concatenate([part.affinity for part in chosen])))
+        frames.append(
+            type(chosen[0])(*columns, pairs, np.concatenate([part.affinity for part in chosen]))
+        )
     return Recording(seen[0].skeleton, frames)

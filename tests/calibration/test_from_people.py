@@ -1,4 +1,6 @@
-"""Cameras of known lenses are placed by people who walk about; what these do not determine is refused by name."""
+"""Cameras of known lenses are placed by people who walk about; what these do not determine is
+refused by name.
+"""
 
 import json
 from dataclasses import replace
@@ -42,12 +44,15 @@ def unposed(rig: Rig) -> Rig:
 def only(recording: Recording, keep) -> Recording:
     """What the cameras saw for which `keep` of view and frame holds."""
     return Recording(
-        recording.skeleton, [each.only(keep(each.view, t)) for t, each in enumerate(recording.frames)]
+        recording.skeleton,
+        [each.only(keep(each.view, t)) for t, each in enumerate(recording.frames)],
     )
 
 
 def off_after_growing(rig: Rig, truth: Rig) -> tuple[np.ndarray, np.ndarray, float]:
-    """Degrees and metres by which cameras are off after a similarity, and how much too large the rig is."""
+    """Degrees and metres by which cameras are off after a similarity, and how much too large the
+    rig is.
+    """
     size = [np.linalg.norm(each.centres - each.centres.mean(axis=0)) for each in (rig, truth)]
     cameras = []
     for camera in rig.cameras:
@@ -60,9 +65,12 @@ def off_after_growing(rig: Rig, truth: Rig) -> tuple[np.ndarray, np.ndarray, flo
 @pytest.mark.slow
 def test_cameras_are_placed_by_people_alone(rig, recording):
     steps = list[tuple[int, int]]()
-    found = calibrate(recording, unposed(rig), TIMES, range(250), progress=lambda *each: steps.append(each))
+    found = calibrate(
+        recording, unposed(rig), TIMES, range(250), progress=lambda *each: steps.append(each)
+    )
     turn, move, grown = off_after_growing(found.rig, rig)
-    # Errors of 2 px do not last here: a tenth of a degree, 1 cm at 4 m, is what ten seconds of three people tell.
+    # Errors of 2 px do not last here: a tenth of a degree, 1 cm at 4 m, is what ten seconds of
+    # three people tell.
     assert turn.max() < 0.25 and move.max() < 0.02 and found.notes == ()
     assert (turn < 3 * np.degrees(found.adjusted.sigma(TURN))).all()
     assert (move < 3 * found.adjusted.sigma(MOVE)).all()
@@ -77,7 +85,8 @@ def test_people_of_known_stature_say_the_scale(rig, recording):
     people = Footage.of(recording, rig, TIMES, range(0, 250, 5)).people(rig)
     factors = [scale_of(people, recording.skeleton, stature) for stature in (None, 1.87)]
     assert factors[1] / factors[0] == pytest.approx(1.87 / 1.70)
-    # Who knows people's stature knows the scale better, and more people do; a detector's bias stays.
+    # Who knows people's stature knows the scale better, and more people do; a detector's bias
+    # stays.
     assert 0.025 < sigma_of_scale(3, True) < sigma_of_scale(3, False) < sigma_of_scale(1, False)
 
 
@@ -88,7 +97,9 @@ def test_bones_say_how_tall_somebody_is():
     stands = keypoints_of(body, Motion.still(betas))[0][:, list(BODY_25.core)]
     said = np.array([build_of(each[None], BODY_25).stature for each in stands])
     # The model's shape space leaves 0.9 %; limbs alone, legs and arms alike, would leave 2.4.
-    assert np.std(said / statures) < 0.012 and np.mean(said / statures) == pytest.approx(1, abs=0.005)
+    assert np.std(said / statures) < 0.012 and np.mean(said / statures) == pytest.approx(
+        1, abs=0.005
+    )
     # Whose trunk and right leg are hidden is as tall, about; of whom nothing is seen nobody knows.
     stands[:, [8, 9, 10, 11, 12]] = np.nan
     arms = np.array([build_of(each[None], BODY_25).stature for each in stands])
@@ -111,10 +122,14 @@ def test_measured_distances_say_the_scale(adjusted):
     assert grown == pytest.approx(1.1)
     # A tape errs by 2 cm; the cameras' own sigma comes on top.
     assert 0.02 / (1.1 * away[2, 0]) < sigma < 0.01
-    both, surer = Measured(distances=((2, 0, 1.1 * away[2, 0]), (1, 3, 1.1 * away[3, 1]))).size_of(adjusted)
+    both, surer = Measured(distances=((2, 0, 1.1 * away[2, 0]), (1, 3, 1.1 * away[3, 1]))).size_of(
+        adjusted
+    )
     assert both == pytest.approx(1.1) and surer < 0.8 * sigma
     wrong = ((2, 0, 1.1 * away[2, 0]), (1, 3, 1.1 * away[3, 1]), (1, 0, 1.3 * away[1, 0]))
-    with pytest.raises(InputError, match=r"distance of cam1 and cam0: people and .* give .* m instead of"):
+    with pytest.raises(
+        InputError, match=r"distance of cam1 and cam0: people and .* give .* m instead of"
+    ):
         Measured(distances=wrong).size_of(adjusted)
 
 
@@ -154,12 +169,17 @@ def test_two_cameras_are_nearest_to_what_they_saw():
     b = points @ R.T + 4.0 * t
     rays = [each / np.linalg.norm(each, axis=-1, keepdims=True) for each in (points, b)]
     near, way, covariance = refined_pose(
-        _rotation(turn + np.array([0.03, -0.05, 0.02])), t + np.array([0.05, 0.05, 0.0]), *rays, np.full(40, 0.3)
+        _rotation(turn + np.array([0.03, -0.05, 0.02])),
+        t + np.array([0.05, 0.05, 0.0]),
+        *rays,
+        np.full(40, 0.3),
     )
     np.testing.assert_allclose(near, R, atol=1e-5)
     np.testing.assert_allclose(way, t, atol=1e-5)
     # The covariance has no part along t, whose length is one.
-    assert np.abs(covariance[3:, 3:] @ way).max() < 1e-12 and np.linalg.eigvalsh(covariance).max() > 0
+    assert (
+        np.abs(covariance[3:, 3:] @ way).max() < 1e-12 and np.linalg.eigvalsh(covariance).max() > 0
+    )
 
 
 def test_a_wrong_pair_gives_way():
@@ -176,7 +196,9 @@ def test_a_wrong_pair_gives_way():
         R = _rotation(np.array([0.0, 2.0 * wrong, 0.0])) @ bTa[:3, :3]
         covariance = np.diag([1e-4] * 6)
         # The wrong pair fits best, alone.
-        pair = Relative(R, bTa[:3, 3] / length, 0.9 if wrong else 0.6, 30.0, covariance, np.zeros((0, 15, 3)))
+        pair = Relative(
+            R, bTa[:3, 3] / length, 0.9 if wrong else 0.6, 30.0, covariance, np.zeros((0, 15, 3))
+        )
         edges[a, b] = Edge.of(pair, length)
     found = arranged(edges, 4)
     between = np.linalg.solve(found[3], found[0])
@@ -207,7 +229,9 @@ def test_lenses_by_their_field_of_view(tmp_path):
 
 
 def test_lenses_by_a_photo(tmp_path):
-    """Of film's 36 x 24 mm a lens of 28 mm sees 75.4 degrees along the diagonal, whatever the picture's shape."""
+    """Of film's 36 x 24 mm a lens of 28 mm sees 75.4 degrees along the diagonal, whatever the
+    picture's shape.
+    """
     image = pytest.importorskip("PIL.Image", reason='needs pip install "shapepose-fg[photos]"')
     for name in ("left_json", "right_json"):
         (tmp_path / name).mkdir()
@@ -225,7 +249,9 @@ def test_lenses_by_a_photo(tmp_path):
         ("torn", "cannot be read"),
         ("no", "no such file"),
     ):
-        with pytest.raises(InputError, match=rf"{name}\.jpg: .*{said}.*; give an unedited photo of the camera"):
+        with pytest.raises(
+            InputError, match=rf"{name}\.jpg: .*{said}.*; give an unedited photo of the camera"
+        ):
             lenses_of(tmp_path, [str(tmp_path / f"{name}.jpg")], (640, 480))
 
 
@@ -233,7 +259,15 @@ def test_lenses_by_a_photo(tmp_path):
 def test_the_command_writes_a_rig_or_says_why_not(rig, recording, tmp_path, capsys):
     write_openpose(recording, rig, tmp_path / "seen")
     write_rig(rig, tmp_path / "lenses.json")
-    base = ["calibrate", "--detections", tmp_path / "seen", "--fps", 25, "--output", tmp_path / "new.json"]
+    base = [
+        "calibrate",
+        "--detections",
+        tmp_path / "seen",
+        "--fps",
+        25,
+        "--output",
+        tmp_path / "new.json",
+    ]
 
     def run(*more):
         with pytest.raises(SystemExit) as ended:
@@ -242,7 +276,11 @@ def test_the_command_writes_a_rig_or_says_why_not(rig, recording, tmp_path, caps
         return ended.value.code, said.out, " ".join(said.err.split())
 
     code, out, _ = run("--calibration", tmp_path / "lenses.json")
-    assert code == 0 and "next: shapepose-fg reconstruct" in out and "scale: assumed median stature 1.70 m" in out
+    assert (
+        code == 0
+        and "next: shapepose-fg reconstruct" in out
+        and "scale: assumed median stature 1.70 m" in out
+    )
     assert off_after_growing(read_rig(tmp_path / "new.json"), rig)[0].max() < 0.25
     (tmp_path / "new.json").unlink()
     code, out, error = run("--calibration", tmp_path / "lenses.json", "--frames", "0:10")
@@ -252,7 +290,9 @@ def test_the_command_writes_a_rig_or_says_why_not(rig, recording, tmp_path, caps
         and not (tmp_path / "new.json").exists()
     )
     degrees = [np.degrees(2 * np.arctan(c.image_size[0] / 2 / c.K[0, 0])) for c in rig.cameras]
-    fields = [f"--field-of-view={name}={each:.1f}" for name, each in zip(rig.names, degrees, strict=True)]
+    fields = [
+        f"--field-of-view={name}={each:.1f}" for name, each in zip(rig.names, degrees, strict=True)
+    ]
     size = "x".join(map(str, rig.cameras[0].image_size))
     away = np.linalg.norm(rig.centres[0] - rig.centres[2])
     more = (f"--distance=cam0,cam2={2 * away:.3f}", "--report", tmp_path / "page.html", "--json")

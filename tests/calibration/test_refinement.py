@@ -1,4 +1,6 @@
-"""Cameras that are off are brought back by the people; sound ones stay; what motion does not say is said."""
+"""Cameras that are off are brought back by the people; sound ones stay; what motion does not say is
+said.
+"""
 
 import json
 from dataclasses import replace
@@ -49,12 +51,17 @@ def test_disturbed_cameras_come_back(rig, recording, people):
     assert found.better and found.after_px < 0.4 * found.before_px and found.notes == ()
     assert np.median(off_by(wrong, rig)[0]) > 0.6
     assert turn.max() < 0.2 and move.max() < 0.025
-    focal = [new.K[0, 0] / old.K[0, 0] - 1 for new, old in zip(found.rig.cameras, rig.cameras, strict=True)]
+    focal = [
+        new.K[0, 0] / old.K[0, 0] - 1
+        for new, old in zip(found.rig.cameras, rig.cameras, strict=True)
+    ]
     assert np.abs(focal).max() < 0.012
     # Independent errors are taken for lasting ones: sigmas are wide rather than narrow.
     assert (turn < 2.8 * np.degrees(found.adjusted.sigma(TURN))).all()
     assert (move < 2.8 * found.adjusted.sigma(MOVE)).all()
-    wide, before = (np.linalg.norm(np.diff(each.centres, axis=0)) for each in (found.of_stature(1.8), found.rig))
+    wide, before = (
+        np.linalg.norm(np.diff(each.centres, axis=0)) for each in (found.of_stature(1.8), found.rig)
+    )
     assert wide / before == pytest.approx(1.8 / found.stature_m)
     bones = people[:, :, list(BODY_25.core)].reshape(-1, 15, 3)
     assert found.stature_m == pytest.approx(build_of(bones, BODY_25).stature, rel=0.02)
@@ -64,14 +71,21 @@ def test_disturbed_cameras_come_back(rig, recording, people):
 def test_a_sound_rig_stays_within_its_sigma(rig, recording):
     found = refine(recording, rig, TIMES, range(250))
     turn, move = off_by(found.rig, rig)
-    for off, sigma in ((turn, np.degrees(found.adjusted.sigma(TURN))), (move, found.adjusted.sigma(MOVE))):
+    for off, sigma in (
+        (turn, np.degrees(found.adjusted.sigma(TURN))),
+        (move, found.adjusted.sigma(MOVE)),
+    ):
         assert (off < 3 * sigma).all() and np.median(off / sigma) < 2
     assert abs(found.after_px / found.before_px - 1) < 0.1
 
 
 @pytest.mark.slow
-def test_a_calibration_by_a_board_is_kept_against_a_detector_s_biases(shared_cases, tmp_path, capsys):
-    """One person's lasting biases fit other cameras better, on frames that were not used as well."""
+def test_a_calibration_by_a_board_is_kept_against_a_detector_s_biases(
+    shared_cases, tmp_path, capsys
+):
+    """One person's lasting biases fit other cameras better, on frames that were not used as
+    well.
+    """
     case, new = shared_cases / "caliscope_person", tmp_path / "new.toml"
     base = [
         "refine-calibration",
@@ -81,7 +95,9 @@ def test_a_calibration_by_a_board_is_kept_against_a_detector_s_biases(shared_cas
         "x",
         "--focal",
     ]
-    code, out, _ = run([*base, "--detections", case / "detections", "--fps", 30, "--output", new], capsys)
+    code, out, _ = run(
+        [*base, "--detections", case / "detections", "--fps", 30, "--output", new], capsys
+    )
     assert code == 0 and "the cameras were not changed" in " ".join(out.split())
     given, kept = (read_rig(each, up="x") for each in (base[2], new))
     np.testing.assert_allclose(kept.centres, given.centres, atol=1e-6)
@@ -95,7 +111,9 @@ def test_more_frames_of_the_same_biases_are_no_more_evidence(rig, recording, peo
     few, many = (gather(seen, frames, 4) for frames in (range(60), range(250)))
     for evidence in (few, many):
         assert Problem.of(Look.given(evidence, rig)).off(usual) < 0.5
-    assert Problem.of(Look.given(many, disturbed(rig, seed, degrees=3, metres=0.1))).off(usual) > 0.5
+    assert (
+        Problem.of(Look.given(many, disturbed(rig, seed, degrees=3, metres=0.1))).off(usual) > 0.5
+    )
 
 
 @pytest.mark.slow
@@ -107,7 +125,10 @@ def test_a_bumped_camera_does_not_pull_the_others(rig, recording):
         now = adjust(bumped, now, people, Freedom(), 12.0, misfit(people, now)).rig
     assert off_by(now, rig)[0].max() < 0.3
     # Where the rig stands as a whole is said by the three that were right.
-    apart = [a.wTc[:3, :3].T @ b.wTc[:3, :3] for a, b in zip(now.cameras[1:], rig.cameras[1:], strict=True)]
+    apart = [
+        a.wTc[:3, :3].T @ b.wTc[:3, :3]
+        for a, b in zip(now.cameras[1:], rig.cameras[1:], strict=True)
+    ]
     assert max(np.degrees(np.arccos((np.trace(each) - 1) / 2)) for each in apart) < 0.5
 
 
@@ -115,16 +136,27 @@ def test_a_bumped_camera_does_not_pull_the_others(rig, recording):
 def test_a_camera_that_was_knocked_far_off_is_found_again(rig, recording):
     knocked = replace(rig, cameras=(disturbed(rig, 1, degrees=15).cameras[0], *rig.cameras[1:]))
     found = refine(recording, knocked, TIMES, range(250))
-    assert found.better and off_by(found.rig, rig)[0].max() < 0.3 and off_by(found.rig, rig)[1].max() < 0.03
-    assert found.change()["turn"][0] == pytest.approx(15, abs=1) and found.change()["turn"][1:].max() < 1
+    assert (
+        found.better
+        and off_by(found.rig, rig)[0].max() < 0.3
+        and off_by(found.rig, rig)[1].max() < 0.03
+    )
+    assert (
+        found.change()["turn"][0] == pytest.approx(15, abs=1)
+        and found.change()["turn"][1:].max() < 1
+    )
 
 
 @pytest.mark.slow
 def test_joints_behind_a_camera_are_no_trouble(rig, recording):
-    """Where cameras are far off, joints end behind them; what these say is nothing, and nothing fails."""
+    """Where cameras are far off, joints end behind them; what these say is nothing, and nothing
+    fails.
+    """
     people = Footage.of(recording, rig, TIMES, range(250)).people(rig)
     back = np.diag([-1.0, 1.0, -1.0, 1.0])
-    cameras = tuple(replace(each, wTc=each.wTc @ back) if v < 3 else each for v, each in enumerate(rig.cameras))
+    cameras = tuple(
+        replace(each, wTc=each.wTc @ back) if v < 3 else each for v, each in enumerate(rig.cameras)
+    )
     wrong = replace(rig, cameras=cameras)
     adjusted = adjust(wrong, wrong, people, Freedom(), 12.0)
     assert (wrong.project(people.points)[1][0][people.seen[..., 0]] < 0).all()
@@ -157,7 +189,8 @@ def test_two_cameras(rig, recording):
     seen = Recording(recording.skeleton, [each.only(each.view < 2) for each in recording.frames])
     wrong = disturbed(two, 0)
     found = refine(seen, wrong, TIMES, range(250))
-    # Of two cameras half of what is wrong shows: here a bias of the detector is no good explanation, but one.
+    # Of two cameras half of what is wrong shows: here a bias of the detector is no good
+    # explanation, but one.
     assert found.after_px < min(3, found.before_px) and found.probability > 0.5
     # How they look at each other is found; along the line between them they may both turn.
     assert off_by(found.adjusted.rig, two)[0].max() < off_by(wrong, two)[0].max()
@@ -181,10 +214,14 @@ def pose2sim_project(rig, recording, folder):
 
 
 def test_places_and_names_are_looked_at_first(rig, recording, tmp_path, capsys):
-    project = pose2sim_project(rig, replace(recording, frames=recording.frames[:3]), tmp_path / "walk")
+    project = pose2sim_project(
+        rig, replace(recording, frames=recording.frames[:3]), tmp_path / "walk"
+    )
     base = ["refine-calibration", "--project", project, "--output"]
     code, _, error = run([*base, tmp_path / "new.qca.txt"], capsys)
-    assert code == 2 and "cameras read as rig file can be written as that" in " ".join(error.split())
+    assert code == 2 and "cameras read as rig file can be written as that" in " ".join(
+        error.split()
+    )
     code, _, error = run(["refine-calibration", "--output", tmp_path / "new.json"], capsys)
     assert code == 2 and "--calibration and --detections: missing" in " ".join(error.split())
     assert not list(tmp_path.glob("new*"))
@@ -196,22 +233,44 @@ def test_the_command_writes_cameras_and_says_what_changed(rig, recording, tmp_pa
     five_seconds, new = replace(recording, frames=recording.frames[:125]), tmp_path / "new.json"
     project = pose2sim_project(disturbed(rig, 4), five_seconds, tmp_path / "walk")
     page = ["--report", tmp_path / "page.html"]
-    code, out, error = run(["refine-calibration", "--project", project, "--output", new, *page], capsys)
+    code, out, error = run(
+        ["refine-calibration", "--project", project, "--output", new, *page], capsys
+    )
     assert code == 0 and "25 Hz (from Config.toml)" in " ".join(error.split())
     said = " ".join(out.split())
     assert f"next: shapepose-fg reconstruct --calibration {new} --project {project}" in said
     assert "px before" in said and "±" in said
-    drawn = json.loads((tmp_path / "page.html").read_text().split('id="scene-data">')[1].split("</script>")[0])
+    drawn = json.loads(
+        (tmp_path / "page.html").read_text().split('id="scene-data">')[1].split("</script>")[0]
+    )
     given = project / "calibration" / "rig.json"
     for part, used in (("before", given), ("cameras", new)):
         centres = [each["centre"] for each in drawn[part]]
         np.testing.assert_allclose(centres, read_rig(used).centres, atol=1e-6)
     assert off_by(read_rig(new), rig)[0].max() < 0.25
-    base = ["refine-calibration", "--calibration", given, "--detections", project / "pose", "--fps", 25]
+    base = [
+        "refine-calibration",
+        "--calibration",
+        given,
+        "--detections",
+        project / "pose",
+        "--fps",
+        25,
+    ]
     code, out, _ = run([*base, "--json", "--output", tmp_path / "again.json"], capsys)
     told = json.loads(out)
-    assert code == 0 and told["better"] and len(told["cameras"]) == 4 and told["held_out"]["after_px"] < 8
-    np.testing.assert_allclose(read_rig(tmp_path / "again.json").centres, read_rig(new).centres, atol=1e-6)
-    for more, said in ((["--reference", "x"], "no such camera"), (["--off-degrees", 90], "above 0")):
+    assert (
+        code == 0
+        and told["better"]
+        and len(told["cameras"]) == 4
+        and told["held_out"]["after_px"] < 8
+    )
+    np.testing.assert_allclose(
+        read_rig(tmp_path / "again.json").centres, read_rig(new).centres, atol=1e-6
+    )
+    for more, said in (
+        (["--reference", "x"], "no such camera"),
+        (["--off-degrees", 90], "above 0"),
+    ):
         code, _, error = run([*base, *more, "--output", new], capsys)
         assert code == 2 and said in " ".join(error.split())

@@ -1,4 +1,6 @@
-"""Cameras that were started by hand: found from the people, to a part of a frame, or said to be unknown."""
+"""Cameras that were started by hand: found from the people, to a part of a frame, or said to be
+unknown.
+"""
 
 import json
 import shlex
@@ -31,7 +33,9 @@ def test_offsets_of_any_size_are_found_to_milliseconds(rig, late):
     assert found.undetermined(rig) == [] and (found.drift == 0).all()
     error = found.offset_s - LATE_S
     assert np.abs(error).max() < 0.003
-    assert (np.abs(error[1:]) < 3.5 * found.sigma_s[1:] + 5e-4).all() and found.sigma_s.max() < 0.004
+    assert (
+        np.abs(error[1:]) < 3.5 * found.sigma_s[1:] + 5e-4
+    ).all() and found.sigma_s.max() < 0.004
 
 
 @pytest.mark.slow
@@ -39,7 +43,9 @@ def test_clocks_that_run_apart(rig, two_people, monkeypatch):
     monkeypatch.setattr(synchronisation, "WHOLE_S", 6.0)
     monkeypatch.setattr(synchronisation, "_END_S", 5.0)
     drift = np.array([0.0, 0.0, 0.003, 0.0])
-    seen = merged(rig, [filmed(two_people[0], *each) for each in zip([0, 0.7, -0.3, 0.2], drift, strict=True)])
+    seen = merged(
+        rig, [filmed(two_people[0], *each) for each in zip([0, 0.7, -0.3, 0.2], drift, strict=True)]
+    )
     found = synchronise(seen, rig, FPS, range(300), 2.0)
     assert np.abs(found.drift - drift).max() < 0.001
     assert (np.abs(found.drift - drift)[1:] < 4 * found.drift_sigma[1:]).all()
@@ -51,22 +57,34 @@ def test_clocks_that_run_apart(rig, two_people, monkeypatch):
 def test_two_cameras(rig, late):
     two = Rig(rig.cameras[:2], rig.up)
     found = synchronise(
-        Recording(late.skeleton, [f.only(f.view < 2) for f in late.frames]), two, FPS, range(300), 8.0
+        Recording(late.skeleton, [f.only(f.view < 2) for f in late.frames]),
+        two,
+        FPS,
+        range(300),
+        8.0,
     )
     assert abs(found.offset_s[1] - LATE_S[1]) < 0.02
 
 
 def test_a_camera_that_sees_somebody_else_beside_is_left_out_of_a_person(rig, two_people):
-    """Three cameras see one person; the fourth sees another, who comes as near as 10 cm, and goes again."""
+    """Three cameras see one person; the fourth sees another, who comes as near as 10 cm, and goes
+    again.
+    """
     times = np.arange(100) / FPS
     one = np.stack([moving(two_people[0], t)[0] for t in times])
     beside = 0.1 + 0.9 * np.abs(np.sin(np.pi * times / 2))
     other = one + beside[:, None, None] * np.array([0.8, 0.6, 0.0])
     parts = [merged(rig, [who[:, None]] * 4) for who in (one, other)]
-    frames = [a.only(a.view < 3) for a in parts[0].frames], [b.only(b.view == 3) for b in parts[1].frames]
+    frames = (
+        [a.only(a.view < 3) for a in parts[0].frames],
+        [b.only(b.view == 3) for b in parts[1].frames],
+    )
     seen = [Sightings.of(Recording(parts[0].skeleton, each), range(100)) for each in frames]
     both = Sightings(
-        *(np.concatenate([getattr(s, n) for s in seen]) for n in ("frame", "view", "xy", "confidence"))
+        *(
+            np.concatenate([getattr(s, n) for s in seen])
+            for n in ("frame", "view", "xy", "confidence")
+        )
     )
     views = Views.of(rig)
     tracks = [Tracks.of(both, views, view, FPS) for view in range(4)]
@@ -90,13 +108,25 @@ def test_a_camera_that_sees_nobody_is_named(rig, recording):
 
 
 @pytest.mark.slow
-def test_the_command_writes_what_reconstruct_takes(rig, late, two_people, tmp_path, capsys, monkeypatch):
+def test_the_command_writes_what_reconstruct_takes(
+    rig, late, two_people, tmp_path, capsys, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     write_rig(rig, tmp_path / "rig.json")
     write_association(late, rig, tmp_path)
-    base = ["synchronise", "--calibration", tmp_path / "rig.json", "--detections", tmp_path / "detection"]
+    base = [
+        "synchronise",
+        "--calibration",
+        tmp_path / "rig.json",
+        "--detections",
+        tmp_path / "detection",
+    ]
     for more, code, said in (
-        (["--fps", "25", "--most", "8", "--output", tmp_path / "same.csv"], 0, "next: shapepose-fg reconstruct"),
+        (
+            ["--fps", "25", "--most", "8", "--output", tmp_path / "same.csv"],
+            0,
+            "next: shapepose-fg reconstruct",
+        ),
         (["--fps", "25", "--most", "8", "--json"], 0, '"offset_s"'),
         ([], 2, "--fps: missing"),
         (["--fps", "25", "--most", "-1"], 2, "--most"),
@@ -114,14 +144,26 @@ def test_the_command_writes_what_reconstruct_takes(rig, late, two_people, tmp_pa
     with pytest.raises(SystemExit) as ended:
         main([*line.split()[2:], "--frames", "0:40", "--no-report"])
     assert ended.value.code == 0
-    asked = ["reconstruct", "--calibration", "rig.json", "--detections", "detection", "--output", "at-once"]
+    asked = [
+        "reconstruct",
+        "--calibration",
+        "rig.json",
+        "--detections",
+        "detection",
+        "--output",
+        "at-once",
+    ]
     asked += ["--synchronise", "--frames", "0:40", "--no-report"]
     for more, code in ((["--timestamps", "same.csv"], 2), (["--fps", "25"], 0)):
         with pytest.raises(SystemExit) as ended:
             main([*asked, *more])
         assert ended.value.code == code
-    assert (tmp_path / "at-once" / "synchronised.csv").read_text() == (tmp_path / "same.csv").read_text()
-    np.testing.assert_array_equal(Reconstruction.load("at-once").joints, Reconstruction.load("results").joints)
+    assert (tmp_path / "at-once" / "synchronised.csv").read_text() == (
+        tmp_path / "same.csv"
+    ).read_text()
+    np.testing.assert_array_equal(
+        Reconstruction.load("at-once").joints, Reconstruction.load("results").joints
+    )
     # The cameras' first common moment: what the first camera, which the times are of, calls 4 s.
     people, body = Reconstruction.load("results"), two_people[0] + np.array([0.45, 0.0, 0.0])
     start = people.time_s.min() - (LATE_S.max() - LATE_S.min())
@@ -133,16 +175,20 @@ def test_the_command_writes_what_reconstruct_takes(rig, late, two_people, tmp_pa
 
 @pytest.fixture
 def as_detected(rig, late, tmp_path, monkeypatch) -> Path:
-    """What `detect` leaves of phones that were started and stopped by hand: detections under their own numbers,
-    and times that say which frames each has.
+    """What `detect` leaves of phones that were started and stopped by hand: detections under their
+    own numbers, and times that say which frames each has.
     """
     monkeypatch.chdir(tmp_path)
     shown = np.arange(300)[:, None] < [300, 250, 300, 220]
-    own = Recording(BODY_25, [frame.only(has[frame.view]) for frame, has in zip(late, shown, strict=True)])
+    own = Recording(
+        BODY_25, [frame.only(has[frame.view]) for frame, has in zip(late, shown, strict=True)]
+    )
     write_rig(rig, tmp_path / "rig.json")
     write_association(own, rig, tmp_path)
     time_s = np.repeat(np.arange(300)[:, None] / FPS, 4, axis=1)
-    write_timestamps(tmp_path / "detection" / "times.csv", rig.names, np.where(shown, time_s, np.nan))
+    write_timestamps(
+        tmp_path / "detection" / "times.csv", rig.names, np.where(shown, time_s, np.nan)
+    )
     return tmp_path
 
 
@@ -155,9 +201,12 @@ COMMON = round((10.78 - 4.0) * FPS)
     "command",
     [
         "synchronise --calibration rig.json --detections detection --most 8 --output same.csv",
-        "calibrate --calibration rig.json --detections detection --most 8 --times same.csv --output new.json",
-        "reconstruct --calibration rig.json --detections detection --synchronise --output results --no-report"
-        " --preset fast",
+        (
+            "calibrate --calibration rig.json --detections detection --most 8 --times same.csv "
+            "--output new.json"
+        ),
+        "reconstruct --calibration rig.json --detections detection --synchronise --output "
+        "results --no-report --preset fast",
     ],
 )
 def test_files_of_unequal_length_keep_all_common_footage(as_detected, command, capsys):

@@ -1,4 +1,6 @@
-"""Cameras of unknown poses that were started by hand: when and where, from the people alone, or refused."""
+"""Cameras of unknown poses that were started by hand: when and where, from the people alone, or
+refused.
+"""
 
 import json
 import re
@@ -38,7 +40,9 @@ def test_moments_of_one_clock():
     xy = joints + 4.0 * time[:, None, None]
     seen = Sightings(frame, view, xy, np.full((40, 15), 0.8))
     following = next_of(seen)
-    assert (following[frame < 19] == np.flatnonzero(frame < 19) + 1).all() and (following[frame == 19] == -1).all()
+    assert (following[frame < 19] == np.flatnonzero(frame < 19) + 1).all() and (
+        following[frame == 19] == -1
+    ).all()
     one = on_one_clock(seen, following, np.array([0.0, -2.25]), BODY_25)
     both = [one.at([moment]) for moment in one.frames]
     assert len(one.frames) == 17 and all(len(each) == 2 for each in both)
@@ -53,19 +57,27 @@ def test_people_who_stand_are_refused(rig, two_people):
 
 
 @pytest.mark.slow
-def test_the_command_finds_poses_and_times_from_people_alone(rig, late, tmp_path, capsys, monkeypatch):
+def test_the_command_finds_poses_and_times_from_people_alone(
+    rig, late, tmp_path, capsys, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     steps = list[tuple[int, int]]()
 
     def watched(*given):
-        return calibrate_unsynchronised(*given[:-1], lambda *each: (steps.append(each), given[-1](*each)))
+        return calibrate_unsynchronised(
+            *given[:-1], lambda *each: (steps.append(each), given[-1](*each))
+        )
 
     monkeypatch.setattr(unsynchronised, "calibrate_unsynchronised", watched)
     write_rig(rig, tmp_path / "lenses.json")
     write_association(late, rig, tmp_path)
     base = ["calibrate", "--calibration", "lenses.json", "--detections", "detection", "--fps", "25"]
     for more, code, said in (
-        (["--times", "times.csv", "--most", "8", "--report", "page.html"], 0, "--timestamps times.csv"),
+        (
+            ["--times", "times.csv", "--most", "8", "--report", "page.html"],
+            0,
+            "--timestamps times.csv",
+        ),
         (["--times", "times.csv", "--timestamps", "lenses.json"], 2, "give one of them"),
         (["--times", "times.csv", "--most", "0"], 2, "must be above 0"),
     ):
@@ -76,7 +88,10 @@ def test_the_command_finds_poses_and_times_from_people_alone(rig, late, tmp_path
     assert steps[-1][0] == steps[-1][1] and steps == sorted(steps)
     turn, move, _ = off_after_growing(read_rig("new.json"), rig)
     assert turn.max() < 0.4 and move.max() < 0.03
-    rows = np.array([line.split(",")[1:] for line in Path("times.csv").read_text().splitlines()[1:]], dtype=float)
+    rows = np.array(
+        [line.split(",")[1:] for line in Path("times.csv").read_text().splitlines()[1:]],
+        dtype=float,
+    )
     assert rows.shape == (300, 4) and np.abs(rows[7] - rows[7, 0] - LATE_S).max() < 0.005
     page = Path("page.html").read_text()
     scene = re.search(r'id="scene-data">(.*?)</script>', page, re.S)

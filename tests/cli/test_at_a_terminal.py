@@ -1,4 +1,6 @@
-"""What a real terminal gets: a pseudo-terminal under the commands, and an emulator that obeys what they write."""
+"""What a real terminal gets: a pseudo-terminal under the commands, and an emulator that obeys what
+they write.
+"""
 
 import os
 import pty
@@ -39,7 +41,9 @@ class Seen:
     code: int
 
     def rubbish(self) -> list[str]:
-        """What a terminal would obey and is not ours, and what is to be read of a control sequence of ours."""
+        """What a terminal would obey and is not ours, and what is to be read of a control sequence
+        of ours.
+        """
         rest = _OURS.sub("", self.raw).replace("\n", "")
         foreign = [letter for letter in rest if letter < " " or "\x7f" <= letter <= "\x9f"]
         cursor = ["the cursor is hidden"] if self.cursor_is_hidden else []
@@ -47,17 +51,28 @@ class Seen:
 
 
 def at_terminal(
-    *command: object, columns: int = 100, stop_at: str | None = None, cwd: Path | None = None, **variables: str
+    *command: object,
+    columns: int = 100,
+    stop_at: str | None = None,
+    cwd: Path | None = None,
+    **variables: str,
 ) -> Seen:
     """Run a command at a terminal of its own; Ctrl-C is pressed as soon as `stop_at` is written."""
     ours, its = pty.openpty()
     termios.tcsetwinsize(its, (50, columns))
     environment = {
-        name: each for name, each in os.environ.items() if name not in ("NO_COLOR", "FORCE_COLOR", "COLUMNS")
+        name: each
+        for name, each in os.environ.items()
+        if name not in ("NO_COLOR", "FORCE_COLOR", "COLUMNS")
     }
-    environment |= {"TERM": "xterm-256color", "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"} | variables
+    environment |= {
+        "TERM": "xterm-256color",
+        "PYTHONPATH": str(ROOT),
+        "OMP_NUM_THREADS": "1",
+    } | variables
     start = (
-        "import fcntl, os, sys, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0); os.execv(sys.argv[1], sys.argv[1:])"
+        "import fcntl, os, sys, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0); "
+        "os.execv(sys.argv[1], sys.argv[1:])"
     )
     process = subprocess.Popen(
         [sys.executable, "-c", start, *map(str, command)],
@@ -84,7 +99,9 @@ def at_terminal(
     raw = written.decode()
     stream.feed(raw)
     lines = [line.rstrip() for line in screen.display]
-    return Seen(raw, [line for line in lines if line], screen.cursor.hidden, process.wait(timeout=60))
+    return Seen(
+        raw, [line for line in lines if line], screen.cursor.hidden, process.wait(timeout=60)
+    )
 
 
 WORK = f"""
@@ -126,7 +143,11 @@ def work(tmp_path_factory) -> Path:
     [
         {},
         *slow(
-            {"columns": 24}, {"NO_COLOR": "1"}, {"TERM": "dumb"}, {"TERM": "xterm"}, {"PYTHONIOENCODING": "ascii"}
+            {"columns": 24},
+            {"NO_COLOR": "1"},
+            {"TERM": "dumb"},
+            {"TERM": "xterm"},
+            {"PYTHONIOENCODING": "ascii"},
         ),
     ],
     ids=["colours", "narrow", "without colours", "dumb", "few colours", "ascii"],
@@ -173,13 +194,21 @@ def test_a_log_has_lines_now_and_then(work, tmp_path):
 
 
 def commands(page: Path) -> list[list[str]]:
-    """The commands of a page, without those that wait for somebody or fetch something, or leave words out."""
-    lines = re.findall(r"^shapepose-fg (.+?)(?: +#.*)?$", page.read_text(encoding="utf-8"), re.MULTILINE)
-    return [line.split() for line in lines if not re.search(r"^live|--download|--cluster|\.\.\.", line)]
+    """The commands of a page, without those that wait for somebody or fetch something, or leave
+    words out.
+    """
+    lines = re.findall(
+        r"^shapepose-fg (.+?)(?: +#.*)?$", page.read_text(encoding="utf-8"), re.MULTILINE
+    )
+    return [
+        line.split() for line in lines if not re.search(r"^live|--download|--cluster|\.\.\.", line)
+    ]
 
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-COMMANDS = sorted({" ".join(each) for page in PAGES for each in commands(page) if each[0] != "simulate"})
+COMMANDS = sorted(
+    {" ".join(each) for page in PAGES for each in commands(page) if each[0] != "simulate"}
+)
 
 
 ALL = """

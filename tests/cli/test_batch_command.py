@@ -1,4 +1,6 @@
-"""An archive on a machine's processes: interrupted, gone on with, and to the byte what each alone gives."""
+"""An archive on a machine's processes: interrupted, gone on with, and to the byte what each alone
+gives.
+"""
 
 import json
 import os
@@ -94,7 +96,9 @@ def stopped_behind_a_chunk(archive: Path, folder: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="stops processes by POSIX signals")
-def test_an_archive_is_interrupted_goes_on_and_is_what_each_recording_alone_gives(archive, tmp_path, capsys):
+def test_an_archive_is_interrupted_goes_on_and_is_what_each_recording_alone_gives(
+    archive, tmp_path, capsys
+):
     pytest.importorskip("distributed", reason="Dask is an extra")
     words = [archive / "recordings.toml", "--output", tmp_path, "--workers", "1", "--at-once", "1"]
     command = [sys.executable, "-m", "shapepose_fg", "batch", *map(str, words)]
@@ -113,7 +117,10 @@ def test_an_archive_is_interrupted_goes_on_and_is_what_each_recording_alone_give
     os.killpg(first.pid, signal.SIGINT)  # as a terminal does, to all of its processes
     _, said = first.communicate(timeout=120)
     assert first.returncode == 130, said
-    assert f"recordings are done in {tmp_path}; continue with --resume" in said and "Traceback" not in said
+    assert (
+        f"recordings are done in {tmp_path}; continue with --resume" in said
+        and "Traceback" not in said
+    )
     stopped_behind_a_chunk(archive, tmp_path / "long")
     assert finished(*words) == 2
     assert (
@@ -124,25 +131,36 @@ def test_an_archive_is_interrupted_goes_on_and_is_what_each_recording_alone_give
     said = capsys.readouterr()
     batch_status = json.loads((tmp_path / "batch.json").read_text())
     assert (batch_status["done"], batch_status["failed"]) == (2, 1)
-    assert batch_status["recordings"]["long"]["frames"] == 30 and batch_status["recordings"]["long"]["people"] >= 2
+    assert (
+        batch_status["recordings"]["long"]["frames"] == 30
+        and batch_status["recordings"]["long"]["people"] >= 2
+    )
     broken = batch_status["recordings"]["broken"]
     assert broken["attempts"] == 2 and broken["reasons"][0] == broken["reasons"][1]
     assert "the file ends too early" in broken["reasons"][0]
-    assert f"broken: {broken['reasons'][0]}"[:60] in " ".join(said.err.split()) and "2 done, 1 failed" in said.out
+    assert (
+        f"broken: {broken['reasons'][0]}"[:60] in " ".join(said.err.split())
+        and "2 done, 1 failed" in said.out
+    )
     assert "parts" not in {file.name for file in (tmp_path / "long").iterdir()}
     for name, more in (("long", {"cuts": (18,)}), ("short", {})):
         rig = read_rig(archive / name / "rig.json")
         seen = read_detections(archive / name / "openpose", rig)
         times = FrameTimes.from_fps(25.0, len(seen)) if name == "long" else None
         execution = Execution(chunk_frames=12 if name == "long" else None)
-        reconstruct(seen, rig, CONFIG, times=times, execution=execution, **more).save(tmp_path / "alone" / name)
+        reconstruct(seen, rig, CONFIG, times=times, execution=execution, **more).save(
+            tmp_path / "alone" / name
+        )
         for file in ("people.npz", "observations.npz"):
-            assert (tmp_path / name / file).read_bytes() == (tmp_path / "alone" / name / file).read_bytes(), file
+            assert (tmp_path / name / file).read_bytes() == (
+                tmp_path / "alone" / name / file
+            ).read_bytes(), file
 
 
 def test_what_can_be_known_before_is_said_before(archive, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(
-        "shapepose_fg.pipeline.cluster.local_cluster", lambda *_, **__: pytest.fail("no work may begin")
+        "shapepose_fg.pipeline.cluster.local_cluster",
+        lambda *_, **__: pytest.fail("no work may begin"),
     )
     table = archive / "wrong.toml"
 
@@ -155,14 +173,19 @@ def test_what_can_be_known_before_is_said_before(archive, tmp_path, capsys, monk
 
     assert "wrong.toml: recording a: " in (err := said('[recordings.a]\ndetections = "none"'))
     assert f"{archive / 'none'}: there is no such folder" in err
-    two = said('[recordings.a]\ndetections = "none"\n[recordings.b]\ntimestamps = "none"\ndetections = "short"')
+    two = said(
+        '[recordings.a]\ndetections = "none"\n[recordings.b]\ntimestamps = "none"\ndetections = '
+        '"short"'
+    )
     assert "(other recordings with problems: b)" in two
     own = '[recordings.a]\ndetections = "long/openpose"\n'
     assert "--fps and --timestamps: both determine the times of frames" in said(
         own + 'fps = 25\ntimestamps = "settings.toml"'
     )
     assert "--chunk-frames 3: must be 6 (batch_frames) or more" in said(own + "chunk_frames = 3")
-    assert "--shapes: shapes need people over time" in said(own + 'shapes = "s.npz"\ntemporal = false')
+    assert "--shapes: shapes need people over time" in said(
+        own + 'shapes = "s.npz"\ntemporal = false'
+    )
     assert "--frames 3: must be A:B" in said(own + 'frames = "3"')
     assert "body.pkl: there is no such file" in said(own + 'body = "body.pkl"')
     assert "fps 0: must be 0.01 to 100000 Hz" in said(own + "fps = 0")
@@ -189,12 +212,18 @@ def test_another_program_on_a_worker_is_noticed(monkeypatch):
 
     own = cluster.this_program()
     for theirs, words in (
-        ({**own, "numpy": "1.0"}, r"its process tcp://b:2 has another version of numpy \(1\.0 there, .* here\)"),
+        (
+            {**own, "numpy": "1.0"},
+            r"its process tcp://b:2 has another version of numpy \(1\.0 there, .* here\)",
+        ),
         (
             {**own, "shapepose-fg itself": "x"},
             "has another version of shapepose-fg itself; install the same version there",
         ),
-        (ModuleNotFoundError("No module named 'shapepose_fg'"), r"cannot run this program \(No module named"),
+        (
+            ModuleNotFoundError("No module named 'shapepose_fg'"),
+            r"cannot run this program \(No module named",
+        ),
     ):
         with pytest.raises(InputError, match=words):
             cluster.refuse_other_programs(Client(theirs), "tcp://s:1")

@@ -1,4 +1,6 @@
-"""Who is next, who is tried again and who is given up, with leaders that only say so; and real ones that die."""
+"""Who is next, who is tried again and who is given up, with leaders that only say so; and real ones
+that die.
+"""
 
 import json
 import os
@@ -111,9 +113,18 @@ def test_the_largest_are_begun_first_and_who_failed_comes_again_at_the_end(stage
         "bbb": "done",
         "cc": "failed",
     }
-    assert batch_status.of["cc"].reasons == ("no", "no again") and batch_status.of["cc"].attempts == 2
-    assert batch_status.of["bbb"].frames == 10 and batch_status.of["bbb"].warnings == ("cam1 is late",)
-    assert ("ended", "cc", "no", True) in stage.heard and ("ended", "cc", "no again", False) in stage.heard
+    assert (
+        batch_status.of["cc"].reasons == ("no", "no again") and batch_status.of["cc"].attempts == 2
+    )
+    assert batch_status.of["bbb"].frames == 10 and batch_status.of["bbb"].warnings == (
+        "cam1 is late",
+    )
+    assert ("ended", "cc", "no", True) in stage.heard and (
+        "ended",
+        "cc",
+        "no again",
+        False,
+    ) in stage.heard
     assert ("frames", "a", 5, 10) in stage.heard
     assert read_status(tmp_path / "batch.json") == batch_status.of
     content = json.loads((tmp_path / "batch.json").read_text())
@@ -121,7 +132,9 @@ def test_the_largest_are_begun_first_and_who_failed_comes_again_at_the_end(stage
 
 
 def test_who_is_to_begin_anew_does_so_until_frames_are_done(stage, tmp_path, monkeypatch):
-    """A first attempt that ends before its run is begun leaves what was there before: nothing to go on with."""
+    """A first attempt that ends before its run is begun leaves what was there before: nothing to go
+    on with.
+    """
     stage.ends, stage.frameless = {"a": ["no memory", DONE]}, ["a"]
     (tmp_path / "a" / "parts").mkdir(parents=True)
     batch_status = run(stage, tmp_path, entries("a"), anew=("a",))
@@ -133,7 +146,9 @@ def test_who_is_to_begin_anew_does_so_until_frames_are_done(stage, tmp_path, mon
 
     for heard, anew in (("began", True), ("frames", False)):
         monkeypatch.setattr(stage, heard, stop)
-        batch_status = BatchStatus(tmp_path / "batch.json", "t", {"a": RecordingStatus({}, anew=True)})
+        batch_status = BatchStatus(
+            tmp_path / "batch.json", "t", {"a": RecordingStatus({}, anew=True)}
+        )
         batch_status.write()
         with pytest.raises(Stopped):
             stage.ends = {"a": ["stopped"]}
@@ -144,7 +159,9 @@ def test_who_is_to_begin_anew_does_so_until_frames_are_done(stage, tmp_path, mon
 
 
 def test_a_batch_that_goes_on_knows_who_was_to_begin_anew(tmp_path):
-    """--restart, or another wish, that was stopped before anything was begun, and gone on with by --resume."""
+    """--restart, or another wish, that was stopped before anything was begun, and gone on with by
+    --resume.
+    """
     both = [Entry("a", Request(fps=25.0)), Entry("b", Request(fps=50.0))]
 
     def anew(entries: list[Entry], **how: bool) -> list[str]:
@@ -167,14 +184,18 @@ def test_no_more_are_led_at_a_time_than_asked(stage, tmp_path):
     assert stage.together == 3 and len(batch_status.names("done")) == 7
 
 
-def test_recordings_with_shared_shapes_are_led_in_turn_and_not_without_those_before(stage, tmp_path):
+def test_recordings_with_shared_shapes_are_led_in_turn_and_not_without_those_before(
+    stage, tmp_path
+):
     stage.ends = {"bb": ["no", "no"]}
     chain = [Entry("a", Request()), Entry("bb", Request(), "a"), Entry("ccc", Request(), "bb")]
     chain += [Entry("dddd", Request(), "ccc")]
     batch_status = run(stage, tmp_path, chain, at_once=4)
     assert [each.name for each in stage.begun] == ["a", "bb", "bb"] and stage.together == 1
     assert batch_status.names("failed") == ["bb", "ccc", "dddd"]
-    assert "needs the body shapes of recording bb, which failed" in batch_status.of["ccc"].reasons[0]
+    assert (
+        "needs the body shapes of recording bb, which failed" in batch_status.of["ccc"].reasons[0]
+    )
 
 
 def test_who_was_done_when_all_are_stopped_is_done(stage, tmp_path, monkeypatch):
@@ -192,7 +213,13 @@ def test_a_damaged_list_is_named(tmp_path):
     for text, words in (
         ("[]", "this is not the status file of a batch; start again with --restart"),
         ('{"format": "shapepose-fg batch 1"}', "recordings.* must be an object, got null"),
-        ('{"format": "shapepose-fg batch 1", "recordings": {"a": {"asked": {}, "status": "lost"}}}', r"a\.status"),
+        (
+            (
+                '{"format": "shapepose-fg batch 1", "recordings": {"a": {"asked": {}, "status": '
+                '"lost"}}}'
+            ),
+            r"a\.status",
+        ),
     ):
         file.write_text(text)
         with pytest.raises(InputError, match=words):
@@ -201,11 +228,15 @@ def test_a_damaged_list_is_named(tmp_path):
 
 @pytest.mark.slow
 def test_a_leader_that_fails_says_why_and_one_that_is_killed_is_noticed(tmp_path):
-    lost = Assignment("a", Request(calibration=tmp_path / "no.json", detections=tmp_path), tmp_path, "tcp://x")
+    lost = Assignment(
+        "a", Request(calibration=tmp_path / "no.json", detections=tmp_path), tmp_path, "tcp://x"
+    )
     leader = Leader(lost)
     told = leader.next()
     assert leader.end() is None
-    assert isinstance(told, str) and told.startswith(f"{tmp_path / 'no.json'}: there is no such file")
+    assert isinstance(told, str) and told.startswith(
+        f"{tmp_path / 'no.json'}: there is no such file"
+    )
     assert "error: " in (tmp_path / "log.txt").read_text()
     leader = Leader(lost)
     os.kill(leader._pid.result(), signal.SIGKILL)

@@ -1,4 +1,6 @@
-"""The command line: what it prints, where it writes, and one sentence for everything that goes wrong."""
+"""The command line: what it prints, where it writes, and one sentence for everything that goes
+wrong.
+"""
 
 import hashlib
 import json
@@ -31,7 +33,10 @@ K = [1000.0, 0, 500, 0, 1000, 400, 0, 0, 1]
 @pytest.fixture
 def recording(tmp_path: Path) -> list[str]:
     """Options for five empty frames of two cameras, with results going to `out`."""
-    poses = {"left": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0], "right": [1, 0, 0, -1, 0, 1, 0, 0, 0, 0, 1, 0]}
+    poses = {
+        "left": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0],
+        "right": [1, 0, 0, -1, 0, 1, 0, 0, 0, 0, 1, 0],
+    }
     cameras = {name: {"K": K, "RT": RT, "imgSize": [1001, 801]} for name, RT in poses.items()}
     (tmp_path / "calibration.json").write_text(json.dumps(cameras))
     for name in cameras:
@@ -46,7 +51,9 @@ def recording(tmp_path: Path) -> list[str]:
 
 @pytest.fixture
 def pipeline(monkeypatch) -> dict:
-    """Replace the pipeline by one that finds two people in every frame; returns what it was called with."""
+    """Replace the pipeline by one that finds two people in every frame; returns what it was called
+    with.
+    """
     called: dict = {}
 
     def fake(kept, task, execution):
@@ -55,8 +62,15 @@ def pipeline(monkeypatch) -> dict:
         execution.progress(len(frames), len(frames))
         N = 2 * len(frames)
         frame, person = np.repeat(np.array(frames), 2), np.arange(N)
-        J, V, names = 25, len(rig), {"joint_names": np.array(BODY_25.joints), "view_names": np.array(rig.names)}
-        nothing = {"xy": np.full((N, J, V, 2), np.nan), "residual_px": np.full((N, J, V, 2), np.nan)}
+        J, V, names = (
+            25,
+            len(rig),
+            {"joint_names": np.array(BODY_25.joints), "view_names": np.array(rig.names)},
+        )
+        nothing = {
+            "xy": np.full((N, J, V, 2), np.nan),
+            "residual_px": np.full((N, J, V, 2), np.nan),
+        }
         nothing |= {"candidate": np.full((N, J, V), -1), "confidence": np.zeros((N, J, V))}
         rows = Reconstruction(
             frame=frame,
@@ -150,7 +164,13 @@ def test_times_cuts_and_time_itself_reach_the_pipeline(recording, pipeline, tmp_
     stamps = tmp_path / "times.csv"
     stamps.write_text("right,left\n" + "".join(f"{0.05 * t},{0.05 * t + 0.01}\n" for t in range(5)))
     (tmp_path / "settings.toml").write_text("temporal = false\n")
-    options = ["--timestamps", str(stamps), "--config", str(tmp_path / "settings.toml"), "--temporal"]
+    options = [
+        "--timestamps",
+        str(stamps),
+        "--config",
+        str(tmp_path / "settings.toml"),
+        "--temporal",
+    ]
     assert run(*recording, *options, "--overwrite") == 0
     np.testing.assert_allclose(
         pipeline["times"].time_s[:, 0], 0.05 * np.arange(5) + 0.01
@@ -160,14 +180,23 @@ def test_times_cuts_and_time_itself_reach_the_pipeline(recording, pipeline, tmp_
 
 
 @pytest.mark.slow
-def test_shapes_are_kept_from_one_recording_to_the_next(recording, pipeline, tmp_path, monkeypatch, capsys):
-    fake, file = shapepose_fg.cli.reconstruct.run.reconstruct_parts, tmp_path / "kept" / "subjects.npz"
+def test_shapes_are_kept_from_one_recording_to_the_next(
+    recording, pipeline, tmp_path, monkeypatch, capsys
+):
+    fake, file = (
+        shapepose_fg.cli.reconstruct.run.reconstruct_parts,
+        tmp_path / "kept" / "subjects.npz",
+    )
 
     def with_shapes(kept, task, execution):
         result, shapes = fake(kept, task, execution), task.shapes
         found = SubjectShapes(np.array(["0"]), np.full((1, 10), 0.5), np.eye(10)[None], shapes.body)
         rows = result.rows_of
-        nobody = {"ok": np.zeros(1, dtype=bool), "betas": np.zeros((1, 10)), "transl": np.zeros((1, 3))}
+        nobody = {
+            "ok": np.zeros(1, dtype=bool),
+            "betas": np.zeros((1, 10)),
+            "transl": np.zeros((1, 3)),
+        }
         nobody |= {"global_orient": np.zeros((1, 3)), "body_pose": np.zeros((1, 23, 3))}
         for number in rows:
             result.parts.kept.keep(f"bodies-{number}", nobody)
@@ -185,10 +214,17 @@ def test_shapes_are_kept_from_one_recording_to_the_next(recording, pipeline, tmp
     assert str(file) in Reconstruction.load(tmp_path / "out").run["inputs"]
 
 
-def test_other_formats_are_read_and_what_was_made_of_them_is_said(recording, pipeline, tmp_path, capsys):
+def test_other_formats_are_read_and_what_was_made_of_them_is_said(
+    recording, pipeline, tmp_path, capsys
+):
     """Cameras without a picture size, and COCO's results, whose scores are per cent."""
     cameras = {
-        name: {"R": np.eye(3).tolist(), "T": [[1000.0 * x], [0.0], [0.0]], "k": [0.0] * 3, "p": [0.0] * 2}
+        name: {
+            "R": np.eye(3).tolist(),
+            "T": [[1000.0 * x], [0.0], [0.0]],
+            "k": [0.0] * 3,
+            "p": [0.0] * 2,
+        }
         | {"fx": 1000.0, "fy": 1000.0, "cx": 500.0, "cy": 400.0}
         for x, name in enumerate(("a", "b"))
     }
@@ -197,7 +233,12 @@ def test_other_formats_are_read_and_what_was_made_of_them_is_said(recording, pip
     for name in cameras:
         person = {"image_id": 0, "keypoints": [100.0, 200.0, 50.0] * 17}
         (tmp_path / "pose" / f"{name}.json").write_text(json.dumps([person]))
-    options = ["--calibration", str(tmp_path / "calibration.json"), "--detections", str(tmp_path / "pose")]
+    options = [
+        "--calibration",
+        str(tmp_path / "calibration.json"),
+        "--detections",
+        str(tmp_path / "pose"),
+    ]
     command = ["reconstruct", *options, "--output", str(tmp_path / "out")]
     assert run(*command) == 2
     assert "image_size is missing; pass --image-size WIDTHxHEIGHT" in capsys.readouterr().err
@@ -214,14 +255,22 @@ def test_other_formats_are_read_and_what_was_made_of_them_is_said(recording, pip
 
 @pytest.mark.slow
 def test_what_detect_wrote_is_found_and_kept_with_the_result(recording, pipeline, tmp_path, capsys):
-    """Times of 60 a second in microseconds are 60 a second; footage.json goes along, and away with the next."""
-    (tmp_path / "times.csv").write_text("frame, time_s\n" + "".join(f"{t}, {t / 60:.6f}\n" for t in range(5)))
+    """Times of 60 a second in microseconds are 60 a second; footage.json goes along, and away with
+    the next.
+    """
+    (tmp_path / "times.csv").write_text(
+        "frame, time_s\n" + "".join(f"{t}, {t / 60:.6f}\n" for t in range(5))
+    )
     footage = {"format": "shapepose-fg footage 1", "cameras": []}
     (tmp_path / "footage.json").write_text(json.dumps(footage))
     assert run(*recording) == 0
     assert "5 (0:5) of 2 cameras, 60 Hz" in " ".join(capsys.readouterr().out.split())
     people = Reconstruction.load(tmp_path / "out")
-    assert people.run["time"] == {"source": str(tmp_path / "times.csv"), "fps": 60.0, "per_camera": False}
+    assert people.run["time"] == {
+        "source": str(tmp_path / "times.csv"),
+        "fps": 60.0,
+        "per_camera": False,
+    }
     assert json.loads((tmp_path / "out" / "footage.json").read_text()) == footage
     assert run(*recording, "--fps", "30", "--overwrite") == 0
     assert Reconstruction.load(tmp_path / "out").run["time"]["fps"] == 30.0
@@ -231,14 +280,19 @@ def test_what_detect_wrote_is_found_and_kept_with_the_result(recording, pipeline
 
 
 @pytest.mark.slow
-def test_a_finished_result_stays_until_it_is_to_be_overwritten(recording, pipeline, tmp_path, capsys):
+def test_a_finished_result_stays_until_it_is_to_be_overwritten(
+    recording, pipeline, tmp_path, capsys
+):
     """And what was made of it is not taken for the new one's."""
     assert run(*recording, "--fps", "60") == 0
     before = (tmp_path / "out" / "people.npz").read_bytes()
     for options in ((), ("--resume",), ("--restart",)):
         capsys.readouterr()
         assert run(*recording, "--fps", "30", *options) == 2
-        assert f"{tmp_path / 'out'}: there is a finished result; give another" in capsys.readouterr().err
+        assert (
+            f"{tmp_path / 'out'}: there is a finished result; give another"
+            in capsys.readouterr().err
+        )
     assert (tmp_path / "out" / "people.npz").read_bytes() == before
     for again in (1, 2):
         (tmp_path / "out" / "export").mkdir()
@@ -258,8 +312,12 @@ def test_warnings_are_warnings_unless_they_are_to_be_strict(recording, pipeline,
     assert run(*recording, "--strict", "--overwrite", "--no-check") == 0
 
 
-def test_who_is_lost_says_so_in_one_line_with_the_cause(recording, pipeline, tmp_path, capsys, monkeypatch):
-    """Five frames in which both cameras see four people, and of which two come out, some dropped."""
+def test_who_is_lost_says_so_in_one_line_with_the_cause(
+    recording, pipeline, tmp_path, capsys, monkeypatch
+):
+    """Five frames in which both cameras see four people, and of which two come out, some
+    dropped.
+    """
     joint = "4 0.1 0.3 0.5 0.7 0.5 0.5 0.5 0.5 1 1 1 1\n"
     frame = joint * 25 + ("0 " * 16 + "\n") * len(BODY_25.limbs)
     for name in ("left", "right"):
@@ -273,8 +331,9 @@ def test_who_is_lost_says_so_in_one_line_with_the_cause(recording, pipeline, tmp
     monkeypatch.setattr(shapepose_fg.cli.reconstruct.run, "reconstruct_parts", dropping)
     assert run(*recording, "--fps", "25", "--no-check") == 0
     assert (
-        "lost 2 rows dropped: there too briefly (frames 3-4); two cameras see 4.0 people per frame, but 2.0 are"
-        " found: 0.2 s are too short to confirm all people; give more frames, or --no-temporal"
+        "lost 2 rows dropped: there too briefly (frames 3-4); two cameras see 4.0 people per "
+        "frame, but 2.0 are found: 0.2 s are too short to confirm all people; give more frames, "
+        "or --no-temporal"
     ) in " ".join(capsys.readouterr().out.split())
 
 
@@ -286,7 +345,8 @@ def test_one_camera_is_no_recording(recording, pipeline, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("text", "frames"), [(":2", range(2)), ("3:", range(3, 5)), (":", range(5)), ("4:5", range(4, 5))]
+    ("text", "frames"),
+    [(":2", range(2)), ("3:", range(3, 5)), (":", range(5)), ("4:5", range(4, 5))],
 )
 def test_frames_are_half_open(recording, pipeline, text, frames):
     assert run(*recording, "--frames", text) == 0
@@ -306,18 +366,27 @@ def test_frames_are_half_open(recording, pipeline, text, frames):
         (["--fps", "0"], "--fps 0: must be 0.01 to 100000 Hz, such as 25"),
         (["--readout", "20"], "--readout 20: must be 0 to 0.1 seconds, such as 0.02"),
         (["--fps", "nan"], "--fps nan: must be 0.01 to 100000 Hz"),
-        (["--cuts", "3,2"], "--cuts 3,2: must be increasing frame numbers between 1 and 4, such as 300,600"),
+        (
+            ["--cuts", "3,2"],
+            "--cuts 3,2: must be increasing frame numbers between 1 and 4, such as 300,600",
+        ),
         (["--cuts", "5"], "--cuts 5: must be increasing frame numbers between 1 and 4"),
         (["--cuts", "a"], "--cuts a: must be increasing frame numbers"),
         (["--timestamps", "/nothing.txt"], "/nothing.txt: there is no such file; check the path"),
-        (["--timestamps", __file__, "--fps", "25"], "--fps and --timestamps: both determine the times of frames"),
+        (
+            ["--timestamps", __file__, "--fps", "25"],
+            "--fps and --timestamps: both determine the times of frames",
+        ),
         (["--shapes", "s.npz", "--no-temporal"], "--shapes: shapes need people over time"),
         (["--shapes", __file__], "cannot be read as an .npz file without pickled objects"),
         (["--up", "up"], "up must be one of x -x y -y z -z, got 'up'"),
         (["--unit", "inch"], "unit must be one of m cm mm, got 'inch'"),
         (["--config", "/nothing.toml"], "/nothing.toml: there is no such file; check the path"),
         (["--body", "/nothing.npz"], "/nothing.npz: there is no such file"),
-        (["--calibration", "/nothing.json"], "/nothing.json: there is no such file; check the path"),
+        (
+            ["--calibration", "/nothing.json"],
+            "/nothing.json: there is no such file; check the path",
+        ),
         (["--detections", "/nothing"], "/nothing: there is no such folder; check the path"),
         (
             ["--output", f"{__file__}/out"],
@@ -339,7 +408,10 @@ def test_errors_are_one_sentence_and_exit_code_2(recording, pipeline, capsys, op
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["reconstruct"], "--calibration, --detections and --output: missing; give them, or --project"),
+        (
+            ["reconstruct"],
+            "--calibration, --detections and --output: missing; give them, or --project",
+        ),
         (["rebuild"], "No such command 'rebuild'"),
         (["evaluate", "shelf", "--people", "x"], "No such option: --people; give the result"),
         (
@@ -405,11 +477,16 @@ def test_help_groups_the_options(capsys):
         assert all(f"─ {group} ─" in printed for group in groups)
     assert run("--help") == 0
     printed = capsys.readouterr().out
-    assert all(words in printed for words in ("Reconstruct a recording", "Use a result", "Try and evaluate"))
+    assert all(
+        words in printed
+        for words in ("Reconstruct a recording", "Use a result", "Try and evaluate")
+    )
 
 
 def test_evaluate_shelf(shared_data, tmp_path, capsys):
-    """Frame 0 of the annotation, one person of whom is found where nobody is: PCP 0 of 30 limbs or fewer."""
+    """Frame 0 of the annotation, one person of whom is found where nobody is: PCP 0 of 30 limbs or
+    fewer.
+    """
     N = 1
     Reconstruction(
         frame=np.zeros(N, dtype=int),
@@ -443,7 +520,9 @@ def short_scene(monkeypatch):
     monkeypatch.setattr("shapepose_fg.cli.demo.built_in_scene", lambda: built_in_scene(frames=5))
 
 
-def test_demo_compares_with_the_truth_and_leaves_a_report(short_scene, tmp_path, monkeypatch, capsys):
+def test_demo_compares_with_the_truth_and_leaves_a_report(
+    short_scene, tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
     assert run("demo") == 0
     printed = capsys.readouterr()
@@ -479,7 +558,10 @@ def test_the_scene_is_what_the_demo_says_it_is():
     from shapepose_fg.simulation import built_in_scene
 
     scene = built_in_scene()
-    assert f"{scene.people} people in close motion, {len(scene.rig)} cameras, {len(scene)} frames" in DEMO
+    assert (
+        f"{scene.people} people in close motion, {len(scene.rig)} cameras, {len(scene)} frames"
+        in DEMO
+    )
 
 
 LIGHT = """
@@ -497,7 +579,9 @@ assert "torch" not in sys.modules, "help loads torch"
 
 @pytest.mark.slow
 def test_importing_and_help_load_no_torch():
-    result = subprocess.run([sys.executable, "-c", LIGHT], check=False, timeout=60, capture_output=True, text=True)
+    result = subprocess.run(
+        [sys.executable, "-c", LIGHT], check=False, timeout=60, capture_output=True, text=True
+    )
     assert result.returncode == 0, result.stderr
     assert "reconstruct" in result.stdout
 
@@ -515,18 +599,25 @@ def test_a_reader_that_stops_reading_is_no_error():
     reader, writer = os.pipe()
     os.close(reader)
     command = [sys.executable, "-m", "shapepose_fg.cli.main", "version"]
-    result = subprocess.run(command, check=False, timeout=60, stdout=writer, stderr=subprocess.PIPE, text=True)
+    result = subprocess.run(
+        command, check=False, timeout=60, stdout=writer, stderr=subprocess.PIPE, text=True
+    )
     os.close(writer)
     assert result.stderr == ""
     assert result.returncode == 1
 
 
 def test_settings_are_looked_at_before_the_recording(recording, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("shapepose_fg.cli.reconstruct.run.read_recording", lambda *_: pytest.fail("it is read"))
+    monkeypatch.setattr(
+        "shapepose_fg.cli.reconstruct.run.read_recording", lambda *_: pytest.fail("it is read")
+    )
     (tmp_path / "typo.toml").write_text("batch_frame = 3\n")
     for words, said in (
         (("--config", str(tmp_path / "typo.toml")), "typo.toml: batch_frame"),
-        (("--shapes", str(tmp_path / "s.npz"), "--no-temporal"), "--shapes: shapes need people over time"),
+        (
+            ("--shapes", str(tmp_path / "s.npz"), "--no-temporal"),
+            "--shapes: shapes need people over time",
+        ),
         (("--chunk-frames", "20"), "--chunk-frames 20: must be 128"),
     ):
         assert run(*recording, *words) == 2
@@ -535,7 +626,10 @@ def test_settings_are_looked_at_before_the_recording(recording, tmp_path, monkey
 
 def test_processes_are_this_machine_s_or_the_cluster_s(recording, pipeline, capsys):
     assert run(*recording, "--workers", "2", "--cluster", "tcp://host:8786") == 2
-    assert "--workers and --cluster tcp://host:8786: processes are either of this" in capsys.readouterr().err
+    assert (
+        "--workers and --cluster tcp://host:8786: processes are either of this"
+        in capsys.readouterr().err
+    )
     assert run(*recording, "--workers", "2", "--cluster", "local") == 0
     assert (pipeline["workers"], pipeline["cluster"]) == (2, "local")
 
@@ -554,7 +648,10 @@ def test_chunks_and_a_cluster_reach_the_pipeline(recording, pipeline, capsys):
     [
         (WorkLost("a worker process was killed"), "a worker process was killed"),
         (MemoryError(), "too little memory"),
-        (RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory"), "too little memory"),
+        (
+            RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory"),
+            "too little memory",
+        ),
         (OSError(28, "No space left on device", "/x/y"), "/x/y: No space left on device"),
     ],
 )
@@ -569,11 +666,15 @@ def test_what_the_system_does_to_a_run_is_one_sentence_with_the_way_on(
         main(recording)
     said = capsys.readouterr().err
     assert ended.value.code == 2 and said.count("\n") == 1
-    assert words in said and "0 of 5 frames are stored in" in said and "continue with --resume" in said
+    assert (
+        words in said and "0 of 5 frames are stored in" in said and "continue with --resume" in said
+    )
 
 
 @pytest.mark.parametrize("name", ["parts", ".detections", ".lock"])
-def test_a_link_in_the_folder_of_results_is_not_followed(recording, pipeline, tmp_path, capsys, name):
+def test_a_link_in_the_folder_of_results_is_not_followed(
+    recording, pipeline, tmp_path, capsys, name
+):
     other = tmp_path / "other"
     for folder in (other, tmp_path / "out"):
         folder.mkdir()
@@ -581,7 +682,12 @@ def test_a_link_in_the_folder_of_results_is_not_followed(recording, pipeline, tm
     with pytest.raises(SystemExit) as ended:
         main(recording)
     said = capsys.readouterr().err
-    assert ended.value.code == 2 and f"{name}: this" in said and "link" in said and said.count("error") == 1
+    assert (
+        ended.value.code == 2
+        and f"{name}: this" in said
+        and "link" in said
+        and said.count("error") == 1
+    )
     assert list(other.iterdir()) == []
 
 
@@ -599,7 +705,11 @@ def three(recording, tmp_path) -> list[str]:
     """The same of three cameras, of which the last has no detections."""
     file = tmp_path / "calibration.json"
     cameras = json.loads(file.read_text())
-    cameras["behind"] = {"K": K, "RT": [1, 0, 0, -2, 0, 1, 0, 0, 0, 0, 1, 0], "imgSize": [1001, 801]}
+    cameras["behind"] = {
+        "K": K,
+        "RT": [1, 0, 0, -2, 0, 1, 0, 0, 0, 0, 1, 0],
+        "imgSize": [1001, 801],
+    }
     file.write_text(json.dumps(cameras))
     return recording
 
@@ -607,10 +717,14 @@ def three(recording, tmp_path) -> list[str]:
 @pytest.mark.slow
 @pytest.mark.parametrize("choice", [["--without", "behind"], ["--cameras", "right, left"]])
 def test_some_of_the_cameras(three, pipeline, tmp_path, choice):
-    """Whoever films with fewer cameras than were calibrated says which; a run that goes on has the same ones."""
+    """Whoever films with fewer cameras than were calibrated says which; a run that goes on has the
+    same ones.
+    """
     assert run(*three, *choice, "--no-check") == 0
     assert pipeline["rig"].names == ("left", "right")
-    assert [each["name"] for each in json.loads((tmp_path / "out/cameras.json").read_text())["cameras"]] == [
+    assert [
+        each["name"] for each in json.loads((tmp_path / "out/cameras.json").read_text())["cameras"]
+    ] == [
         "left",
         "right",
     ]

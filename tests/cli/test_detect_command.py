@@ -1,4 +1,6 @@
-"""`detect` from the command line: what it says of people's folders and options, and real recordings."""
+"""`detect` from the command line: what it says of people's folders and options, and real
+recordings.
+"""
 
 import json
 import re
@@ -23,7 +25,9 @@ from shapepose_fg.simulation.scene import ring_of_cameras
 
 @pytest.fixture
 def kitchen(tmp_path, monkeypatch) -> Path:
-    """calibration.json of three cameras, and a network that sees a right wrist at every white spot."""
+    """calibration.json of three cameras, and a network that sees a right wrist at every white
+    spot.
+    """
     monkeypatch.chdir(tmp_path)
     rig = ring_of_cameras(3, np.random.default_rng(0))
     write_rig(rig, tmp_path / "calibration.json")
@@ -70,7 +74,9 @@ def film(path: Path, rig, name: str, frames: range, fps: float) -> None:
 
 @pytest.mark.slow
 def test_half_size_videos_at_two_rates_one_of_which_starts_late(kitchen, capsys):
-    """Cameras at 50, 25 and 50 a second, the third 4 frames late: its point is where the others' is then."""
+    """Cameras at 50, 25 and 50 a second, the third 4 frames late: its point is where the others' is
+    then.
+    """
     rig = read_rig("calibration.json")
     a, b, c = rig.names
     Path("videos").mkdir()
@@ -81,11 +87,13 @@ def test_half_size_videos_at_two_rates_one_of_which_starts_late(kitchen, capsys)
     said = capsys.readouterr()
     told = " ".join(said.err.split())
     assert told.count("of the same aspect ratio: they are assumed to be resized") == 3
-    assert f"camera {a}: frames without a picture of every camera are left out, 4 at the start" in told
+    assert (
+        f"camera {a}: frames without a picture of every camera are left out, 4 at the start" in told
+    )
     (command,) = re.findall("next: (.*)", said.out)
     assert command == (
-        f"shapepose-fg reconstruct --calibration {kitchen}/calibration.json --detections {kitchen}/out"
-        f" --output {kitchen}/results"
+        f"shapepose-fg reconstruct --calibration {kitchen}/calibration.json --detections "
+        f"{kitchen}/out --output {kitchen}/results"
     )
     table = read_detections("out", rig)
     assert len(table) == 8 and table.skeleton.name == "COCO_18"
@@ -99,8 +107,12 @@ def test_half_size_videos_at_two_rates_one_of_which_starts_late(kitchen, capsys)
 
 
 @pytest.mark.slow
-def test_files_of_unequal_length_are_detected_whole_where_nobody_says_when_they_began(kitchen, capsys):
-    """Two are shorter than the time between their starts: no moment would be left of what they share."""
+def test_files_of_unequal_length_are_detected_whole_where_nobody_says_when_they_began(
+    kitchen, capsys
+):
+    """Two are shorter than the time between their starts: no moment would be left of what they
+    share.
+    """
     rig, lengths = read_rig("calibration.json"), (12, 5, 8)
     Path("videos").mkdir()
     for name, length in zip(rig.names, lengths, strict=True):
@@ -122,11 +134,16 @@ def test_folders_of_pictures_need_no_rate(kitchen, capsys):
     for name in rig.names:
         (Path("shots") / name).mkdir(parents=True)
         for frame in range(100, 104):
-            cv2.imwrite(f"shots/{name}/img_{frame}.png", picture(rig, name, 0, rig.cameras[0].image_size))
+            cv2.imwrite(
+                f"shots/{name}/img_{frame}.png", picture(rig, name, 0, rig.cameras[0].image_size)
+            )
     Path(f"shots/{rig.names[1]}/img_102.png").unlink()
     assert run(*COMMON, "--images", "shots") == 0
     said = capsys.readouterr()
-    assert "1 of 4 pictures are missing" in said.err and "they are read as frames without people" in said.err
+    assert (
+        "1 of 4 pictures are missing" in said.err
+        and "they are read as frames without people" in said.err
+    )
     assert "--timestamps" not in said.out and not Path("out/times.csv").exists()
     table = read_detections("out", rig)
     assert [frame.view.tolist() for frame in table] == [[0, 1, 2], [0, 1, 2], [0, 2], [0, 1, 2]]
@@ -136,7 +153,9 @@ def test_folders_of_pictures_need_no_rate(kitchen, capsys):
 
 @pytest.mark.slow
 def test_a_project_is_detected_in_and_goes_on_as_a_project(kitchen, capsys, monkeypatch):
-    """Cameras, videos and places come from it; the next line is the project's, quoted, from any folder."""
+    """Cameras, videos and places come from it; the next line is the project's, quoted, from any
+    folder.
+    """
     rig, project = read_rig("calibration.json"), kitchen / "my walk"
     (project / "calibration").mkdir(parents=True)
     (kitchen / "calibration.json").rename(project / "calibration" / "rig.json")
@@ -154,7 +173,9 @@ def test_a_project_is_detected_in_and_goes_on_as_a_project(kitchen, capsys, monk
     assert end.value.code == 0
     told = json.loads((project / "shapepose-fg" / "run.json").read_text())
     assert told["time"]["fps"] == 50.0 and told["project"] == "my walk"
-    assert "<title>my walk" in (project / "shapepose-fg" / "report.html").read_text(encoding="utf-8")
+    assert "<title>my walk" in (project / "shapepose-fg" / "report.html").read_text(
+        encoding="utf-8"
+    )
     assert (project / "shapepose-fg" / "footage.json").is_file()
 
 
@@ -171,16 +192,20 @@ def test_one_camera_is_enough_to_detect(kitchen):
     (["--videos", "shots", "--fps", "fast"], "--fps fast: must be a frame rate in Hz"),
     (["--videos", "shots", "--fps", "kitchen=5"], "no camera 'kitchen'"),
     (["--videos", "shots", "--start", "0.2s"], "--start 0.2s: must be CAMERA=VALUE"),
-    (["--videos", "shots", "--start", "{a}=2"], "--start 2: must be seconds, such as 0.2s, or frames"),
+    (["--videos", "shots", "--start", "{a}=2"],
+     "--start 2: must be seconds, such as 0.2s, or frames"),
     (["--videos", "shots", "--start", "{a}=2s"], "the frame rate is unknown; give --fps"),
     (["--videos", "shots", "--start", "{a}=2f", "--start", "{a}=3f"], "is given twice"),
     (["--videos", "shots", "--start", "{a}=50f"], "have no time in common; check --start"),
-    (["--videos", "shots", "--image-placement", "bent"], "must be one of same crop crop-centre scale letterbox"),
-    (["--videos", "shots", "--image-placement", "same"], "1280 x 720; give another --image-placement"),
+    (["--videos", "shots", "--image-placement", "bent"],
+     "must be one of same crop crop-centre scale letterbox"),
+    (["--videos", "shots", "--image-placement", "same"],
+     "1280 x 720; give another --image-placement"),
     (["--videos", "shots"], "give --image-placement: letterbox"),
     (["--videos", "shots", "--image-placement", "scale", "--frames", "7:9"], "which has 1 frames"),
     (["--videos", "shots", "--long-side", "7"], "--long-side 7: must be 128 to 4096"),
-    (["--videos", "shots", "--backend", "abacus"], "--backend abacus: must be opencv or onnxruntime"),
+    (["--videos", "shots", "--backend", "abacus"],
+     "--backend abacus: must be opencv or onnxruntime"),
     (["--videos", "shots", "--network", "clever"], "no network of this name"),
 ])  # fmt: skip
 def test_what_cannot_be_detected_in_is_said_before_any_work(kitchen, capsys, words, problem):
@@ -215,13 +240,32 @@ def test_a_man_is_found_in_real_videos_of_rolled_cameras(shared_data, network, t
     """Pose2Sim's demo as it lies, six frames: the man in each, with his head above his feet."""
     data = shared_data / "pose2sim_single"
     calibration, found, results = data / "Calib.qca.txt", tmp_path / "found", tmp_path / "results"
-    words = ("--calibration", calibration, "--videos", data, "--network", network, "--output", found)
+    words = (
+        "--calibration",
+        calibration,
+        "--videos",
+        data,
+        "--network",
+        network,
+        "--output",
+        found,
+    )
     assert run(*words, "--frames", "10:16") == 0
     said = " ".join((told := capsys.readouterr()).err.split())
     for name in ("cam01", "cam02"):
-        assert f"camera {name}: the pictures have 1080 x 1920 pixels, but the calibration is for 1088" in said
+        assert (
+            f"camera {name}: the pictures have 1080 x 1920 pixels, but the calibration is for 1088"
+            in said
+        )
     assert "-14°" in told.out and "26°" in told.out
-    words = ("--calibration", calibration, "--detections", found, "--timestamps", found / "times.csv")
+    words = (
+        "--calibration",
+        calibration,
+        "--detections",
+        found,
+        "--timestamps",
+        found / "times.csv",
+    )
     assert command("reconstruct", *words, "--output", results) == 0
     people = Reconstruction.load(results)
     # The bystander is over 1.5 m from the middle of the cameras.
@@ -229,14 +273,18 @@ def test_a_man_is_found_in_real_videos_of_rolled_cameras(shared_data, network, t
     man = people.rows(np.linalg.norm(away, axis=1) < 1.5)
     assert man.frame.tolist() == list(range(6))
     names = man.joint_names.tolist()
-    nose, right, left = (man.joints[:, names.index(name), 2] for name in ("Nose", "RAnkle", "LAnkle"))
+    nose, right, left = (
+        man.joints[:, names.index(name), 2] for name in ("Nose", "RAnkle", "LAnkle")
+    )
     # An adult who leans forward on a treadmill.
     assert ((nose - np.minimum(right, left) > 1.1) & (nose - np.minimum(right, left) < 1.8)).all()
 
 
 @pytest.mark.slow
 def test_four_people_around_a_pizza(shared_data, network, tmp_path):
-    """CMU Panoptic's demo: five letterboxed pictures of one moment. At least three of four, and nobody else."""
+    """CMU Panoptic's demo: five letterboxed pictures of one moment. At least three of four, and
+    nobody else.
+    """
     data = shared_data / "panoptic_pizza"
     camera = ("--calibration", data / "calibration.json", "--image-size", "1920x1080")
     found, results = tmp_path / "found", tmp_path / "results"
@@ -252,7 +300,9 @@ def test_four_people_around_a_pizza(shared_data, network, tmp_path):
 
 
 def test_without_a_calibration_cameras_are_called_as_their_videos(kitchen, capsys):
-    """Pixels are the pictures' own, and the next command is the one that finds where cameras stand."""
+    """Pixels are the pictures' own, and the next command is the one that finds where cameras
+    stand.
+    """
     rig = read_rig("calibration.json")
     Path("videos").mkdir()
     for name in rig.names:
@@ -261,8 +311,16 @@ def test_without_a_calibration_cameras_are_called_as_their_videos(kitchen, capsy
     said = capsys.readouterr()
     (command,) = re.findall("next: (.*)", said.out)
     words = shlex.split(command)
-    assert words[:2] == ["shapepose-fg", "calibrate"] and words[words.index("--field-of-view") + 1] == "65"
-    assert {"--focal", f"{kitchen}/out", f"{kitchen}/times.csv", f"{kitchen}/calibration.json"} <= set(words)
+    assert (
+        words[:2] == ["shapepose-fg", "calibrate"]
+        and words[words.index("--field-of-view") + 1] == "65"
+    )
+    assert {
+        "--focal",
+        f"{kitchen}/out",
+        f"{kitchen}/times.csv",
+        f"{kitchen}/calibration.json",
+    } <= set(words)
     seen = lenses_of(Path("out"), ["65"], None)
     assert list(seen.names) == [f"phone {name}" for name in rig.names]
     assert {camera.image_size for camera in seen.cameras} == {(640, 360)}

@@ -22,13 +22,17 @@ def cameras(tmp_path, five_cameras):
 
 
 def lines(rig, people, frames: int) -> str:
-    """What an OpenPose of each camera would write of people who stand still, 10 pictures a second."""
+    """What an OpenPose of each camera would write of people who stand still, 10 pictures a
+    second.
+    """
     xy, _ = rig.project(people)
     rng, written = np.random.default_rng(0), []
     for frame in range(frames):
         for view, name in enumerate(rig.names):
             noisy = xy[view] + rng.normal(0, 1, xy[view].shape)
-            flat = np.concatenate([noisy, np.full((*noisy.shape[:2], 1), 0.9)], axis=-1).reshape(len(people), -1)
+            flat = np.concatenate([noisy, np.full((*noisy.shape[:2], 1), 0.9)], axis=-1).reshape(
+                len(people), -1
+            )
             seen = [{"pose_keypoints_2d": each.tolist()} for each in flat]
             written.append(json.dumps({"camera": name, "time_s": frame / 10, "people": seen}))
     return "\n".join(written) + "\n"
@@ -37,7 +41,15 @@ def lines(rig, people, frames: int) -> str:
 @pytest.mark.slow
 def test_people_come_out_as_lines(tmp_path, cameras, five_cameras, two_people):
     (tmp_path / "in.jsonl").write_text(lines(five_cameras, two_people, 8))
-    given = ["live", "--calibration", cameras, "--detections", str(tmp_path / "in.jsonl"), "--workers", "1"]
+    given = [
+        "live",
+        "--calibration",
+        cameras,
+        "--detections",
+        str(tmp_path / "in.jsonl"),
+        "--workers",
+        "1",
+    ]
     with pytest.raises(SystemExit) as ended:
         main([*given, "--output", str(tmp_path / "out.jsonl")])
     assert ended.value.code == 0
@@ -53,9 +65,19 @@ def test_people_come_out_as_lines(tmp_path, cameras, five_cameras, two_people):
         assert np.linalg.norm(joints[order] - two_people, axis=-1).mean() < 0.01
 
 
-def test_cameras_that_are_not_wanted_are_passed_over(tmp_path, cameras, five_cameras, two_people, capsys):
+def test_cameras_that_are_not_wanted_are_passed_over(
+    tmp_path, cameras, five_cameras, two_people, capsys
+):
     (tmp_path / "in.jsonl").write_text(lines(five_cameras, two_people, 4))
-    given = ["live", "--calibration", cameras, "--detections", str(tmp_path / "in.jsonl"), "--workers", "1"]
+    given = [
+        "live",
+        "--calibration",
+        cameras,
+        "--detections",
+        str(tmp_path / "in.jsonl"),
+        "--workers",
+        "1",
+    ]
     with pytest.raises(SystemExit) as ended:
         main([*given, "--without", five_cameras.names[0], "--output", str(tmp_path / "out.jsonl")])
     assert ended.value.code == 0
@@ -70,7 +92,10 @@ def test_cameras_that_are_not_wanted_are_passed_over(tmp_path, cameras, five_cam
         ("{", "standing.jsonl, line 1: line 1 column 2 is not JSON"),
         ('{"camera": "9", "time_s": 0, "people": []}', "there is no camera 9"),
         ('{"camera": "CAM", "people": []}', "time_s is missing"),
-        ('{"camera": "CAM", "time_s": 0, "people": [{"pose_keypoints_2d": [1, 2]}]}', "75 numbers per person"),
+        (
+            '{"camera": "CAM", "time_s": 0, "people": [{"pose_keypoints_2d": [1, 2]}]}',
+            "75 numbers per person",
+        ),
     ],
 )
 def test_a_line_that_is_none_is_named(tmp_path, cameras, five_cameras, capsys, line, said):
@@ -111,7 +136,9 @@ def free_port() -> int:
         return server.getsockname()[1]
 
 
-def test_detections_come_and_people_go_by_sockets(tmp_path, cameras, five_cameras, two_people, capsys):
+def test_detections_come_and_people_go_by_sockets(
+    tmp_path, cameras, five_cameras, two_people, capsys
+):
     inward, outward, text = free_port(), free_port(), lines(five_cameras, two_people, 8)
     ends = ["--detections", f"tcp://:{inward}", "--output", f"tcp://:{outward}", "--workers", "1"]
     thread = started(["live", "--calibration", cameras, *ends])
@@ -123,7 +150,9 @@ def test_detections_come_and_people_go_by_sockets(tmp_path, cameras, five_camera
         sender.shutdown(socket.SHUT_WR)
         told = [json.loads(line) for line in people.makefile()]
     thread.join(timeout=60)
-    assert [each["time_s"] for each in told if each["kind"] == "now"] == pytest.approx(np.arange(8) / 10)
+    assert [each["time_s"] for each in told if each["kind"] == "now"] == pytest.approx(
+        np.arange(8) / 10
+    )
     assert len(told[-1]["people"]) == 2
     assert "the connection is closed" in capsys.readouterr().err
 
@@ -134,21 +163,31 @@ def test_detections_and_people_are_mcap(tmp_path, cameras, five_cameras, two_peo
     from mcap.reader import make_reader
     from mcap_ros2.decoder import DecoderFactory
 
-    text, seen, out = lines(five_cameras, two_people, 8), tmp_path / "seen.mcap", tmp_path / "out.mcap"
+    text, seen, out = (
+        lines(five_cameras, two_people, 8),
+        tmp_path / "seen.mcap",
+        tmp_path / "out.mcap",
+    )
     with seen.open("wb") as stream, McapWriter(stream, None) as writer:
         for line in map(json.loads, text.splitlines()):
             flat = [each["pose_keypoints_2d"] for each in line["people"]]
             writer.detections(line["camera"], flat, line["time_s"], five_cameras)
     (tmp_path / "in.jsonl").write_text(text)
     given = ["live", "--calibration", cameras, "--workers", "1", "--detections"]
-    for source, target in ((str(seen), str(out)), (str(tmp_path / "in.jsonl"), str(tmp_path / "out.jsonl"))):
+    for source, target in (
+        (str(seen), str(out)),
+        (str(tmp_path / "in.jsonl"), str(tmp_path / "out.jsonl")),
+    ):
         with pytest.raises(SystemExit) as ended:
             main([*given, source, "--output", target])
         assert ended.value.code == 0
     with out.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
         found = [
-            message for *_, message in reader.iter_decoded_messages(topics=["/people/now", "/people/settled"])
+            message
+            for *_, message in reader.iter_decoded_messages(
+                topics=["/people/now", "/people/settled"]
+            )
         ]
     told = [json.loads(line) for line in (tmp_path / "out.jsonl").read_text().splitlines()]
     for kind in ("now", "settled"):
@@ -159,20 +198,33 @@ def test_detections_and_people_are_mcap(tmp_path, cameras, five_cameras, two_peo
             joints = [np.reshape(list(each.joints), (25, 3)) for each in here.people]
             # Lines have six digits, and stamps whole nanoseconds: times differ by less than one.
             expected = [
-                np.array([[np.nan] * 3 if x is None else x for x in p["joints"]], float) for p in there["people"]
+                np.array([[np.nan] * 3 if x is None else x for x in p["joints"]], float)
+                for p in there["people"]
             ]
             np.testing.assert_allclose(joints, expected, rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.slow
-def test_people_can_be_looked_at_while_they_go_elsewhere(tmp_path, cameras, five_cameras, two_people, capfd):
-    """One person leaves after six of 30 pictures: rerun is told who is known in the newest moment."""
+def test_people_can_be_looked_at_while_they_go_elsewhere(
+    tmp_path, cameras, five_cameras, two_people, capfd
+):
+    """One person leaves after six of 30 pictures: rerun is told who is known in the newest
+    moment.
+    """
     rerun = pytest.importorskip("rerun")
     both, one = lines(five_cameras, two_people, 6), lines(five_cameras, two_people[:1], 30)
     later = [json.loads(line) for line in one.splitlines()][6 * len(five_cameras) :]
     (tmp_path / "in.jsonl").write_text(both + "\n".join(map(json.dumps, later)))
     out, looked = tmp_path / "out.jsonl", tmp_path / "people.rrd"
-    given = ["live", "--calibration", cameras, "--detections", str(tmp_path / "in.jsonl"), "--workers", "1"]
+    given = [
+        "live",
+        "--calibration",
+        cameras,
+        "--detections",
+        str(tmp_path / "in.jsonl"),
+        "--workers",
+        "1",
+    ]
     with pytest.raises(SystemExit) as ended:
         main([*given, "--output", str(out), "--output", str(looked)])
     assert ended.value.code == 0 and "WARN" not in capfd.readouterr().err
@@ -184,7 +236,11 @@ def test_people_can_be_looked_at_while_they_go_elsewhere(tmp_path, cameras, five
     }
     assert all(any(person["joints"]) for people in now.values() for person in people)
     for who in (0, 1):
-        tables = [each.to_record_batch() for each in chunks if each.entity_path == f"/world/people/{who}/joints"]
+        tables = [
+            each.to_record_batch()
+            for each in chunks
+            if each.entity_path == f"/world/people/{who}/joints"
+        ]
         rows = [row for table in tables for row in table.to_pylist()]
         shown = {row["time"].total_seconds(): row["Points3D:positions"] for row in rows}
         expected = {
@@ -194,10 +250,16 @@ def test_people_can_be_looked_at_while_they_go_elsewhere(tmp_path, cameras, five
             if person["person"] == who
         }
         assert sorted(shown) == pytest.approx(sorted(expected)) and len(shown) >= 6
-        for time_s, joints in zip(sorted(shown), (expected[each] for each in sorted(expected)), strict=True):
+        for time_s, joints in zip(
+            sorted(shown), (expected[each] for each in sorted(expected)), strict=True
+        ):
             np.testing.assert_allclose(shown[time_s], joints, atol=1e-5)
     (stays,) = (each["person"] for each in now[2.9])
-    cleared = {each.entity_path for each in chunks if each.entity_path in ("/world/people/0", "/world/people/1")}
+    cleared = {
+        each.entity_path
+        for each in chunks
+        if each.entity_path in ("/world/people/0", "/world/people/1")
+    }
     assert cleared == {f"/world/people/{1 - stays}"}
 
 

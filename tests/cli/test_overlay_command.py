@@ -11,7 +11,12 @@ from shapepose_fg.cli.main import main
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.io.calibration import write_rig
-from shapepose_fg.io.footage.placement import CameraFootage, Placement, PlacementKind, write_used_footage
+from shapepose_fg.io.footage.placement import (
+    CameraFootage,
+    Placement,
+    PlacementKind,
+    write_used_footage,
+)
 from shapepose_fg.pipeline.pipeline import reconstruct
 from shapepose_fg.simulation import built_in_scene, simulate
 
@@ -20,7 +25,9 @@ FRAMES = 3
 
 @pytest.fixture(scope="module")
 def solved(tmp_path_factory) -> Path:
-    """results/ of three frames of two people, and half-size videos of grey that gets lighter, one a frame late."""
+    """results/ of three frames of two people, and half-size videos of grey that gets lighter, one a
+    frame late.
+    """
     folder = tmp_path_factory.mktemp("overlay")
     scene = built_in_scene(frames=FRAMES, people=2)
     people = reconstruct(simulate(scene), scene.rig, times=FrameTimes.from_fps(scene.fps, FRAMES))
@@ -57,14 +64,18 @@ def frames_of(path: Path) -> list[np.ndarray]:
 
 
 def test_a_grid_of_all_cameras_that_plays(solved, tmp_path, capsys):
-    """Pictures are found by what detect wrote: that of the first camera is a frame late, and so drawn lighter."""
+    """Pictures are found by what detect wrote: that of the first camera is a frame late, and so
+    drawn lighter.
+    """
     assert run(solved / "results", "--output", tmp_path, "--width", 960) == 0
     assert capsys.readouterr().out == f"written  {tmp_path / 'grid.mp4'}\n"
     frames = frames_of(tmp_path / "grid.mp4")
     assert len(frames) == FRAMES
     assert frames[0].shape[1] == 960
     assert [path.name for path in tmp_path.iterdir()] == ["grid.mp4"]
-    corner = [int(np.median(frame[-12:, :60])) for frame in frames]  # of the last row's first camera
+    corner = [
+        int(np.median(frame[-12:, :60])) for frame in frames
+    ]  # of the last row's first camera
     np.testing.assert_allclose(corner, [40, 80, 120], atol=8)
     first = [int(np.median(frame[40:52, :20])) for frame in frames]
     np.testing.assert_allclose(first, [80, 120, 160], atol=8)
@@ -72,10 +83,20 @@ def test_a_grid_of_all_cameras_that_plays(solved, tmp_path, capsys):
 
 def test_stills_of_each_camera_show_people_where_they_are(solved, tmp_path):
     people = Reconstruction.load(solved / "results")
-    names = [camera["name"] for camera in json.loads((solved / "results/cameras.json").read_text())["cameras"]]
+    names = [
+        camera["name"]
+        for camera in json.loads((solved / "results/cameras.json").read_text())["cameras"]
+    ]
     assert (
         run(
-            solved / "results", "--output", tmp_path, "--each", "--stills", "0,2", "--cameras", ",".join(names[:2])
+            solved / "results",
+            "--output",
+            tmp_path,
+            "--each",
+            "--stills",
+            "0,2",
+            "--cameras",
+            ",".join(names[:2]),
         )
         == 0
     )
@@ -92,7 +113,16 @@ def test_stills_of_each_camera_show_people_where_they_are(solved, tmp_path):
 
 @pytest.mark.slow
 def test_bodies_and_videos_that_are_given(solved, tmp_path, capsys):
-    rest = ["--output", tmp_path, "--stills", "1", "--width", "640", "--no-skeletons", "--no-points"]
+    rest = [
+        "--output",
+        tmp_path,
+        "--stills",
+        "1",
+        "--width",
+        "640",
+        "--no-skeletons",
+        "--no-points",
+    ]
     assert run(solved / "results", "--bodies", *rest) == 0
     with_bodies = cv2.imread(str(tmp_path / "grid_000001.jpg"))
     assert run(solved / "results", *rest) == 0
@@ -121,7 +151,9 @@ def test_what_cannot_be_drawn_is_said(solved, tmp_path, capsys, words, problem):
 def test_without_footage_json_pictures_are_counted_and_it_is_said(solved, tmp_path, capsys):
     people = Reconstruction.load(solved / "results")
     people.with_run(inputs={}).save(tmp_path / "results")
-    (tmp_path / "results" / "cameras.json").write_bytes((solved / "results" / "cameras.json").read_bytes())
+    (tmp_path / "results" / "cameras.json").write_bytes(
+        (solved / "results" / "cameras.json").read_bytes()
+    )
     assert run(tmp_path / "results") == 2
     assert "the pictures of camera" in " ".join(capsys.readouterr().err.split())
     name = people.observations.view_names[1]
@@ -138,7 +170,16 @@ def test_footage_of_another_calibration_is_not_drawn_on(solved, tmp_path, capsys
     content = json.loads((solved / "detections" / "footage.json").read_text())
     content["cameras"][0]["calibrated_size"][0] *= 2
     (tmp_path / "footage.json").write_text(json.dumps(content))
-    words = ["--output", tmp_path / "out", "--stills", "0", "--width", "640", "--detections", tmp_path]
+    words = [
+        "--output",
+        tmp_path / "out",
+        "--stills",
+        "0",
+        "--width",
+        "640",
+        "--detections",
+        tmp_path,
+    ]
     assert run(solved / "results", *words) == 2
     printed = " ".join(capsys.readouterr().err.split())
     assert f"camera {content['cameras'][0]['name']} was calibrated for pictures of" in printed

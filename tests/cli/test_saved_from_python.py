@@ -52,10 +52,15 @@ def test_the_cameras_are_those_that_it_was_solved_with(people, scene, tmp_path):
         np.testing.assert_array_equal(kept, [getattr(camera, name) for camera in scene.rig.cameras])
 
 
-def test_a_result_without_cameras_is_saved_with_them_or_the_command_says_how(people, scene, tmp_path, capsys):
+def test_a_result_without_cameras_is_saved_with_them_or_the_command_says_how(
+    people, scene, tmp_path, capsys
+):
     loaded = replace(people, rig=None)
     loaded.save(tmp_path / "bare")
-    for line in (["explain", tmp_path / "bare", 0, "RWrist", "--frame", 1], ["overlay", tmp_path / "bare"]):
+    for line in (
+        ["explain", tmp_path / "bare", 0, "RWrist", "--frame", 1],
+        ["overlay", tmp_path / "bare"],
+    ):
         code, _, err = run(capsys, *line)
         assert code == 2 and err.count("\n") == 1 and "people.save(folder, rig)" in err
     code, _, err = run(capsys, "export", tmp_path / "bare", "trc")
@@ -75,7 +80,9 @@ def test_another_programs_calibration_is_not_overwritten(people, scene, tmp_path
     (tmp_path / "cameras.json").write_text(theirs)
     with pytest.raises(InputError, match="another folder"):
         people.save(tmp_path)
-    assert (tmp_path / "cameras.json").read_text() == theirs and not (tmp_path / "people.npz").exists()
+    assert (tmp_path / "cameras.json").read_text() == theirs and not (
+        tmp_path / "people.npz"
+    ).exists()
 
 
 def test_cameras_that_are_not_those_of_the_observations_are_refused(people, scene, tmp_path):

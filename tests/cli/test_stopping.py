@@ -47,7 +47,9 @@ def test_a_second_signal_does_not_disturb_the_clean_up():
 
 def test_other_errors_of_finalisers_are_reported_as_before(monkeypatch):
     reported = []
-    monkeypatch.setattr(sys, "unraisablehook", lambda unraisable: reported.append(unraisable.exc_type))
+    monkeypatch.setattr(
+        sys, "unraisablehook", lambda unraisable: reported.append(unraisable.exc_type)
+    )
     with stoppable():
         Breaks()
     assert reported == [ValueError]

@@ -66,7 +66,9 @@ def test_names_and_keys_of_files_reach_no_terminal_as_they_are(tmp_path, capsys)
     """Keys of TOML and JSON, names of files and recordings, arguments."""
     escaped = json.dumps(ESCAPES)
     (tmp_path / "keys.toml").write_text(f"{escaped} = 1\n[{escaped}]\na = 2", encoding="utf-8")
-    (tmp_path / "keys.json").write_text(f'{{{escaped}: 1, "K": {{{escaped}: [1]}}}}', encoding="utf-8")
+    (tmp_path / "keys.json").write_text(
+        f'{{{escaped}: 1, "K": {{{escaped}: [1]}}}}', encoding="utf-8"
+    )
     (tmp_path / "table.toml").write_text(f"[recordings.{escaped}]\n{escaped} = 1", encoding="utf-8")
     (tmp_path / f"a{ESCAPES}").write_text("{}")
     common = ["--detections", str(tmp_path), "--output", str(tmp_path / "out")]

@@ -10,7 +10,9 @@ LENS = np.array([-0.3, 0.1, 0.001, -0.002, 0.02])
 
 def posed(name: str = "a", lens: np.ndarray = LENS) -> Camera:
     R, _ = cv2.Rodrigues(np.array([0.3, -0.5, 0.2]))
-    return Camera.from_camera_from_world(name, K, np.hstack([R, [[0.1], [0.2], [4.0]]]), (1000, 800), list(lens))
+    return Camera.from_camera_from_world(
+        name, K, np.hstack([R, [[0.1], [0.2], [4.0]]]), (1000, 800), list(lens)
+    )
 
 
 def test_projects_like_opencv():
@@ -35,11 +37,15 @@ def test_undistort_inverts_distort():
     xy = np.random.default_rng(0).uniform((0, 0), (1000, 800), (50, 2))
     # The inverse is iterated to 1e-6 of a normalised coordinate, a thousandth of a pixel.
     np.testing.assert_allclose(camera.distort(camera.undistort(xy)), xy, atol=1e-6)
-    assert np.abs(camera.undistort(xy) - xy).max() > 5.0, "the lens must bend something for this to test anything"
+    assert np.abs(camera.undistort(xy) - xy).max() > 5.0, (
+        "the lens must bend something for this to test anything"
+    )
 
 
 def test_behind_the_camera_is_nan():
-    xy, depth = Camera("a", K, np.eye(4), (1000, 800)).project(np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]))
+    xy, depth = Camera("a", K, np.eye(4), (1000, 800)).project(
+        np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
+    )
     assert np.isnan(xy[0]).all() and depth[0] == -1.0
     np.testing.assert_allclose(xy[1], [500.0, 400.0])
 
@@ -55,7 +61,9 @@ def test_rig_projects_as_its_cameras(five_cameras, two_people):
 def test_normalise_inverts_the_intrinsics(five_cameras, two_people):
     xy, depth = five_cameras.project(two_people[0])
     view = np.repeat(np.arange(5), 25)
-    rays = np.concatenate([five_cameras.normalise(view, xy.reshape(-1, 2)), np.ones((125, 1))], axis=1)
+    rays = np.concatenate(
+        [five_cameras.normalise(view, xy.reshape(-1, 2)), np.ones((125, 1))], axis=1
+    )
     points_camera = rays * depth.reshape(-1, 1)
     cTw = five_cameras.cTw[view]
     points = np.einsum("dji,dj->di", cTw[:, :, :3], points_camera - cTw[:, :, 3])
@@ -80,7 +88,9 @@ def test_refuses_what_is_no_camera(changed, message):
 
 def test_printed_digits_do_not_scale():
     R, _ = cv2.Rodrigues(np.array([0.3, -0.5, 0.2]))
-    camera = Camera.from_camera_from_world("a", K, np.hstack([R.round(4), np.ones((3, 1))]), (10, 10))
+    camera = Camera.from_camera_from_world(
+        "a", K, np.hstack([R.round(4), np.ones((3, 1))]), (10, 10)
+    )
     np.testing.assert_allclose(camera.wTc[:3, :3] @ camera.wTc[:3, :3].T, np.eye(3), atol=1e-12)
 
 
@@ -112,7 +122,9 @@ def test_a_lens_bends_as_opencv_says_and_is_undone(lens):
     rays = np.random.default_rng(0).uniform(-0.45, 0.45, (60, 2))
     points = np.concatenate([rays, np.ones((60, 1))], axis=1)
     project = cv2.fisheye.projectPoints if family == "fisheye" else cv2.projectPoints
-    seen, _ = project(points.reshape(-1, 1, 3), np.zeros(3), np.zeros(3), plain, np.array(coefficients))
+    seen, _ = project(
+        points.reshape(-1, 1, 3), np.zeros(3), np.zeros(3), plain, np.array(coefficients)
+    )
     ideal, _ = camera.project(points)
     np.testing.assert_allclose(camera.distort(ideal), seen[:, 0], atol=1e-9)
     np.testing.assert_allclose(camera.undistort(seen[:, 0]), ideal, atol=1e-6)  # pixels
@@ -125,8 +137,15 @@ def test_skew_is_bent_too():
 
 
 def test_what_the_lens_does_not_reach_is_nan():
-    # r (1 - 0.28 r^2 + 0.08 r^4 - 0.01 r^6) stays under 1.0: a corner at r = 1.1 is no point of any ray.
-    camera = Camera("a", np.diag([1000.0, 1000, 1]), np.eye(4), (1000, 800), np.array([-0.28, 0.08, 0, 0, -0.01]))
+    # r (1 - 0.28 r^2 + 0.08 r^4 - 0.01 r^6) stays under 1.0: a corner at r = 1.1 is no point of any
+    # ray.
+    camera = Camera(
+        "a",
+        np.diag([1000.0, 1000, 1]),
+        np.eye(4),
+        (1000, 800),
+        np.array([-0.28, 0.08, 0, 0, -0.01]),
+    )
     ideal = camera.undistort(np.array([[960.0, 540.0], [300.0, 200.0]]))
     assert np.isnan(ideal[0]).all() and np.isfinite(ideal[1]).all()
 
@@ -142,7 +161,9 @@ def test_refuses_coefficients_of_another_lens():
         Camera.from_camera_from_world("a", K, np.eye(4), (10, 10), [0.1] * 5, "fisheye")
 
 
-def test_pixels_are_those_of_the_projection_with_derivatives_moving_cameras_too(five_cameras, two_people):
+def test_pixels_are_those_of_the_projection_with_derivatives_moving_cameras_too(
+    five_cameras, two_people
+):
     still = Views.of(five_cameras)
     for views in (still, Views(still.K, np.tile(still.cTw, (2, 1, 1, 1)))):
         points = two_people.copy()

@@ -1,4 +1,6 @@
-"""Kernels: compiled anew when they change, kept where that is possible, and said when they are compiled."""
+"""Kernels: compiled anew when they change, kept where that is possible, and said when they are
+compiled.
+"""
 
 import os
 import shutil
@@ -35,7 +37,9 @@ print(run(10.0), *x, *(sum(each.loaded.stats.cache_hits.values()) for each in (r
 
 
 class Program:
-    """Modules in a folder and a cache: a call runs the program and returns the result, what was read, stderr."""
+    """Modules in a folder and a cache: a call runs the program and returns the result, what was
+    read, stderr.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.modules, self.cache, self.program = folder / "modules", folder / "cache", PROGRAM
@@ -46,7 +50,10 @@ class Program:
             (self.modules / f"{name}.py").write_text(text)
 
     def start(self, **variables: str) -> subprocess.Popen:
-        where = {"PYTHONPATH": f"{self.modules}{os.pathsep}{ROOT}", "NUMBA_CACHE_DIR": str(self.cache)}
+        where = {
+            "PYTHONPATH": f"{self.modules}{os.pathsep}{ROOT}",
+            "NUMBA_CACHE_DIR": str(self.cache),
+        }
         where |= {"TMPDIR": str(self.temporary)} | variables
         environment = {name: each for name, each in (os.environ | where).items() if each}
         command = [sys.executable, "-B", "-c", self.program]
@@ -75,7 +82,9 @@ def program(tmp_path) -> Program:
 
 @pytest.mark.slow
 def test_a_kernel_is_compiled_anew_when_a_file_has_changed_that_it_calls_into(program, tmp_path):
-    """Its own file, or one whose part it calls by way of another; else it is read, wherever it stands."""
+    """Its own file, or one whose part it calls by way of another; else it is read, wherever it
+    stands.
+    """
     assert [program()[:2], program()[:2]] == [(21.0, [0, 0]), (21.0, [1, 1])]
     shutil.copytree(program.modules, tmp_path / "there")
     (program.modules / "inner.py").write_text(FILES["inner"].replace("2 * x", "3 * x"))
@@ -104,7 +113,9 @@ def test_a_damaged_cache_is_made_anew(program):
 
 @pytest.mark.slow
 def test_a_cache_that_cannot_be_written_is_read(program):
-    """As in an image, where another user made it; nothing is left in the folder for temporary files."""
+    """As in an image, where another user made it; nothing is left in the folder for temporary
+    files.
+    """
     program()
     program.program = "import tempfile, pathlib\n" + refuse("cache") + PROGRAM
     assert program()[:2] == (21.0, [1, 1])
@@ -199,7 +210,8 @@ def test_compiling_is_done_side_by_side_and_said_once_before_it_ends(program):
     result, hits, complaints = program()
     assert (result, hits) == (21.0, [1, 1])  # neither was compiled there
     assert (
-        complaints.count("\n") == 1 and "compiling 2 functions for this machine, which takes about" in complaints
+        complaints.count("\n") == 1
+        and "compiling 2 functions for this machine, which takes about" in complaints
     )
     assert program()[2] == ""
 
@@ -226,16 +238,25 @@ def test_the_command_compiles_all_ahead():
 
 @pytest.mark.slow
 def test_a_reconstruction_calls_kernels_with_the_types_that_they_name():
-    """Each is compiled once: for one more layout of an array it would be compiled again, for seconds."""
+    """Each is compiled once: for one more layout of an array it would be compiled again, for
+    seconds.
+    """
 
     def loaded() -> dict[str, set]:
-        return {name: set(each.loaded.overloads) for name, each in KERNELS.items() if each.loaded is not None}
+        return {
+            name: set(each.loaded.overloads)
+            for name, each in KERNELS.items()
+            if each.loaded is not None
+        }
 
     scene = built_in_scene(seed=3, frames=12)
     recording, before = simulate(scene, seed=3), loaded()
     check_setup(recording, scene.rig)
     reconstruct(recording, scene.rig, times=FrameTimes.from_fps(scene.fps, len(scene)))
     used = loaded()
-    others = {name: types - {signature(KERNELS[name])} - before.get(name, set()) for name, types in used.items()}
+    others = {
+        name: types - {signature(KERNELS[name])} - before.get(name, set())
+        for name, types in used.items()
+    }
     assert not any(others.values()), others
     assert sum(signature(KERNELS[name]) in types for name, types in used.items()) >= 34

@@ -1,4 +1,6 @@
-"""Decompositions without a choice of LAPACK's: no sign, and no basis of equal values, is left in them."""
+"""Decompositions without a choice of LAPACK's: no sign, and no basis of equal values, is left in
+them.
+"""
 
 import numpy as np
 import pytest
@@ -20,7 +22,9 @@ def turned(rng: np.random.Generator, count: int) -> np.ndarray:
 
 @pytest.mark.parametrize("values", [(1, 2, 3), (2, 2, 2), (0, 1, 1), (0, 0, 0)])
 def test_a_root_is_the_symmetric_one(values):
-    """It is the only root that is symmetric and positive semi-definite, also where eigenvalues are equal."""
+    """It is the only root that is symmetric and positive semi-definite, also where eigenvalues are
+    equal.
+    """
     R = turned(np.random.default_rng(0), 20)
     matrix = R * np.array(values, dtype=float) @ R.mT
     root = symmetric_root(matrix)
@@ -59,7 +63,9 @@ def test_principal_axes_have_one_sign_however_the_covariance_is_rounded():
     # Turned by any of the four half turns that leave the ellipsoid as it is, the axes are the same.
     for signs in ((1, -1, -1), (-1, 1, -1), (-1, -1, 1)):
         half = R * np.array(signs, dtype=float)
-        np.testing.assert_allclose(principal_axes(half * [1.0, 4.0, 9.0] @ half.mT)[1], axes, atol=1e-9)
+        np.testing.assert_allclose(
+            principal_axes(half * [1.0, 4.0, 9.0] @ half.mT)[1], axes, atol=1e-9
+        )
 
 
 def test_the_nearest_rotation_is_one_also_of_what_mirrors():

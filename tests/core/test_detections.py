@@ -76,5 +76,7 @@ def test_a_detection_knows_its_place_among_those_of_its_view():
     none = np.zeros((0, 2), dtype=np.intp)
     every = Detections(view, np.zeros(6, int), np.zeros((6, 2)), np.ones(6), none, np.zeros(0))
     assert every.place.tolist() == [0, 0, 1, 0, 2, 1]
-    assert every.rows(np.array([4, 5, 0])).place.tolist() == [2, 1, 0], "also where others are left out"
+    assert every.rows(np.array([4, 5, 0])).place.tolist() == [2, 1, 0], (
+        "also where others are left out"
+    )
     assert Detections.empty().place.tolist() == []

@@ -19,7 +19,10 @@ def test_a_camera_that_starts_later_and_ends_earlier_cuts_the_others():
     moments = align([clock("a", 30, 100), clock("b", 30, 50, start_s=0.5)], True)
     assert moments.picture[0].tolist() == [15, 0] and moments.picture[-1].tolist() == [64, 49]
     assert moments.notes == (
-        "camera a: frames without a picture of every camera are left out, 15 at the start and 35 at the end",
+        (
+            "camera a: frames without a picture of every camera are left out, 15 at the start "
+            "and 35 at the end"
+        ),
     )
 
 
@@ -32,7 +35,10 @@ def test_of_a_faster_camera_the_nearest_frames_are_taken():
     assert off.max() == pytest.approx(1 / 300, abs=1e-9)
     np.testing.assert_array_equal(moments.picture[:, 1], np.round(np.arange(30) * 100 / 30))
     assert moments.notes == (
-        "camera fast: pictures are up to 3.3 ms from the time of their synchronised frame (2.2 ms on average)",
+        (
+            "camera fast: pictures are up to 3.3 ms from the time of their synchronised frame (2.2 "
+            "ms on average)"
+        ),
     )
     assert not moments.synchronised
 
@@ -61,7 +67,9 @@ def test_the_camera_with_most_frames_tells_the_moments():
 def test_frame_rates_that_vary_are_followed_by_time():
     rng = np.random.default_rng(0)
     phone = np.cumsum(rng.uniform(0.025, 0.042, 200))
-    moments = align([CameraClock("phone", phone, float(np.median(np.diff(phone)))), clock("b", 30, 180)], True)
+    moments = align(
+        [CameraClock("phone", phone, float(np.median(np.diff(phone)))), clock("b", 30, 180)], True
+    )
     assert moments.time_s is not None
     both = (moments.picture >= 0).all(axis=1)
     assert np.abs(np.diff(moments.time_s[both], axis=1)).max() <= 1 / 60 + 1e-3
@@ -69,7 +77,9 @@ def test_frame_rates_that_vary_are_followed_by_time():
 
 
 def test_a_picture_stands_for_one_moment():
-    """29.97 among 30 a second for 100 s: after 16.7 s a picture is as near to one moment as to the next."""
+    """29.97 among 30 a second for 100 s: after 16.7 s a picture is as near to one moment as to the
+    next.
+    """
     moments = align([clock("a", 30, 3000), clock("b", 30000 / 1001, 2997)], True)
     used = moments.picture[moments.picture[:, 1] >= 0, 1]
     assert len(moments) == 3000 and (np.diff(used) == 1).all() and len(used) == 2997
@@ -78,15 +88,23 @@ def test_a_picture_stands_for_one_moment():
 
 
 def test_cameras_without_a_moment_in_common_are_named():
-    with pytest.raises(InputError, match=r"camera a ends at 0\.3 s and camera b starts at 9 s: they have no"):
+    with pytest.raises(
+        InputError, match=r"camera a ends at 0\.3 s and camera b starts at 9 s: they have no"
+    ):
         align([clock("a", 10, 4), clock("b", 10, 4, start_s=9.0)], True)
 
 
 def test_where_nothing_says_when_cameras_began_every_picture_is_kept():
-    """The second is shorter, the third twice as fast: of it every second picture belongs to none."""
-    moments = own_frames([clock("a", 25, 10), clock("b", 25, 4, start_s=0.2), clock("c", 50, 20)], True)
+    """The second is shorter, the third twice as fast: of it every second picture belongs to
+    none.
+    """
+    moments = own_frames(
+        [clock("a", 25, 10), clock("b", 25, 4, start_s=0.2), clock("c", 50, 20)], True
+    )
     own = np.arange(10)
-    np.testing.assert_array_equal(moments.picture, np.stack([own, np.where(own < 4, own, -1), 2 * own], axis=1))
+    np.testing.assert_array_equal(
+        moments.picture, np.stack([own, np.where(own < 4, own, -1), 2 * own], axis=1)
+    )
     assert moments.time_s is not None and not moments.synchronised
     assert np.isnan(moments.time_s[4:, 1]).all() and np.isfinite(moments.time_s[:, [0, 2]]).all()
     assert "4 to 10 frames" in moments.notes[0] and "--start" in moments.notes[0]

@@ -26,9 +26,13 @@ def test_a_dropped_frame_is_a_gap_and_cameras_may_have_times_of_their_own():
     assert apart.as_dict()["per_camera"]
 
 
-@pytest.mark.parametrize("fps", [25, 30, 50, 60, 120, 240, 12.5, 30000 / 1001, 24000 / 1001, 60000 / 1001])
+@pytest.mark.parametrize(
+    "fps", [25, 30, 50, 60, 120, 240, 12.5, 30000 / 1001, 24000 / 1001, 60000 / 1001]
+)
 def test_a_rate_is_recovered_exactly_from_times_of_few_digits(fps):
-    """Microseconds, also with frames dropped; milliseconds over some seconds; and times that jitter."""
+    """Microseconds, also with frames dropped; milliseconds over some seconds; and times that
+    jitter.
+    """
     times, rng = np.arange(5000) / fps, np.random.default_rng(0)
     kept = np.delete(times[:100], [3, 50, 51, 70])
     shaken = times + rng.uniform(-0.1, 0.1, len(times)) / fps
@@ -39,9 +43,16 @@ def test_a_rate_is_recovered_exactly_from_times_of_few_digits(fps):
 
 def test_a_rate_of_no_camera_stays_what_it_is_and_29_97_is_30000_by_1001():
     assert rate_of(np.arange(500) / 29.8123) == pytest.approx(29.8123, abs=1e-6)
-    for typed, exact in ((29.97, 30000 / 1001), (23.976, 24000 / 1001), (59.94, 60000 / 1001), (29.8, 29.8)):
+    for typed, exact in (
+        (29.97, 30000 / 1001),
+        (23.976, 24000 / 1001),
+        (59.94, 60000 / 1001),
+        (29.8, 29.8),
+    ):
         assert FrameTimes.from_fps(typed, 200).as_dict()["fps"] == exact
-        np.testing.assert_array_equal(FrameTimes.from_fps(typed, 200).frame_s, np.arange(200) / exact)
+        np.testing.assert_array_equal(
+            FrameTimes.from_fps(typed, 200).frame_s, np.arange(200) / exact
+        )
 
 
 @pytest.mark.parametrize(
@@ -77,5 +88,7 @@ def test_a_recording_from_cut_to_cut():
     assert segments(range(4, 4), cuts) == []
     assert check_cuts((), 0) == ()
     for wrong in ([0], [20], [3, 3], [5, 2], [1.5], [[1]]):
-        with pytest.raises(ValueError, match="cuts must be increasing frame numbers between 1 and 19"):
+        with pytest.raises(
+            ValueError, match="cuts must be increasing frame numbers between 1 and 19"
+        ):
             check_cuts(wrong, 20)

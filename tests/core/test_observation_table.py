@@ -10,7 +10,9 @@ from shapepose_fg.core.observation_table import Gate, ObservationTable
 
 
 def table() -> ObservationTable:
-    """One person in frames 4 and 6, two joints, two views: a wrist that view B does not see in frame 6."""
+    """One person in frames 4 and 6, two joints, two views: a wrist that view B does not see in
+    frame 6.
+    """
     gate = np.array([[[1, 1], [1, 2]], [[1, 3], [1, 0]]])
     seen = gate > 0
     return ObservationTable(
@@ -33,7 +35,9 @@ def test_the_file_reads_with_numpy_alone(tmp_path):
         assert reason[0].tolist() == [["used", "used"], ["used", "too far"]]
         assert reason[1].tolist() == [["used", "contradicts body"], ["used", "not seen"]]
         assert file["candidate"].tolist() == [[[7, 7], [7, 7]], [[7, 7], [7, -1]]]
-        np.testing.assert_array_equal(np.linalg.norm(file["residual_px"], axis=-1)[1], [[5, 5], [5, np.nan]])
+        np.testing.assert_array_equal(
+            np.linalg.norm(file["residual_px"], axis=-1)[1], [[5, 5], [5, np.nan]]
+        )
     loaded = ObservationTable.load(tmp_path / "observations.npz")
     for name in (*ObservationTable.ROWS, "joint_names", "view_names"):
         np.testing.assert_array_equal(getattr(loaded, name), getattr(table(), name), err_msg=name)
@@ -48,7 +52,9 @@ def test_reasons_are_counted():
 
 def test_rows_and_back_together():
     every = table()
-    back = ObservationTable.concatenate([every.rows(np.array([0])), every.rows(np.array([False, True]))])
+    back = ObservationTable.concatenate(
+        [every.rows(np.array([0])), every.rows(np.array([False, True]))]
+    )
     np.testing.assert_array_equal(back.residual_px, every.residual_px)
     assert len(ObservationTable.concatenate([])) == len(ObservationTable.empty()) == 0
     with pytest.raises(ValueError, match="parts must have the same view_names"):
@@ -64,7 +70,11 @@ def test_rows_and_back_together():
             np.ones((2, 2, 2), int),
             "xy and gate must agree on what was seen, but do not at row 1, wrist, view B",
         ),
-        ("candidate", np.full((2, 2, 2), 3), "candidate and gate must agree .* row 1, wrist, view B"),
+        (
+            "candidate",
+            np.full((2, 2, 2), 3),
+            "candidate and gate must agree .* row 1, wrist, view B",
+        ),
         (
             "xy",
             np.zeros((2, 2, 2, 2)),
@@ -89,7 +99,9 @@ def test_wrong_columns(tmp_path, column, value, message):
     with np.load(file) as archive:
         columns = dict(archive)
     np.savez(file, **(columns | {column: value}))
-    with pytest.raises(InputError, match=f"observations.npz: {message}.*; give the observations.npz"):
+    with pytest.raises(
+        InputError, match=f"observations.npz: {message}.*; give the observations.npz"
+    ):
         ObservationTable.load(file)
 
 
@@ -116,17 +128,23 @@ def test_bad_files(tmp_path, changed, sentence):
 
 
 def test_the_table_of_solved_rows(five_cameras, two_people, seen_exactly):
-    """Detections without error, joints moved by hand: residuals are what the cameras say, reasons as they must."""
+    """Detections without error, joints moved by hand: residuals are what the cameras say, reasons
+    as they must.
+    """
     from shapepose_fg.core.observations import Observations
 
     seen = seen_exactly(five_cameras, two_people)
     candidate = np.full((2, 25, 5), -1)
-    for person in range(2):  # the first detection of a joint in a view is the one, the second the other
+    for person in range(
+        2
+    ):  # the first detection of a joint in a view is the one, the second the other
         for joint in range(25):
             for view in range(5):
                 rows = np.flatnonzero((seen.joint == joint) & (seen.view == view))
                 xy = five_cameras.project(two_people[person, joint][None])[0][view, 0]
-                candidate[person, joint, view] = rows[np.linalg.norm(seen.xy[rows] - xy, axis=1).argmin()]
+                candidate[person, joint, view] = rows[
+                    np.linalg.norm(seen.xy[rows] - xy, axis=1).argmin()
+                ]
     candidate[0, 3, 2] = -1
     observations = replace(Observations.of(candidate, seen, two_people), frame=np.array([7, 7]))
     joints = two_people.copy()
@@ -147,13 +165,19 @@ def test_the_table_of_solved_rows(five_cameras, two_people, seen_exactly):
     assert solved.gate[0, 3, 2] == Gate.NOT_SEEN and solved.candidate[0, 3, 2] == -1
     assert solved.gate[0, 4].tolist() == [1, 2, 1, 1, 1]
     assert (solved.gate[1, 5] == Gate.NOT_PLACED).all() and np.isnan(solved.residual_px[1, 5]).all()
-    assert solved.gate[1, 6, 0] == Gate.BEHIND_CAMERA and np.isnan(solved.residual_px[1, 6, 0]).all()
+    assert (
+        solved.gate[1, 6, 0] == Gate.BEHIND_CAMERA and np.isnan(solved.residual_px[1, 6, 0]).all()
+    )
     still = np.ones((2, 25, 5), dtype=bool)
     still[0, 3, 2] = still[0, 4] = still[1, 5] = still[1, 6] = False
     np.testing.assert_allclose(solved.residual_px[still], 0, atol=1e-4)
-    moved = (five_cameras.project(joints[0, 4][None])[0] - five_cameras.project(two_people[0, 4][None])[0])[:, 0]
+    moved = (
+        five_cameras.project(joints[0, 4][None])[0]
+        - five_cameras.project(two_people[0, 4][None])[0]
+    )[:, 0]
     np.testing.assert_allclose(solved.residual_px[0, 4], moved, rtol=1e-4, atol=1e-4)
-    # The detection that the table names is the one at that place: a reader of the file finds it again.
+    # The detection that the table names is the one at that place: a reader of the file finds it
+    # again.
     for view in range(5):
         own = np.flatnonzero(seen.view == view)
         picked = solved.candidate[0, 10, view]

@@ -1,4 +1,6 @@
-"""A saved result of which some rows are read: they are those of the whole, and the others take no memory."""
+"""A saved result of which some rows are read: they are those of the whole, and the others take no
+memory.
+"""
 
 import tracemalloc
 from dataclasses import replace
@@ -21,7 +23,9 @@ PEOPLE, FRAMES, VIEWS = 3, 400, ("a", "b")
 
 @pytest.fixture(scope="module")
 def result() -> Reconstruction:
-    """1200 rows of random numbers, with observations; person 2 is there in every third frame only."""
+    """1200 rows of random numbers, with observations; person 2 is there in every third frame
+    only.
+    """
     rng = np.random.default_rng(0)
     frame, person = np.divmod(np.arange(PEOPLE * FRAMES), PEOPLE)
     there = (person != 2) | (frame % 3 == 0)
@@ -73,7 +77,9 @@ def same(found: Reconstruction, expected: Reconstruction) -> None:
         np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
     assert found.observations is not None and expected.observations is not None
     for name in (*ObservationTable.ROWS, "view_names"):
-        np.testing.assert_array_equal(getattr(found.observations, name), getattr(expected.observations, name))
+        np.testing.assert_array_equal(
+            getattr(found.observations, name), getattr(expected.observations, name)
+        )
 
 
 @pytest.mark.slow
@@ -130,7 +136,9 @@ def test_rows_in_the_middle_take_the_memory_of_these_rows(folder, result):
 
 def test_what_does_not_fit_in_memory_is_a_sentence(folder, monkeypatch):
     monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=1_000_000))
-    with pytest.raises(InputError, match=r"people\.npz: 934 rows need .* and 1\.0 MB are free; read fewer"):
+    with pytest.raises(
+        InputError, match=r"people\.npz: 934 rows need .* and 1\.0 MB are free; read fewer"
+    ):
         Reconstruction.load(folder)
     with pytest.raises(InputError, match=r"rows need"):
         read_take(folder, up="z")
@@ -139,7 +147,9 @@ def test_what_does_not_fit_in_memory_is_a_sentence(folder, monkeypatch):
 
 
 def test_many_people_in_many_frames_are_a_sentence(folder, monkeypatch):
-    """A place for everybody in every frame: 12,000 people in as many frames took a gigabyte from 83 KB."""
+    """A place for everybody in every frame: 12,000 people in as many frames took a gigabyte from 83
+    KB.
+    """
     monkeypatch.setattr("shapepose_fg.io.export.take._BODY_BYTES", 10**12)
     with pytest.raises(
         InputError, match=r"people\.npz: \d+ people over \d+ frames need .* \(--frames, --person\)"
@@ -148,14 +158,19 @@ def test_many_people_in_many_frames_are_a_sentence(folder, monkeypatch):
 
 
 def test_a_file_that_was_changed_is_one_sentence(folder, tmp_path, result):
-    """Damage in a column is found where the rows are read, and a file of other rows when it is opened."""
+    """Damage in a column is found where the rows are read, and a file of other rows when it is
+    opened.
+    """
     result.save(tmp_path)
     content = bytearray((tmp_path / "people.npz").read_bytes())
     for place in range(len(content) // 8, len(content) // 2, 997):
         content[place] ^= 0x55
     (tmp_path / "people.npz").write_bytes(bytes(content))
     # A column whose head is damaged is found when the file is opened.
-    with pytest.raises(InputError, match=r"^.*people\.npz: ") as caught, Reconstruction.open(tmp_path) as opened:
+    with (
+        pytest.raises(InputError, match=r"^.*people\.npz: ") as caught,
+        Reconstruction.open(tmp_path) as opened,
+    ):
         opened.frames(390, 400)
     assert "\n" not in str(caught.value)
     result.rows(np.arange(5)).save(tmp_path)
@@ -171,10 +186,16 @@ def test_a_part_is_exported_listed_and_shown_as_the_whole_would_be(folder, resul
     monkeypatch.setattr("shapepose_fg.tracking.listing._TOGETHER", 500)
     with Reconstruction.open(folder) as opened:
         listed = list_saved_tracks(opened)
-    without = [[replace(track, stature_m=0.0) for track in each] for each in (listed, list_tracks(result))]
+    without = [
+        [replace(track, stature_m=0.0) for track in each] for each in (listed, list_tracks(result))
+    ]
     assert without[0] == without[1]  # without a body nobody has a height
     monkeypatch.setattr("shapepose_fg.viz.report.writing.MOST_ROWS", 300)
     page = report_of(folder, up="z").read_text()
     assert "every 4th frame" in page
     thin = list_tracks(result.rows(result.frame % 4 == 0), every=4)
-    assert [track.gaps for track in thin] == [0, 0, 33]  # person 2 is in every twelfth frame: 34 of them
+    assert [track.gaps for track in thin] == [
+        0,
+        0,
+        33,
+    ]  # person 2 is in every twelfth frame: 34 of them

@@ -61,7 +61,10 @@ def test_saved_and_loaded_is_the_same(tmp_path):
         loaded = Reconstruction.load(path)
         assert_same(loaded, original)
         assert loaded.run == original.run
-    assert sorted(file.name for file in (tmp_path / "new" / "folder").iterdir()) == ["people.npz", "run.json"]
+    assert sorted(file.name for file in (tmp_path / "new" / "folder").iterdir()) == [
+        "people.npz",
+        "run.json",
+    ]
 
 
 def test_file_has_the_columns_that_are_promised_and_nothing_pickled(tmp_path):
@@ -71,7 +74,12 @@ def test_file_has_the_columns_that_are_promised_and_nothing_pickled(tmp_path):
         assert file["joint_names"].tolist()[:4] == ["Nose", "Neck", "RShoulder", "RElbow"]
         assert file["status"].tolist() == ["ok", "body undetermined", "body undetermined"]
         assert file["frame"].dtype == np.int64
-        assert file["known_names"][file["known"][0, 3:7]].tolist() == ["seen", "unknown", "body", "motion"]
+        assert file["known_names"][file["known"][0, 3:7]].tolist() == [
+            "seen",
+            "unknown",
+            "body",
+            "motion",
+        ]
     assert shapes == {
         "frame": (3,),
         "person": (3,),
@@ -103,7 +111,9 @@ def test_rows_of_a_frame_and_back_together():
     every = people([0, 0, 3, 7])
     assert [len(every.at(frame)) for frame in (0, 1, 3, 7)] == [2, 0, 1, 1]
     np.testing.assert_array_equal(every.at(3).joints[0], every.joints[2])
-    assert_same(Reconstruction.concatenate([every.at(0), every.at(1), every.at(3), every.at(7)]), every)
+    assert_same(
+        Reconstruction.concatenate([every.at(0), every.at(1), every.at(3), every.at(7)]), every
+    )
     assert every.at(3).run == every.run
 
 
@@ -127,7 +137,11 @@ def test_run_may_hold_arrays_and_paths(tmp_path):
         ("known", np.full((2, 25), 300), "known must hold 0 to 255, got 300 to 300"),
         ("known", np.full((2, 25), 1.0), "known must hold uint8 values, got float64"),
         ("time_s", np.zeros(3), r"time_s must be \(2,\), got \(3,\)"),
-        ("velocity_covariance", np.zeros((2, 25, 3)), r"velocity_covariance must be \(2, 25, 3, 3\)"),
+        (
+            "velocity_covariance",
+            np.zeros((2, 25, 3)),
+            r"velocity_covariance must be \(2, 25, 3, 3\)",
+        ),
         ("status", np.array([Status.OK, None]), "status must hold .* values, got object"),
     ],
 )
@@ -145,7 +159,9 @@ def test_parts_of_other_skeletons_do_not_mix():
 def columns_of(people: Reconstruction) -> dict[str, np.ndarray]:
     """What people.npz holds."""
     names = np.array([kind.name.lower() for kind in Known])
-    return {name: getattr(people, name) for name in (*Reconstruction.ROWS, "joint_names")} | {"known_names": names}
+    return {name: getattr(people, name) for name in (*Reconstruction.ROWS, "joint_names")} | {
+        "known_names": names
+    }
 
 
 def write_bad(path, kind: str) -> None:
@@ -164,7 +180,14 @@ def write_bad(path, kind: str) -> None:
     elif kind == "other codes":
         np.savez(path, **(columns_of(people([0])) | {"known_names": np.array(["seen", "guessed"])}))
     elif kind == "no code names":
-        np.savez(path, **{name: column for name, column in columns_of(people([0])).items() if "names" not in name})
+        np.savez(
+            path,
+            **{
+                name: column
+                for name, column in columns_of(people([0])).items()
+                if "names" not in name
+            },
+        )
     elif kind == "cut":
         people([0]).save(path.parent)
         path.write_bytes(path.read_bytes()[:1000])
@@ -176,19 +199,31 @@ def write_bad(path, kind: str) -> None:
 @pytest.mark.parametrize(
     ("kind", "sentence"),
     [
-        ("missing", "there is no such file; give the people.npz of a reconstruction, or run one first"),
+        (
+            "missing",
+            "there is no such file; give the people.npz of a reconstruction, or run one first",
+        ),
         ("text", "cannot be read as an .npz file without pickled objects"),
         ("array", "cannot be read as an .npz file"),
         ("cut", "cannot be read as an .npz file"),
         ("zip", "cannot be read as an .npz file"),
         (
             "pickled",
-            "cannot be read as an .npz file without pickled objects (frame.npy holds object, neither numbers",
+            (
+                "cannot be read as an .npz file without pickled objects (frame.npy holds object, "
+                "neither numbers"
+            ),
         ),
         ("other columns", "column frame is missing; give the people.npz of a reconstruction"),
-        ("other codes", "known_names are not those of this version; give the people.npz of a reconstruction"),
+        (
+            "other codes",
+            "known_names are not those of this version; give the people.npz of a reconstruction",
+        ),
         ("no code names", "column joint_names is missing"),
-        ("wrong shape", "betas must be (1, 10), got (1, 11); give the people.npz of a reconstruction"),
+        (
+            "wrong shape",
+            "betas must be (1, 10), got (1, 11); give the people.npz of a reconstruction",
+        ),
     ],
 )
 def test_bad_files(tmp_path, kind, sentence):
@@ -270,9 +305,17 @@ ADDED = ("time_s", "velocity", "velocity_covariance", "known")
 
 def test_columns_that_are_not_given_are_unknown():
     old = people([0, 3])
-    columns = {name: getattr(old, name) for name in (*Reconstruction.ROWS, "joint_names") if name not in ADDED}
+    columns = {
+        name: getattr(old, name)
+        for name in (*Reconstruction.ROWS, "joint_names")
+        if name not in ADDED
+    }
     new = Reconstruction(**columns)
-    assert np.isnan(new.time_s).all() and np.isnan(new.velocity).all() and np.isnan(new.velocity_covariance).all()
+    assert (
+        np.isnan(new.time_s).all()
+        and np.isnan(new.velocity).all()
+        and np.isnan(new.velocity_covariance).all()
+    )
     assert new.velocity_covariance.shape == (2, 25, 3, 3)
     assert (new.known == Known.UNKNOWN).all()
 
@@ -280,7 +323,11 @@ def test_columns_that_are_not_given_are_unknown():
 def test_files_of_the_first_version_still_load(tmp_path):
     """What 0.1.0 wrote: no times, velocities, or ways of knowing."""
     old = people([0, 3])
-    columns = {name: getattr(old, name) for name in (*Reconstruction.ROWS, "joint_names") if name not in ADDED}
+    columns = {
+        name: getattr(old, name)
+        for name in (*Reconstruction.ROWS, "joint_names")
+        if name not in ADDED
+    }
     np.savez_compressed(tmp_path / "people.npz", **columns)
     loaded = Reconstruction.load(tmp_path)
     np.testing.assert_array_equal(loaded.joints, old.joints)
@@ -305,9 +352,13 @@ def part(rows: list[int], **run) -> Reconstruction:
 
 def test_the_run_of_parts_put_together():
     settings = {"candidates": {"gate_m": 0.1}}
-    early = part([100], frames=[100, 200], configuration=settings, seconds={"vote": 1.0}, people={"found": 1})
+    early = part(
+        [100], frames=[100, 200], configuration=settings, seconds={"vote": 1.0}, people={"found": 1}
+    )
     late = part([200, 201], frames=[200, 300], configuration=settings, people={"found": 2})
-    far = part([500], frames=[500, 510], configuration=settings, versions={"numpy": "9"}, inputs={"a": "x"})
+    far = part(
+        [500], frames=[500, 510], configuration=settings, versions={"numpy": "9"}, inputs={"a": "x"}
+    )
     both = Reconstruction.concatenate([late, early])
     assert both.frame.tolist() == [200, 201, 100]
     assert both.run == {
@@ -322,7 +373,8 @@ def test_the_run_of_parts_put_together():
     assert three["frames"] == [[100, 300], [500, 510]]
     assert three["inputs"] == {"a": "x"}
     assert three["parts"][2] == {"frames": [500, 510], "versions": {"numpy": "9"}}
-    # Parts of one run are that run, a part that found nobody still covered its frames, and nobody has no say.
+    # Parts of one run are that run, a part that found nobody still covered its frames, and nobody
+    # has no say.
     assert Reconstruction.concatenate([early, early.at(7)]).run == early.run
     nobody = replace(Reconstruction.empty(), run={"frames": [200, 210], "configuration": settings})
     assert Reconstruction.concatenate([early, nobody]).run["frames"] == [100, 210]
@@ -338,8 +390,16 @@ def test_the_run_of_parts_put_together():
             {"configuration": {"refine": {"settled_m": 0.2}}},
             "same configuration, but refine.settled_m differs",
         ),
-        ({"frames": [0, 10]}, {"frames": [9, 12]}, "must not overlap, but two of them cover frame 9"),
-        ({"frames": [0, 10]}, {"frames": 9}, r'"frames" must be \[start, stop\] or a list of those, got 9'),
+        (
+            {"frames": [0, 10]},
+            {"frames": [9, 12]},
+            "must not overlap, but two of them cover frame 9",
+        ),
+        (
+            {"frames": [0, 10]},
+            {"frames": 9},
+            r'"frames" must be \[start, stop\] or a list of those, got 9',
+        ),
         ({"inputs": {"a": "x"}}, {"inputs": {"a": "y"}}, "a changed between two of them"),
     ],
 )
@@ -374,7 +434,9 @@ def with_observations(frames: list[int], seed: int = 0) -> Reconstruction:
 def test_observations_go_with_their_rows(tmp_path):
     every = with_observations([0, 0, 3, 7])
     picked = every.rows(np.array([3, 1]))
-    np.testing.assert_array_equal(picked.observations.candidate, every.observations.candidate[[3, 1]])
+    np.testing.assert_array_equal(
+        picked.observations.candidate, every.observations.candidate[[3, 1]]
+    )
     back = Reconstruction.concatenate([every.at(frame) for frame in (0, 3, 7)])
     np.testing.assert_array_equal(back.observations.gate, every.observations.gate)
     assert Reconstruction.concatenate([every, Reconstruction.empty()]).observations is not None
@@ -384,7 +446,9 @@ def test_observations_go_with_their_rows(tmp_path):
     with pytest.raises(ValueError, match="observations must have the same person as the people"):
         replace(every, person=np.array([5, 6, 5, 5]))
     every.save(tmp_path)
-    np.testing.assert_array_equal(Reconstruction.load(tmp_path).observations.xy, every.observations.xy)
+    np.testing.assert_array_equal(
+        Reconstruction.load(tmp_path).observations.xy, every.observations.xy
+    )
 
 
 def test_observations_of_an_earlier_result_do_not_stay(tmp_path):
@@ -393,14 +457,18 @@ def test_observations_of_an_earlier_result_do_not_stay(tmp_path):
     people([0, 0]).save(tmp_path)
     assert sorted(file.name for file in tmp_path.iterdir()) == ["people.npz", "run.json"]
     observed([0, 5]).save(tmp_path / "observations.npz")
-    with pytest.raises(InputError, match=r"observations.npz: observations must have the same frame .* delete it"):
+    with pytest.raises(
+        InputError, match=r"observations.npz: observations must have the same frame .* delete it"
+    ):
         Reconstruction.load(tmp_path)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("file", ["people.npz", "observations.npz"])
 def test_a_file_that_is_damaged_anywhere_is_one_sentence_or_none(tmp_path, file):
-    """300 files with a few bytes changed, lost or doubled: each loads, or says in one sentence what it is."""
+    """300 files with a few bytes changed, lost or doubled: each loads, or says in one sentence what
+    it is.
+    """
     with_observations([0, 0, 3]).save(tmp_path)
     path, rng = tmp_path / file, np.random.default_rng(0)
     whole, refused = path.read_bytes(), 0
@@ -459,5 +527,8 @@ def test_entries_of_run_json_that_are_read_again(tmp_path, run, sentence):
 def test_files_from_before_weak_joints_had_a_code_still_load(tmp_path):
     """Their codes keep their meaning, and observations without a probability count as certain."""
     old = people([0, 3])
-    np.savez(tmp_path / "people.npz", **(columns_of(old) | {"known_names": columns_of(old)["known_names"][:4]}))
+    np.savez(
+        tmp_path / "people.npz",
+        **(columns_of(old) | {"known_names": columns_of(old)["known_names"][:4]}),
+    )
     np.testing.assert_array_equal(Reconstruction.load(tmp_path).known, old.known)

@@ -1,4 +1,6 @@
-"""Cameras that stop, or show pictures twice: what they repeat is left out, named, and does no harm."""
+"""Cameras that stop, or show pictures twice: what they repeat is left out, named, and does no
+harm.
+"""
 
 from dataclasses import replace
 
@@ -29,7 +31,9 @@ def recording(scene):
 
 
 def showing(recording: Recording, view: int, pictures) -> Recording:
-    """The recording whose camera `view` shows in each frame what it saw in the frame `pictures` (T,)."""
+    """The recording whose camera `view` shows in each frame what it saw in the frame `pictures`
+    (T,).
+    """
     frames = []
     for own, shown in zip(recording.frames, pictures, strict=True):
         other = recording.frames[shown]
@@ -48,7 +52,9 @@ def stopped(recording) -> Recording:
 
 def errors(people: Reconstruction, scene) -> np.ndarray:
     """(N, J) distance of each row's joints from those of the nearest person, metres."""
-    every = np.linalg.norm(people.joints[:, None] - scene.keypoints[people.frame], axis=-1)  # (N, P, J)
+    every = np.linalg.norm(
+        people.joints[:, None] - scene.keypoints[people.frame], axis=-1
+    )  # (N, P, J)
     return every[np.arange(len(people)), np.nanmedian(every, axis=2).argmin(axis=1)]
 
 
@@ -85,7 +91,9 @@ def test_another_number_order_or_digit_is_a_new_picture(recording):
 
     assert repeated_views(before, frame(before), 4).tolist() == [False, True, False, False]
     assert not repeated_views(before, frame(replace(before, xy=digit)), 4).any()
-    assert not repeated_views(before, frame(before.only(np.arange(len(before)) != mine[5])), 4).any()
+    assert not repeated_views(
+        before, frame(before.only(np.arange(len(before)) != mine[5])), 4
+    ).any()
     assert not repeated_views(before, rest, 4).any()  # a view without detections repeats nothing
     few = before.only((before.view != 1) | np.isin(np.arange(len(before)), mine[:2]))
     assert not repeated_views(few, frame(few), 4).any()  # the odd detection may stand still
@@ -98,8 +106,9 @@ def test_where_nothing_moves_nothing_is_left_out(recording):
 
 @pytest.mark.slow
 def test_cameras_that_stop_do_no_harm(scene, recording):
-    """Two of four cameras stop after five frames. Believed, they put joints 10 cm off in the median, and 9 % of
-    those with a sigma under 3 cm by more than 20 cm; left out, it is 25 mm, of two cameras.
+    """Two of four cameras stop after five frames. Believed, they put joints 10 cm off in the
+    median, and 9 % of those with a sigma under 3 cm by more than 20 cm; left out, it is 25 mm, of
+    two cameras.
     """
     for view in (1, 3):
         recording = showing(recording, view, np.minimum(np.arange(FRAMES), 4))
@@ -108,8 +117,13 @@ def test_cameras_that_stop_do_no_harm(scene, recording):
     table = people.observations
     assert table is not None
     late = table.frame > 4
-    assert (table.candidate[late][..., [1, 3]] == -1).all() and (table.candidate[~late][..., 1] >= 0).any()
-    error, sigma = errors(people, scene), np.sqrt(np.trace(people.covariance, axis1=-2, axis2=-1) / 3)
+    assert (table.candidate[late][..., [1, 3]] == -1).all() and (
+        table.candidate[~late][..., 1] >= 0
+    ).any()
+    error, sigma = (
+        errors(people, scene),
+        np.sqrt(np.trace(people.covariance, axis1=-2, axis2=-1) / 3),
+    )
     claimed = (sigma < 0.03) & np.isfinite(error)
     assert len(people) == 2 * FRAMES and np.nanmedian(error) < 0.035
     assert claimed.sum() > 1500 and error[claimed].max() < 0.2
@@ -129,7 +143,9 @@ def test_the_check_names_a_camera_that_stops(scene, recording, stopped):
 
 
 @pytest.mark.slow
-def test_a_camera_that_stands_still_from_the_first_frame_is_not_said_to_see_nobody(scene, recording):
+def test_a_camera_that_stands_still_from_the_first_frame_is_not_said_to_see_nobody(
+    scene, recording
+):
     frozen = showing(recording, 1, np.zeros(FRAMES, dtype=int))
     kinds = [each.kind for each in check_setup(frozen, scene.rig).findings]
     assert kinds == [Kind.STOPPED]

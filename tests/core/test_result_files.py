@@ -27,13 +27,21 @@ def written(columns) -> bytes:
 def test_pieces_leave_the_same_bytes_as_a_whole_and_numpy_reads_them():
     """Pieces of odd lengths, beyond the megabyte that the compressor is given at a time."""
     rng = np.random.default_rng(0)
-    arrays = {"joints": rng.normal(size=(3001, 25, 3)), "status": np.array(["ok", "too few views"] * 7)}
+    arrays = {
+        "joints": rng.normal(size=(3001, 25, 3)),
+        "status": np.array(["ok", "too few views"] * 7),
+    }
     arrays |= {
         "none": np.zeros((0, 3), dtype=np.uint8),
         "id": np.array("abc"),
         "turned": rng.normal(size=(4, 6)).T,
     }
-    cuts = {"joints": [0, 1, 1700, 1700, 3001], "status": [0, 14], "none": [0, 0], "turned": [0, 2, 6]}
+    cuts = {
+        "joints": [0, 1, 1700, 1700, 3001],
+        "status": [0, 14],
+        "none": [0, 0],
+        "turned": [0, 2, 6],
+    }
     pieces = {
         name: Pieces(
             array.dtype,
@@ -100,8 +108,12 @@ def _id(folder) -> str:
     return json.loads((folder / "run.json").read_text())["run_id"]
 
 
-def test_a_disk_that_is_full_at_any_write_leaves_the_old_files_and_is_named(two_results, monkeypatch):
-    """A write fails behind so many bytes; all three files are as they were, and nothing else is there."""
+def test_a_disk_that_is_full_at_any_write_leaves_the_old_files_and_is_named(
+    two_results, monkeypatch
+):
+    """A write fails behind so many bytes; all three files are as they were, and nothing else is
+    there.
+    """
     a = two_results / "a"
     old = {file.name: file.read_bytes() for file in a.iterdir()}
     new = Reconstruction.load(two_results / "b")

@@ -29,7 +29,10 @@ class Walk(Table):
 def walk(rows: int = 2) -> Walk:
     frame = np.arange(rows)
     return Walk(
-        frame, np.array(["left", "right"]), np.arange(rows * 6.0).reshape(rows, 2, 3), np.ones((rows, 2), int)
+        frame,
+        np.array(["left", "right"]),
+        np.arange(rows * 6.0).reshape(rows, 2, 3),
+        np.ones((rows, 2), int),
     )
 
 
@@ -46,7 +49,10 @@ def walk(rows: int = 2) -> Walk:
 )
 def test_what_does_not_fit_is_named(column, value, message):
     with pytest.raises(ValueError, match=message):
-        Walk(**{name: getattr(walk(), name) for name in ("frame", "feet", "place", "gait")} | {column: value})
+        Walk(
+            **{name: getattr(walk(), name) for name in ("frame", "feet", "place", "gait")}
+            | {column: value}
+        )
 
 
 def test_rows_are_picked_and_joined():
@@ -80,7 +86,11 @@ def test_a_file_gives_the_table_back_and_earlier_files_lack_what_came_later(tmp_
 @pytest.mark.parametrize(
     ("column", "value", "message"),
     [
-        ("place", np.full((2, 2, 3), 2e3), r"place must be at most 1000 or unknown \(NaN\), got 2000"),
+        (
+            "place",
+            np.full((2, 2, 3), 2e3),
+            r"place must be at most 1000 or unknown \(NaN\), got 2000",
+        ),
         ("frame", np.array([0, -1]), "frame must not be negative, got -1"),
         (
             "place",

@@ -39,7 +39,9 @@ def test_every_skeleton_is_one_tree_on_its_limbs_and_mirrors_itself(skeleton):
         assert parent < 0 or skeleton.adjacency[joint, parent] == 1
     mirror = np.array(skeleton.mirror)
     np.testing.assert_array_equal(mirror[mirror], np.arange(len(skeleton)))
-    wanted = [BODY_25.joints[joint] for joint in BODY_25.core if BODY_25.joints[joint] in skeleton.joints]
+    wanted = [
+        BODY_25.joints[joint] for joint in BODY_25.core if BODY_25.joints[joint] in skeleton.joints
+    ]
     assert [skeleton.joints[joint] for joint in skeleton.core] == wanted and len(wanted) >= 14
     assert {skeleton.joints[hip] for hip in skeleton.hips} == {"RHip", "LHip"}
     assert skeleton.joints[skeleton.root] == "MidHip"
@@ -75,7 +77,11 @@ def test_target_skeletons_have_the_detectors_order():
 
 
 def test_an_anchor_needs_two_joints_that_mirror_each_other_beside_it():
-    parts = {"limbs": [("A", "B"), ("B", "LC"), ("B", "RC")], "mirror": [("RC", "LC")], "core": ["A", "B"]}
+    parts = {
+        "limbs": [("A", "B"), ("B", "LC"), ("B", "RC")],
+        "mirror": [("RC", "LC")],
+        "core": ["A", "B"],
+    }
     assert Skeleton.of("four", ["A", "B", "LC", "RC"], anchor="B", **parts).parents == (1, -1, 1, 1)
     with pytest.raises(ValueError, match="two joints next to the anchor A must be left and right"):
         Skeleton.of("four", ["A", "B", "LC", "RC"], anchor="A", **parts)

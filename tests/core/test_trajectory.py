@@ -18,7 +18,9 @@ def turned(degrees: float, x: float, y: float = 0.0) -> NDArray[np.float64]:
     return np.array([[c, -s, 0, x], [s, c, 0, y], [0, 0, 1, 0], [0, 0, 0, 1.0]])
 
 
-ROBOT = Trajectory("robot", np.array([0.0, 0.4, 0.8]), np.stack([turned(0, 0), turned(90, 1), turned(90, 1, 2)]))
+ROBOT = Trajectory(
+    "robot", np.array([0.0, 0.4, 0.8]), np.stack([turned(0, 0), turned(90, 1), turned(90, 1, 2)])
+)
 
 
 @pytest.fixture(scope="session")
@@ -33,9 +35,13 @@ def with_robot(five_cameras) -> Rig:
 
 def test_between_two_poses_it_goes_straight_and_turns_about_one_axis():
     np.testing.assert_allclose(
-        ROBOT.at(np.array([0.1, 0.4, 0.6])), [turned(22.5, 0.25), turned(90, 1), turned(90, 1, 1)], atol=1e-12
+        ROBOT.at(np.array([0.1, 0.4, 0.6])),
+        [turned(22.5, 0.25), turned(90, 1), turned(90, 1, 1)],
+        atol=1e-12,
     )
-    np.testing.assert_allclose(ROBOT.at(np.array([-1.0, 9.0])), [turned(0, 0), turned(90, 1, 2)], atol=1e-12)
+    np.testing.assert_allclose(
+        ROBOT.at(np.array([-1.0, 9.0])), [turned(0, 0), turned(90, 1, 2)], atol=1e-12
+    )
 
 
 def test_covariances_are_interpolated():
@@ -75,7 +81,9 @@ def test_a_rig_of_a_moment_has_its_cameras_on_the_robot(with_robot, five_cameras
     assert five_cameras.at(time_s) is five_cameras
     np.testing.assert_array_equal(there.cTw[:3], five_cameras.cTw[:3])
     np.testing.assert_allclose(there.cameras[3].wTc, turned(90, 1) @ turned(5, 0, 0.25), atol=1e-12)
-    np.testing.assert_allclose(there.cameras[4].wTc, turned(22.5, 0.25) @ turned(5, 0, -0.25), atol=1e-12)
+    np.testing.assert_allclose(
+        there.cameras[4].wTc, turned(22.5, 0.25) @ turned(5, 0, -0.25), atol=1e-12
+    )
 
 
 def test_views_of_rows_are_those_of_their_moments(with_robot, two_people):
@@ -83,7 +91,9 @@ def test_views_of_rows_are_those_of_their_moments(with_robot, two_people):
     views = Views.of(with_robot, time_s)
     for row in range(2):
         xy, _ = with_robot.at(time_s[row]).project(two_people[row])
-        np.testing.assert_allclose(views.pixels(two_people)[0][row], np.moveaxis(xy, 0, 1), atol=1e-8)
+        np.testing.assert_allclose(
+            views.pixels(two_people)[0][row], np.moveaxis(xy, 0, 1), atol=1e-8
+        )
     assert views.carried is not None
     np.testing.assert_array_equal(views.carried.carrier, [-1, -1, -1, 0, 0])
     with pytest.raises(ValueError, match="give time_s"):

@@ -25,15 +25,23 @@ def paint(camera: Camera, joints: np.ndarray, size: tuple[int, int] | None = Non
     picture = np.zeros((camera.image_size[1], camera.image_size[0], 3), dtype=np.uint8)
     for person in joints:
         xy = camera.distort(camera.project(person)[0])
-        for (x, y), code in zip(np.round(xy * 16).astype(int).tolist(), CODES.tolist(), strict=True):
+        for (x, y), code in zip(
+            np.round(xy * 16).astype(int).tolist(), CODES.tolist(), strict=True
+        ):
             cv2.circle(picture, (x, y), 7 * 16, code, -1, cv2.LINE_8, 4)
-    return picture if size is None else np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
+    return (
+        picture
+        if size is None
+        else np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
+    )
 
 
 def see_discs(blob: np.ndarray) -> np.ndarray:
-    """What a network for such pictures gives: of each cell and joint the share of pixels with its colour.
+    """What a network for such pictures gives: of each cell and joint the share of pixels with its
+    colour.
 
-    Neighbours are mixed in, so that peaks are as smooth as a network's. Fields of affinity are empty.
+    Neighbours are mixed in, so that peaks are as smooth as a network's. Fields of affinity are
+    empty.
     """
     picture = (blob[0] + 0.5) * 256  # the layout's own scaling undone
     level = np.rint(picture / 127.5)
@@ -57,9 +65,15 @@ def painted_network() -> HeatMapNetwork:
 
 @pytest.fixture(scope="session")
 def rolled_rig() -> Rig:
-    """Three cameras around the origin, the second rolled by 30 degrees, the third with a lens that bends."""
+    """Three cameras around the origin, the second rolled by 30 degrees, the third with a lens that
+    bends.
+    """
     cameras = []
-    for name, angle, roll, distortion in (("a", 0, 0, 0), ("b", 100, 30, 0), ("c", 200, -15, -0.12)):
+    for name, angle, roll, distortion in (
+        ("a", 0, 0, 0),
+        ("b", 100, 30, 0),
+        ("c", 200, -15, -0.12),
+    ):
         eye = 4.0 * np.array([np.cos(np.radians(angle)), np.sin(np.radians(angle)), 0.4])
         wTc = look_at(eye, np.array([0, 0, 0.9]), np.array([0.0, 0, 1]))
         c, s = np.cos(np.radians(roll)), np.sin(np.radians(roll))
@@ -70,23 +84,32 @@ def rolled_rig() -> Rig:
 
 
 def onnx_file(path: Path, weights: np.ndarray, fixed: tuple[int, int] | None = None) -> Path:
-    """An ONNX file of one convolution with a stride of its kernel's size: `weights` (out, 3, k, k)."""
+    """An ONNX file of one convolution with a stride of its kernel's size: `weights` (out, 3, k,
+    k).
+    """
     side = weights.shape[2]
     nodes = [node("Conv", "x w", "y", kernel_shape=[side] * 2, strides=[side] * 2)]
     height, width = fixed or ("h", "w")
-    return onnx_model(path, nodes, {"w": weights}, (1, 3, height, width), {"y": (1, len(weights), "p", "q")})
+    return onnx_model(
+        path, nodes, {"w": weights}, (1, 3, height, width), {"y": (1, len(weights), "p", "q")}
+    )
 
 
-def onnx_model(path: Path, nodes: list[bytes], weights: dict[str, np.ndarray], takes: Sides, gives: dict) -> Path:
+def onnx_model(
+    path: Path, nodes: list[bytes], weights: dict[str, np.ndarray], takes: Sides, gives: dict
+) -> Path:
     """An ONNX file that takes x of the shape `takes` and gives arrays of known names and shapes.
 
-    Written by hand, after the format's own description (onnx.proto), so that no test needs the package onnx.
+    Written by hand, after the format's own description (onnx.proto), so that no test needs the
+    package onnx.
     """
     graph = b"".join(blob(1, each) for each in nodes) + blob(2, b"g")
     for name, array in weights.items():
         whole = array.dtype.kind == "i"
         tensor = (
-            b"".join(varint(1, n) for n in array.shape) + varint(2, 7 if whole else 1) + blob(8, name.encode())
+            b"".join(varint(1, n) for n in array.shape)
+            + varint(2, 7 if whole else 1)
+            + blob(8, name.encode())
         )
         graph += blob(5, tensor + blob(9, array.astype("<i8" if whole else "<f4").tobytes()))
     graph += blob(11, _value("x", takes))
@@ -97,12 +120,20 @@ def onnx_model(path: Path, nodes: list[bytes], weights: dict[str, np.ndarray], t
 
 
 def node(operator: str, takes: str, gives: str, **attributes: int | list[int]) -> bytes:
-    """A step of a network: names of what it takes and gives, separated by blanks, and its attributes."""
+    """A step of a network: names of what it takes and gives, separated by blanks, and its
+    attributes.
+    """
     content = b"".join(blob(1, name.encode()) for name in takes.split())
-    content += b"".join(blob(2, name.encode()) for name in gives.split()) + blob(4, operator.encode())
+    content += b"".join(blob(2, name.encode()) for name in gives.split()) + blob(
+        4, operator.encode()
+    )
     for name, value in attributes.items():
         whole = varint(3, value) + varint(20, 2) if isinstance(value, int) else b""
-        several = b"".join(varint(8, n) for n in value) + varint(20, 7) if isinstance(value, list) else b""
+        several = (
+            b"".join(varint(8, n) for n in value) + varint(20, 7)
+            if isinstance(value, list)
+            else b""
+        )
         content += blob(5, blob(1, name.encode()) + whole + several)
     return content
 
@@ -124,13 +155,18 @@ def blob(field: int, content: bytes) -> bytes:
 
 def _value(name: str, shape: Sides, *, whole: bool = False) -> bytes:
     sides = b"".join(
-        blob(1, blob(2, side.encode()) if isinstance(side, str) else varint(1, side)) for side in shape
+        blob(1, blob(2, side.encode()) if isinstance(side, str) else varint(1, side))
+        for side in shape
     )
     return blob(1, name.encode()) + blob(2, blob(1, varint(1, 7 if whole else 1) + blob(2, sides)))
 
 
-def rtmpose_file(path: Path, joints: int, size: tuple[int, int], seed: int, batch: int | str = "batch") -> Path:
-    """A network with RTMPose's input and outputs, of random weights; its curves depend on all of the crop."""
+def rtmpose_file(
+    path: Path, joints: int, size: tuple[int, int], seed: int, batch: int | str = "batch"
+) -> Path:
+    """A network with RTMPose's input and outputs, of random weights; its curves depend on all of
+    the crop.
+    """
     rng, (width, height) = np.random.default_rng(seed), size
     cells = width * height // 256
     weights = {
@@ -149,8 +185,12 @@ def rtmpose_file(path: Path, joints: int, size: tuple[int, int], seed: int, batc
     return onnx_model(path, nodes, weights, (batch, 3, height, width), gives)
 
 
-def yolox_file(path: Path, size: tuple[int, int], seed: int, classes: int = 1, suppressed: bool = False) -> Path:
-    """A network with YOLOX's input and outputs, `suppressed` as mmdeploy exports it: boxes that overlap a lot."""
+def yolox_file(
+    path: Path, size: tuple[int, int], seed: int, classes: int = 1, suppressed: bool = False
+) -> Path:
+    """A network with YOLOX's input and outputs, `suppressed` as mmdeploy exports it: boxes that
+    overlap a lot.
+    """
     rng, (width, height) = np.random.default_rng(seed), size
     steps = (32,) if suppressed else (8, 16, 32)
     nodes, weights, grids = [], {"flat": np.array([1, 5 + classes - suppressed, -1])}, []
@@ -172,13 +212,16 @@ def yolox_file(path: Path, size: tuple[int, int], seed: int, classes: int = 1, s
         grids.append(f"grid{step}")
     count = sum((width // step) * (height // step) for step in steps)
     last = "moved" if suppressed else "dets"
-    nodes += [node("Concat", " ".join(grids), "every", axis=2), node("Transpose", "every", last, perm=[0, 2, 1])]
+    nodes += [
+        node("Concat", " ".join(grids), "every", axis=2),
+        node("Transpose", "every", last, perm=[0, 2, 1]),
+    ]
     gives: dict[str, Sides] = {"dets": (1, count, 4 + 1 + classes - suppressed)}
     if suppressed:
         low = rng.uniform(0, 0.7, (count, 2)) * size
-        weights["base"] = np.hstack([low, low + rng.uniform(0.1, 0.3, (count, 2)) * size, np.zeros((count, 1))])[
-            None
-        ]
+        weights["base"] = np.hstack(
+            [low, low + rng.uniform(0.1, 0.3, (count, 2)) * size, np.zeros((count, 1))]
+        )[None]
         weights["given"] = np.arange(count)[None] % classes
         nodes += [node("Add", "moved base", "dets"), node("Identity", "given", "labels")]
         gives["labels"] = (1, count)

@@ -1,7 +1,8 @@
 """Boxes and joints against `rtmlib` 0.0.16 on the same made ONNX files and pictures.
 
-rtmlib is no dependency, as it asks for two other OpenCVs: to run this, `pip install --no-deps --target DIR rtmlib
-tqdm` and add DIR to PYTHONPATH. Of 1905 made people boxes were equal, joints to 1e-12 pixels.
+rtmlib is no dependency, as it asks for two other OpenCVs: to run this, `pip install --no-deps
+--target DIR rtmlib tqdm` and add DIR to PYTHONPATH. Of 1905 made people boxes were equal, joints to
+1e-12 pixels.
 """
 
 import itertools
@@ -15,7 +16,9 @@ from shapepose_fg.detection2d.opening import open_network
 from shapepose_fg.detection2d.top_down import TopDownNetwork
 from tests.detection2d.conftest import rtmpose_file, yolox_file
 
-rtmlib = pytest.importorskip("rtmlib", reason="rtmlib is the reference of a development-only environment")
+rtmlib = pytest.importorskip(
+    "rtmlib", reason="rtmlib is the reference of a development-only environment"
+)
 pytest.importorskip("onnxruntime", reason="onnxruntime is an extra: shapepose-fg[detect]")
 
 SIZES = ((640, 480), (1920, 1080), (1080, 1920), (640, 640))
@@ -25,7 +28,9 @@ SIZES = ((640, 480), (1920, 1080), (1080, 1920), (640, 640))
 @pytest.mark.parametrize("suppressed", [False, True])
 @pytest.mark.parametrize("shown, boxed", [((192, 256), (416, 416)), ((288, 384), (640, 640))])
 def test_boxes_and_joints_are_rtmlib_s(tmp_path: Path, monkeypatch, shown, boxed, suppressed):
-    monkeypatch.setattr("shapepose_fg.detection2d.boxes._MOST_PEOPLE", 1000)  # rtmlib has no such bound
+    monkeypatch.setattr(
+        "shapepose_fg.detection2d.boxes._MOST_PEOPLE", 1000
+    )  # rtmlib has no such bound
     rng, people, off = np.random.default_rng(0), 0, []
     for seed, (width, height) in itertools.product(range(2), SIZES):
         pose = rtmpose_file(tmp_path / f"pose{seed}.onnx", 26, shown, seed)
@@ -48,5 +53,7 @@ def test_boxes_and_joints_are_rtmlib_s(tmp_path: Path, monkeypatch, shown, boxed
         ])  # fmt: skip
         people += len(boxes)
     worst = np.max(off, axis=0)
-    print(f"{people} people: boxes {worst[0]:.1e} px, joints {worst[1]:.1e} px, scores {worst[2]:.1e}")
+    print(
+        f"{people} people: boxes {worst[0]:.1e} px, joints {worst[1]:.1e} px, scores {worst[2]:.1e}"
+    )
     assert worst[0] < 0.01 and worst[1] < 0.01 and worst[2] < 1e-4

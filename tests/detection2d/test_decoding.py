@@ -14,8 +14,12 @@ def gaussians(places: np.ndarray, size: tuple[int, int], sigma: float = 1.1) -> 
     return np.exp(-squared / (2 * sigma**2)).max(axis=0).astype(np.float32)
 
 
-def people_output(people: np.ndarray, layout: NetworkLayout, size: tuple[int, int] = (60, 40)) -> np.ndarray:
-    """(C, H, W) what a perfect network gives of people (P, J, 2), cells: peaks of 0.9, fields 3 cells wide."""
+def people_output(
+    people: np.ndarray, layout: NetworkLayout, size: tuple[int, int] = (60, 40)
+) -> np.ndarray:
+    """(C, H, W) what a perfect network gives of people (P, J, 2), cells: peaks of 0.9, fields 3
+    cells wide.
+    """
     output = np.zeros((layout.channels, size[1], size[0]), dtype=np.float32)
     x, y = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
     for joint in range(len(layout.text.joints)):
@@ -37,7 +41,9 @@ def people_output(people: np.ndarray, layout: NetworkLayout, size: tuple[int, in
 def test_peaks_lie_between_cells_as_the_gaussians_do(seed):
     rng = np.random.default_rng(seed)
     columns, rows = np.meshgrid(np.arange(6, 54, 12), np.arange(6, 36, 10))
-    places = np.column_stack([columns.ravel(), rows.ravel()]) + rng.uniform(-0.5, 0.5, (columns.size, 2))
+    places = np.column_stack([columns.ravel(), rows.ravel()]) + rng.uniform(
+        -0.5, 0.5, (columns.size, 2)
+    )
     heat = np.stack([0.8 * gaussians(places, (60, 40)), np.zeros((40, 60), np.float32)])
     joint, xy, score = peaks(heat, 0.1)
     assert joint.tolist() == [0] * len(places)
@@ -60,16 +66,22 @@ def test_a_plateau_is_one_peak_and_the_edge_has_peaks_too():
 def test_two_people_are_linked_to_themselves_alone(name):
     layout = layouts()[name]
     rng = np.random.default_rng(3)
-    # 30 apart and 8 wide: a line to the other's joint runs along no limb, as one between two level limbs would.
+    # 30 apart and 8 wide: a line to the other's joint runs along no limb, as one between two level
+    # limbs would.
     one = np.column_stack(
-        [rng.uniform(11, 19, len(layout.text.joints)), rng.permutation(len(layout.text.joints)) * 1.4 + 2]
+        [
+            rng.uniform(11, 19, len(layout.text.joints)),
+            rng.permutation(len(layout.text.joints)) * 1.4 + 2,
+        ]
     )
     people = one + np.array([[[0.0, 0.0]], [[30.0, 1.0]]])
     found = decode(people_output(people, layout), layout.text)
     truth = people[:, found.joint]
     whose = np.linalg.norm(truth - found.xy, axis=-1).argmin(axis=0)
     assert np.linalg.norm(truth[whose, np.arange(len(found))] - found.xy, axis=1).max() < 0.2
-    assert np.bincount(found.joint, minlength=len(layout.text.joints)).tolist() == [2] * len(layout.text.joints)
+    assert np.bincount(found.joint, minlength=len(layout.text.joints)).tolist() == [2] * len(
+        layout.text.joints
+    )
     first, second = found.pairs.T
     ends = np.array(layout.text.limbs)[found.limb]
     assert (found.joint[first] == ends[:, 0]).all() and (found.joint[second] == ends[:, 1]).all()

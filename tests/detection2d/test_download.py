@@ -27,7 +27,9 @@ def archive(*files: tuple[str, bytes]) -> bytes:
 
 @pytest.fixture
 def server(monkeypatch, tmp_path):
-    """A server with pages that a test fills: bytes, a place to go on to, or None that never ends."""
+    """A server with pages that a test fills: bytes, a place to go on to, or None that never
+    ends.
+    """
     pages: dict[str, bytes | str | None] = {}
     asked: list[str] = []
 
@@ -44,7 +46,9 @@ def server(monkeypatch, tmp_path):
             self.end_headers()
             try:
                 for _ in range(10_000 if page is None else 1):
-                    self.wfile.write(NETWORK if page is None else page if isinstance(page, bytes) else b"")
+                    self.wfile.write(
+                        NETWORK if page is None else page if isinstance(page, bytes) else b""
+                    )
             except OSError:
                 pass  # the other side has had enough
 
@@ -67,26 +71,39 @@ def server(monkeypatch, tmp_path):
 
 def test_a_network_is_fetched_once_when_asked_and_is_the_same_ever_after(server):
     pages, asked = server
-    pages[f"/first/{FILE}"] = archive(("2023/pose/end2end.onnx", NETWORK), ("2023/pose/detail.json", b"{}"))
+    pages[f"/first/{FILE}"] = archive(
+        ("2023/pose/end2end.onnx", NETWORK), ("2023/pose/detail.json", b"{}")
+    )
     with pytest.raises(
-        InputError, match="rtmpose-m: this network has not been downloaded yet; give --download rtmpose-m"
+        InputError,
+        match="rtmpose-m: this network has not been downloaded yet; give --download rtmpose-m",
     ):
         named_file(NAME)
     assert asked == [] and not user_cache("networks").exists()
     said, told = [], []
-    file = named_file(NAME, fetch=True, say=said.append, progress=lambda done, total: told.append((done, total)))
+    file = named_file(
+        NAME, fetch=True, say=said.append, progress=lambda done, total: told.append((done, total))
+    )
     assert file.read_bytes() == NETWORK and told[-1][0] == len(pages[f"/first/{FILE}"])
     digest = hashlib.sha256(NETWORK).hexdigest()
-    assert said == [f"rtmpose-m: sha256 {digest} is pinned in {user_cache('networks') / 'rtmpose-m.sha256'}"]
-    assert named_file(NAME, say=said.append) == named_file(NAME, fetch=True, say=said.append) == file
+    assert said == [
+        f"rtmpose-m: sha256 {digest} is pinned in {user_cache('networks') / 'rtmpose-m.sha256'}"
+    ]
+    assert (
+        named_file(NAME, say=said.append) == named_file(NAME, fetch=True, say=said.append) == file
+    )
     assert len(said) == 1 and asked == [f"/first/{FILE}"]
     # A file that was changed, and another that comes in its place.
     file.write_bytes(b"damaged")
-    with pytest.raises(InputError, match=rf"the sha256 of the file is .*, but {digest} was pinned at first use"):
+    with pytest.raises(
+        InputError, match=rf"the sha256 of the file is .*, but {digest} was pinned at first use"
+    ):
         named_file(NAME)
     file.unlink()
     pages[f"/first/{FILE}"] = archive(("end2end.onnx", NETWORK[::-1]))
-    with pytest.raises(InputError, match=r"the sha256 of the download is .* was pinned at first use; if the"):
+    with pytest.raises(
+        InputError, match=r"the sha256 of the download is .* was pinned at first use; if the"
+    ):
         named_file(NAME, fetch=True)
     assert not file.exists()
     (user_cache("networks") / "rtmpose-m.sha256").unlink()
@@ -103,16 +120,20 @@ def test_the_mirror_is_asked_where_the_first_address_fails(server):
     (b"<html>", "File is not a zip file"),
     (archive(("end2end.onnx", NETWORK))[:-30], "File is not a zip file"),
     (archive(("other.onnx", NETWORK)), "it holds 0 files end2end.onnx"),
-    (archive(("a/end2end.onnx", NETWORK), ("../../end2end.onnx", NETWORK)), "it holds 2 files end2end.onnx"),
+    (archive(("a/end2end.onnx", NETWORK), ("../../end2end.onnx", NETWORK)),
+     "it holds 2 files end2end.onnx"),
     (archive(("end2end.onnx", bytes(10_000_000))), "its end2end.onnx has over 1000000 bytes"),
     (None, "the download is too long"),
-    ("http://127.0.0.1:9/elsewhere", "redirects to http://127.0.0.1:9/elsewhere, which is not https"),
+    ("http://127.0.0.1:9/elsewhere",
+     "redirects to http://127.0.0.1:9/elsewhere, which is not https"),
     ("file:///etc/passwd", "302"),
 ])  # fmt: skip
 def test_what_is_not_a_network_is_not_kept(server, monkeypatch, page, problem):
     monkeypatch.setattr(download, "MOST_BYTES", 1_000_000)
     server[0][f"/first/{FILE}"] = server[0][f"/mirror/{FILE}"] = page
-    with pytest.raises(InputError, match=f"cannot be downloaded from .*{problem}.*; download it by hand"):
+    with pytest.raises(
+        InputError, match=f"cannot be downloaded from .*{problem}.*; download it by hand"
+    ):
         named_file(NAME, fetch=True)
     assert not user_cache("networks").exists()
 

@@ -28,14 +28,20 @@ NUMBERS = varint(1, 3) + varint(2, 1) + blob(8, b"w")
 """A tensor's shape, type and name."""
 ELSEWHERE = {
     "as onnx writes it": blob(13, entry()) + varint(14, 1),
-    "the location's key behind its value": blob(13, blob(2, b"secret") + blob(1, b"location")) + varint(14, 1),
+    "the location's key behind its value": blob(13,
+                                                blob(2, b"secret") + blob(1,
+                                                                          b"location")) + varint(14,
+                                                                                                 1),
     "without a place": varint(14, 1),
     "without saying so": blob(13, entry()),
     "another key": blob(13, entry(b"offset", b"0")),
     "a number that 32 bits make 1": bytes([14 << 3, *[0x81, 0x80, 0x80, 0x80, 0x10]]),
     "first elsewhere, then here": varint(14, 1) + varint(14, 0),
-    "a key in more bytes": blob(13, b"\x8a\x80\x80\x80\x10" + blob(1, b"location")[1:] + blob(2, b"secret")),
-    "a length in more bytes": bytes([13 << 3 | 2, 0x80 | len(entry()), 0x80, 0x00]) + entry() + varint(14, 1),
+    "a key in more bytes": blob(13,
+                                b"\x8a\x80\x80\x80\x10" + blob(1, b"location")[1:] + blob(2,
+                                                                                          b"secret")),
+    "a length in more bytes": bytes([13 << 3 | 2, 0x80 | len(entry()), 0x80,
+                                     0x00]) + entry() + varint(14, 1),
 }  # fmt: skip
 PLACES = {
     "an initializer": lambda tensor: blob(7, blob(5, tensor)),
@@ -59,9 +65,13 @@ PLACES = {
 def test_weights_elsewhere_are_refused(tmp_path, spelling, place):
     file = onnx_file(tmp_path / "n.onnx", WEIGHTS)
     file.write_bytes(file.read_bytes() + PLACES[place](NUMBERS + ELSEWHERE[spelling]))
-    with pytest.raises(InputError, match="its weights are in another file; give a network that contains them"):
+    with pytest.raises(
+        InputError, match="its weights are in another file; give a network that contains them"
+    ):
         OnnxNetwork.open(file, "opencv")
-    file.write_bytes(PLACES[place](ELSEWHERE[spelling] + NUMBERS) + onnx_file(file, WEIGHTS).read_bytes())
+    file.write_bytes(
+        PLACES[place](ELSEWHERE[spelling] + NUMBERS) + onnx_file(file, WEIGHTS).read_bytes()
+    )
     with pytest.raises(InputError, match="its weights are in another file"):
         OnnxNetwork.open(file, "opencv")
 
@@ -69,7 +79,8 @@ def test_weights_elsewhere_are_refused(tmp_path, spelling, place):
 @pytest.mark.parametrize(
     "content",
     [
-        b"\xba\x80\x80\x80\x10" + blob(7, blob(5, NUMBERS + varint(14, 1)))[1:],  # bits that 32 bits do not have
+        b"\xba\x80\x80\x80\x10"
+        + blob(7, blob(5, NUMBERS + varint(14, 1)))[1:],  # bits that 32 bits do not have
         b"\xba\x00" + blob(7, blob(5, NUMBERS + varint(14, 1)))[1:],  # zeros behind
         blob(7, b"\xaa\x80\x00" + blob(5, NUMBERS + varint(14, 1))[1:]),
         b"\x3b" + blob(5, NUMBERS + varint(14, 1)) + b"\x3c",  # a group
@@ -130,13 +141,20 @@ def test_a_file_that_looks_like_onnxruntime_s_own_format_is_read_as_onnx(tmp_pat
 
 @pytest.mark.slow
 def test_weights_within_are_read_in_every_spelling(tmp_path):
-    """Numbers as bytes, packed, and one by one; a length in more bytes than needed; a place that says: here."""
+    """Numbers as bytes, packed, and one by one; a length in more bytes than needed; a place that
+    says: here.
+    """
     halves = np.full(3, 0.5, dtype="<f4")
-    packed, single = blob(4, halves.tobytes()), b"".join(b"\x25" + each.tobytes() for each in halves)
+    packed, single = (
+        blob(4, halves.tobytes()),
+        b"".join(b"\x25" + each.tobytes() for each in halves),
+    )
     for numbers in (blob(9, halves.tobytes()), packed, single, packed + varint(14, 0)):
         add = node("Add", "x w", "y")
         file = onnx_model(tmp_path / "n.onnx", [add], {}, (1, 3, 1, 1), {"y": (1, 3, 1, 1)})
-        tensor = b"".join(varint(1, n) for n in (1, 3, 1, 1)) + varint(2, 1) + blob(8, b"w") + numbers
+        tensor = (
+            b"".join(varint(1, n) for n in (1, 3, 1, 1)) + varint(2, 1) + blob(8, b"w") + numbers
+        )
         file.write_bytes(file.read_bytes() + blob(7, blob(5, tensor)))
         given = np.ones((1, 3, 1, 1), dtype=np.float32)
         np.testing.assert_allclose(OnnxNetwork.open(file, "opencv").run(given)[0].ravel(), 1.5)

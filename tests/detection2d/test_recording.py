@@ -24,7 +24,9 @@ FRAMES = 5
 
 @pytest.fixture(scope="module")
 def apart(rolled_rig) -> np.ndarray:
-    """(25, 3) points in the room that no view has nearer to each other than 24 pixels: discs that do not touch."""
+    """(25, 3) points in the room that no view has nearer to each other than 24 pixels: discs that
+    do not touch.
+    """
     rng = np.random.default_rng(0)
     points = np.zeros((0, 3))
     while len(points) < 25:
@@ -38,7 +40,9 @@ def apart(rolled_rig) -> np.ndarray:
 
 
 def standing(points: np.ndarray, frame: int) -> np.ndarray:
-    """(1, 25, 3) somebody who walks a centimetre a frame, with the joints of a scarecrow in a storm."""
+    """(1, 25, 3) somebody who walks a centimetre a frame, with the joints of a scarecrow in a
+    storm.
+    """
     return points[None] + [0.01 * frame, 0, 0]
 
 
@@ -49,7 +53,10 @@ def pictures(rolled_rig, apart, tmp_path_factory) -> Path:
     for camera in rolled_rig.cameras:
         (folder / camera.name).mkdir()
         for frame in range(FRAMES):
-            cv2.imwrite(str(folder / camera.name / f"{frame:03d}.png"), paint(camera, standing(apart, frame)))
+            cv2.imwrite(
+                str(folder / camera.name / f"{frame:03d}.png"),
+                paint(camera, standing(apart, frame)),
+            )
     return folder
 
 
@@ -65,8 +72,12 @@ def run_of(rig: Rig, pictures: Path, output: Path, network, long_side: int = 640
     return DetectionRun(detectors, align(clocks, True), output)
 
 
-def test_joints_are_found_where_each_lens_puts_them(rolled_rig, apart, pictures, tmp_path, painted_network):
-    """Read by our own reader, undistorted, against the projection; one camera is rolled by 30 degrees."""
+def test_joints_are_found_where_each_lens_puts_them(
+    rolled_rig, apart, pictures, tmp_path, painted_network
+):
+    """Read by our own reader, undistorted, against the projection; one camera is rolled by 30
+    degrees.
+    """
     told = []
     run = run_of(rolled_rig, pictures, tmp_path, painted_network)
     _, unreadable = run_detection(run, lambda done, total: told.append((done, total)))
@@ -80,14 +91,24 @@ def test_joints_are_found_where_each_lens_puts_them(rolled_rig, apart, pictures,
             for joint in range(25):
                 mine = found.xy[(found.view == view) & (found.joint == joint)]
                 # Cells are 8 to 9 pixels: a third of one.
-                assert np.linalg.norm(mine - xy[view, joint], axis=1).min(initial=99) < 3, (frame, view, joint)
-    assert read_timestamps(tmp_path / "times.csv", rolled_rig, FRAMES)[0].time_s.tolist() == pytest.approx(
-        [0, 0.04, 0.08, 0.12, 0.16]
-    )
+                assert np.linalg.norm(mine - xy[view, joint], axis=1).min(initial=99) < 3, (
+                    frame,
+                    view,
+                    joint,
+                )
+    assert read_timestamps(tmp_path / "times.csv", rolled_rig, FRAMES)[
+        0
+    ].time_s.tolist() == pytest.approx([0, 0.04, 0.08, 0.12, 0.16])
     used = read_used_footage(tmp_path / FOOTAGE)
     assert [each.name for each in used] == ["a", "b", "c"]
     assert used[1].places.tolist() == list(range(FRAMES))
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.txt", "b.txt", "c.txt", FOOTAGE, "times.csv"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "a.txt",
+        "b.txt",
+        "c.txt",
+        FOOTAGE,
+        "times.csv",
+    ]
 
 
 class Stopped(Exception):
@@ -95,7 +116,9 @@ class Stopped(Exception):
 
 
 @pytest.mark.slow
-def test_a_stopped_run_goes_on_to_the_same_end(rolled_rig, pictures, tmp_path, painted_network, monkeypatch):
+def test_a_stopped_run_goes_on_to_the_same_end(
+    rolled_rig, pictures, tmp_path, painted_network, monkeypatch
+):
     monkeypatch.setattr(recording, "BLOCK", 2)
     whole, parted = tmp_path / "whole", tmp_path / "parted"
     run_detection(run_of(rolled_rig, pictures, whole, painted_network))
@@ -126,7 +149,8 @@ def test_runs_do_not_mix(rolled_rig, pictures, tmp_path, painted_network):
     with pytest.raises(Stopped):
         run_detection(run_of(rolled_rig, pictures, tmp_path, painted_network), stop)
     with pytest.raises(
-        InputError, match="there is an interrupted run with different detection; start it with the same options"
+        InputError,
+        match="interrupted run with different detection; start it with the same options",
     ):
         run_detection(run_of(rolled_rig, pictures, tmp_path, painted_network, long_side=320))
     moved = tmp_path / "moved"
@@ -143,7 +167,9 @@ def test_runs_do_not_mix(rolled_rig, pictures, tmp_path, painted_network):
     assert (tmp_path / "other" / "unfinished" / "thesis.txt").read_text() == "mine"
 
 
-def test_where_a_picture_cannot_be_read_nobody_is_seen(rolled_rig, pictures, tmp_path, painted_network):
+def test_where_a_picture_cannot_be_read_nobody_is_seen(
+    rolled_rig, pictures, tmp_path, painted_network
+):
     spoilt = tmp_path / "spoilt"
     shutil.copytree(pictures, spoilt)
     (spoilt / "b" / "002.png").write_bytes(b"\x89PNG but no more")

@@ -1,4 +1,6 @@
-"""RTMPose's kind: made ONNX networks that give known numbers, or see painted people, through `detect`."""
+"""RTMPose's kind: made ONNX networks that give known numbers, or see painted people, through
+`detect`.
+"""
 
 import json
 import re
@@ -30,17 +32,23 @@ def constant_file(path: Path, size: tuple[int, int], **gives: np.ndarray) -> Pat
     """A network that gives the same arrays of every picture."""
     weights = {f"{name}_kept": array for name, array in gives.items()}
     nodes = [node("Identity", f"{name}_kept", name) for name in gives]
-    return onnx_model(path, nodes, weights, (1, 3, size[1], size[0]), {n: a.shape for n, a in gives.items()})
+    return onnx_model(
+        path, nodes, weights, (1, 3, size[1], size[0]), {n: a.shape for n, a in gives.items()}
+    )
 
 
 def yolox_of(path: Path, proposals: list, classes: int = 2) -> BoxNetwork:
-    """YOLOX for 416 x 416: nothing, but in some cells (stride, column, row) x, y, w, h, sureness, classes."""
+    """YOLOX for 416 x 416: nothing, but in some cells (stride, column, row) x, y, w, h, sureness,
+    classes.
+    """
     found = np.full((1, 52 * 52 + 26 * 26 + 13 * 13, 5 + classes), -9.0)
     found[..., 4:] = 0.0
     for stride, column, row, *numbers in proposals:
         start = {8: 0, 16: 52 * 52, 32: 52 * 52 + 26 * 26}[stride]
         found[0, start + row * (416 // stride) + column] = numbers
-    return BoxNetwork(OnnxNetwork.open(constant_file(path, (416, 416), dets=found)), BoxForm(size=(416, 416)))
+    return BoxNetwork(
+        OnnxNetwork.open(constant_file(path, (416, 416), dets=found)), BoxForm(size=(416, 416))
+    )
 
 
 def test_boxes_are_where_the_grids_say_once_each_and_people_s(tmp_path):
@@ -56,20 +64,27 @@ def test_boxes_are_where_the_grids_say_once_each_and_people_s(tmp_path):
     ]).find  # fmt: skip
     boxes = find(np.zeros((416, 832, 3), np.uint8))
     middles, sides = [[336, 104], [640, 192]], [[128, 192], [48, 80]]
-    expected = np.hstack([np.subtract(middles, np.divide(sides, 2)), np.add(middles, np.divide(sides, 2))])
+    expected = np.hstack(
+        [np.subtract(middles, np.divide(sides, 2)), np.add(middles, np.divide(sides, 2))]
+    )
     np.testing.assert_allclose(boxes, expected, atol=1e-3)
 
 
 def test_boxes_that_the_network_suppressed_itself_are_taken_as_they_are(tmp_path):
-    dets = np.array([[[10, 20, 60, 120, 0.4], [12, 22, 62, 122, 0.9], [1, 1, 9, 9, 0.2], [5, 5, 50, 50, 0.9]]])
+    dets = np.array(
+        [[[10, 20, 60, 120, 0.4], [12, 22, 62, 122, 0.9], [1, 1, 9, 9, 0.2], [5, 5, 50, 50, 0.9]]]
+    )
     labels = np.array([[0, 0, 0, 17]])
-    network = OnnxNetwork.open(constant_file(tmp_path / "n.onnx", (416, 416), dets=dets, labels=labels))
+    network = OnnxNetwork.open(
+        constant_file(tmp_path / "n.onnx", (416, 416), dets=dets, labels=labels)
+    )
     boxes = BoxNetwork(network, BoxForm(size=(416, 416))).find(np.zeros((208, 208, 3), np.uint8))
     np.testing.assert_allclose(boxes, [[6, 11, 31, 61], [5, 10, 30, 60]], atol=1e-5)
 
 
 BOX = np.array([100.0, 50, 148, 146])
-"""A person in a picture of 208 x 208. With padding 1.5 and the shape of the input: from 88 to 160, 26 to 170."""
+"""A person in a picture of 208 x 208. With padding 1.5 and the shape of the input: from 88 to 160,
+26 to 170."""
 
 
 def detected(folder: Path, lines: list[str], **gives: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -77,8 +92,12 @@ def detected(folder: Path, lines: list[str], **gives: np.ndarray) -> tuple[np.nd
     constant_file(folder / "pose.onnx", (96, 192), **gives)
     constant_file(folder / "yolox.onnx", (208, 208), dets=np.array([[[*BOX, 0.9]]]))
     boxes = ["[boxes]", 'network = "yolox.onnx"']
-    (folder / "n.toml").write_text("\n".join(['network = "pose.onnx"', "padding = 1.5", *lines, *boxes]))
-    found = open_network(str(folder / "n.toml"), None, Path).detect(np.zeros((208, 208, 3), np.uint8))
+    (folder / "n.toml").write_text(
+        "\n".join(['network = "pose.onnx"', "padding = 1.5", *lines, *boxes])
+    )
+    found = open_network(str(folder / "n.toml"), None, Path).detect(
+        np.zeros((208, 208, 3), np.uint8)
+    )
     return found.xy, found.score
 
 
@@ -90,7 +109,9 @@ def test_simcc_is_read_at_its_own_resolution(tmp_path):
         curve[0, np.arange(26), best] = height
     xy, score = detected(tmp_path, [], simcc_x=curves[0], simcc_y=curves[1])
     # 72 x 144 pixels of the picture are 192 x 384 places of the curves.
-    np.testing.assert_allclose(xy[0], np.column_stack([88 + x * 72 / 192, 26 + y * 144 / 384]), atol=1e-4)
+    np.testing.assert_allclose(
+        xy[0], np.column_stack([88 + x * 72 / 192, 26 + y * 144 / 384]), atol=1e-4
+    )
     np.testing.assert_allclose(score, 0.8, atol=1e-6)
 
 
@@ -99,9 +120,13 @@ def test_heat_maps_are_read_between_their_cells(tmp_path, cells):
     rng = np.random.default_rng(1)
     true = rng.uniform([10, 10], [85, 180], (26, 2))  # pixels of the input
     size, shape = np.array([96, 192]), np.array([24, 48])
-    cell = true * (shape - 1) / (size - 1) if cells == "corners" else (true + 0.5) * shape / size - 0.5
+    cell = (
+        true * (shape - 1) / (size - 1) if cells == "corners" else (true + 0.5) * shape / size - 0.5
+    )
     columns, rows = np.meshgrid(np.arange(24), np.arange(48))
-    maps = np.exp(-((columns - cell[:, 0, None, None]) ** 2 + (rows - cell[:, 1, None, None]) ** 2) / 4.5)
+    maps = np.exp(
+        -((columns - cell[:, 0, None, None]) ** 2 + (rows - cell[:, 1, None, None]) ** 2) / 4.5
+    )
     lines = ['decoding = "heat map"', f'cells = "{cells}"', 'outputs = ["maps"]']
     xy, score = detected(tmp_path, lines, other=np.zeros((1, 3)), maps=maps[None])
     np.testing.assert_allclose(xy[0], [88, 26] + true * 72 / 96, atol=0.02)
@@ -110,7 +135,12 @@ def test_heat_maps_are_read_between_their_cells(tmp_path, cells):
 
 def test_coordinates_go_to_the_joints_that_the_file_names(tmp_path):
     given = np.array([[[0.5, 0.25, 0.9], [0.25, 0.75, 0.8], [0.1, 0.1, 0.7], [np.inf, 0.5, 0.9]]])
-    lines = ['decoding = "coordinates"', "scale = [96.0, 192.0]", 'skeleton = "COCO_17"', 'input = "x"']
+    lines = [
+        'decoding = "coordinates"',
+        "scale = [96.0, 192.0]",
+        'skeleton = "COCO_17"',
+        'input = "x"',
+    ]
     lines += ['joints = ["LHip", "Nose", "", "RHip"]']
     xy, score = detected(tmp_path, lines, out=given)
     names, keypoints = COCO_17.joints, list(COCO_17.keypoints or ())
@@ -124,11 +154,19 @@ def test_coordinates_go_to_the_joints_that_the_file_names(tmp_path):
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e38])
 def test_what_is_no_number_or_no_place_is_nobody(tmp_path, value):
-    box = constant_file(tmp_path / "yolox.onnx", (208, 208), dets=np.array([[[0, 0, value, 100, 0.9]]]))
+    box = constant_file(
+        tmp_path / "yolox.onnx", (208, 208), dets=np.array([[[0, 0, value, 100, 0.9]]])
+    )
     pose = rtmpose_file(tmp_path / "pose.onnx", 26, (96, 192), 0)
-    assert len(open_network(str(pose), str(box), Path).detect(np.zeros((208, 208, 3), np.uint8)).xy) == 0
+    assert (
+        len(open_network(str(pose), str(box), Path).detect(np.zeros((208, 208, 3), np.uint8)).xy)
+        == 0
+    )
     flat, x, y = (np.full((1, 26, *shape), value) for shape in ((24, 12), (192,), (384,)))
-    for how, gives in ((['decoding = "heat map"'], {"maps": flat}), ([], {"simcc_x": x, "simcc_y": y})):
+    for how, gives in (
+        (['decoding = "heat map"'], {"maps": flat}),
+        ([], {"simcc_x": x, "simcc_y": y}),
+    ):
         xy, score = detected(tmp_path, how, **gives)
         assert np.isfinite(xy).all() and np.isfinite(score).all()
         assert value == 1e38 or (score == 0).all()
@@ -138,20 +176,25 @@ def test_a_network_of_whole_pictures_may_find_several_people(tmp_path):
     people = np.random.default_rng(2).uniform(20, 90, (1, 3, 17, 3))
     constant_file(tmp_path / "pose.onnx", (100, 200), out=people)
     (tmp_path / "n.toml").write_text('network = "pose.onnx"\ndecoding = "coordinates"\n')
-    found = open_network(str(tmp_path / "n.toml"), None, Path).detect(np.zeros((100, 200, 3), np.uint8))
+    found = open_network(str(tmp_path / "n.toml"), None, Path).detect(
+        np.zeros((100, 200, 3), np.uint8)
+    )
     # 200 x 100 pixels lie in the middle of 200 x 400, which are shown at half their size.
     np.testing.assert_allclose(found.xy, people[0, ..., :2] * 2 - [0, 150], atol=1e-4)
 
 
 @pytest.mark.parametrize("lines, problem", [
-    (['decoding = "guess"'], "decoding must be 'simcc', 'heat map' or 'coordinates', got text 'guess'; docs/det"),
+    (['decoding = "guess"'],
+     "decoding must be 'simcc', 'heat map' or 'coordinates', got text 'guess'; docs/det"),
     (["outputs = ['a', 'b']"], "the network has no 'a', but simcc_x simcc_y; name one of these"),
     (["input = 'picture'"], "the network has no 'picture', but x; name one of these"),
     (['decoding = "heat map"'], "is 1 x 26 x 192 and 1 x 26 x 384, which is not a heat map"),
     (['skeleton = "COCO_17"'], "the network has 26 joints, but 17 are named (COCO_17)"),
-    (['joints = ["Nose", "Nose"]'], "joints has 'Nose', which must be a keypoint of HALPE_26 without repetition"
+    (['joints = ["Nose", "Nose"]'],
+     "joints has 'Nose', which must be a keypoint of HALPE_26 without repetition"
         " (Nose LEye"),
-    (['joints = ["Tail"]'], "joints has 'Tail', which must be a keypoint of HALPE_26 without repetition"),
+    (['joints = ["Tail"]'],
+     "joints has 'Tail', which must be a keypoint of HALPE_26 without repetition"),
     (["padding = 0.5"], "padding is not valid"),
     (["colour = 'rgb'"], "colour is not a known key"),
     (["skeleton = '../mine.toml'"], "skeleton '../mine.toml' must be a file in the same folder"),
@@ -168,7 +211,11 @@ def test_the_file_that_the_page_shows_is_read(tmp_path):
     (tmp_path / "other.toml").write_text(re.findall("```toml\n(.*?)```", page, re.DOTALL)[0])
     form = read_form(tmp_path / "other.toml")
     assert form.model_fields_set == set(KeypointForm.model_fields) and form.decoding == "heat map"
-    assert form.boxes is not None and form.boxes.model_fields_set >= {"network", "min_score", "max_overlap"}
+    assert form.boxes is not None and form.boxes.model_fields_set >= {
+        "network",
+        "min_score",
+        "max_overlap",
+    }
 
 
 def test_networks_in_each_other_s_place_are_refused(tmp_path):
@@ -176,32 +223,42 @@ def test_networks_in_each_other_s_place_are_refused(tmp_path):
     yolox = str(yolox_file(tmp_path / "yolox.onnx", (416, 416), 0))
     with pytest.raises(InputError, match=r"--boxes"):
         open_network(pose, None, Path)
-    with pytest.raises(InputError, match=r"pose.onnx: .* YOLOX has an output of 1 x 1008 x 6 or more.*--boxes"):
+    with pytest.raises(
+        InputError, match=r"pose.onnx: .* YOLOX has an output of 1 x 1008 x 6 or more.*--boxes"
+    ):
         open_network(pose, pose, Path)
     with pytest.raises(
         InputError,
-        match="the output of the network is 1 x 3549 x 6, which is not a simcc; describe the network in a TOML",
+        match=(
+            "the output of the network is 1 x 3549 x 6, which is not a simcc; describe the "
+            "network in a TOML"
+        ),
     ):
         open_network(yolox, yolox, Path)
-    with pytest.raises(InputError, match="--long-side is for networks such as OpenPose; leave it out"):
+    with pytest.raises(
+        InputError, match="--long-side is for networks such as OpenPose; leave it out"
+    ):
         open_network(pose, yolox, Path, long_side=656)
     with pytest.raises(InputError, match="--device cuda: the installed onnxruntime supports cpu"):
         open_network(pose, yolox, Path, "cuda")
     five = str(rtmpose_file(tmp_path / "five.onnx", 5, (192, 256), 0))
     with pytest.raises(
-        InputError, match="no known skeleton has 5 joints; describe it in a TOML file of the network"
+        InputError,
+        match="no known skeleton has 5 joints; describe it in a TOML file of the network",
     ):
         open_network(five, yolox, Path)
 
 
 def test_people_are_the_same_one_by_one_and_many_at_once(tmp_path):
     """Of 300 boxes and more, in blocks, and by a file that takes one picture at a time."""
-    picture = cv2.resize(np.random.default_rng(0).integers(0, 256, (24, 32, 3), dtype=np.uint8), (640, 480))
+    picture = cv2.resize(
+        np.random.default_rng(0).integers(0, 256, (24, 32, 3), dtype=np.uint8), (640, 480)
+    )
     yolox = str(yolox_file(tmp_path / "yolox.onnx", (416, 416), 0, 1, True))
     found = [
-        open_network(str(rtmpose_file(tmp_path / f"{n}.onnx", 26, (96, 128), 3, batch)), yolox, Path).detect(
-            picture
-        )
+        open_network(
+            str(rtmpose_file(tmp_path / f"{n}.onnx", 26, (96, 128), 3, batch)), yolox, Path
+        ).detect(picture)
         for n, batch in enumerate(("batch", 1))
     ]
     assert len(found[0].xy) > 32
@@ -212,7 +269,9 @@ def test_people_are_the_same_one_by_one_and_many_at_once(tmp_path):
 def test_one_opencv_is_asked_for_and_installed():
     """Two would overwrite each other's cv2: rtmlib, which brings two more, is no dependency."""
     asked = [re.split(r"[^\w-]", each)[0].lower() for each in requires("shapepose-fg") or ()]
-    assert [each for each in asked if "opencv" in each] == ["opencv-python-headless"] and "rtmlib" not in asked
+    assert [each for each in asked if "opencv" in each] == [
+        "opencv-python-headless"
+    ] and "rtmlib" not in asked
     installed = {each.name.lower() for each in distributions() if each.name}
     assert {each for each in installed if each.startswith("opencv")} == {"opencv-python-headless"}
 
@@ -224,16 +283,20 @@ def test_a_skeleton_of_one_s_own_goes_on_to_reconstruct(rolled_rig, tmp_path, ca
     for camera in rolled_rig.cameras:
         cv2.imwrite(f"shots/{camera.name}.png", np.zeros((480, 640, 3), np.uint8))
     Path("mine.toml").write_text(
-        'name = "mine"\nkeypoints = ["RHip", "LHip", "RKnee", "LKnee", "Neck"]\nanchor = ["RHip", "LHip"]\n'
-        'limbs = [["RHip", "RKnee"], ["LHip", "LKnee"], ["MidHip", "Neck"]]\n'
+        'name = "mine"\nkeypoints = ["RHip", "LHip", "RKnee", "LKnee", "Neck"]\nanchor = '
+        '["RHip", "LHip"]\nlimbs = [["RHip", "RKnee"], ["LHip", "LKnee"], ["MidHip", "Neck"]]\n'
         'mirror = [["RHip", "LHip"], ["RKnee", "LKnee"]]\n'
     )
     constant_file(
         Path("pose.onnx"),
         (96, 192),
-        out=np.array([[[40, 95, 0.9], [55, 95, 0.9], [40, 120, 0.9], [55, 120, 0.9], [48, 70, 0.9]]]),
+        out=np.array(
+            [[[40, 95, 0.9], [55, 95, 0.9], [40, 120, 0.9], [55, 120, 0.9], [48, 70, 0.9]]]
+        ),
     )
-    Path("n.toml").write_text('network = "pose.onnx"\nskeleton = "mine.toml"\ndecoding = "coordinates"\n')
+    Path("n.toml").write_text(
+        'network = "pose.onnx"\nskeleton = "mine.toml"\ndecoding = "coordinates"\n'
+    )
     words = "detect --calibration calibration.json --images shots --network n.toml --output found"
     with pytest.raises(SystemExit) as end:
         main(words.split())
@@ -277,7 +340,9 @@ def disc_file(path: Path, joints: int, size: tuple[int, int]) -> Path:
 
 @pytest.mark.slow
 def test_detected_feet_are_reconstructed_feet(rolled_rig, tmp_path, capsys, monkeypatch):
-    """A man of the built-in scene, painted for three cameras, one of them rolled: HALPE-26 in and out."""
+    """A man of the built-in scene, painted for three cameras, one of them rolled: HALPE-26 in and
+    out.
+    """
     monkeypatch.chdir(tmp_path)
     frames, scene = 4, built_in_scene(frames=4)
     truth = np.stack([scene.truth_at(frame)[0] for frame in range(frames)])
@@ -291,12 +356,19 @@ def test_detected_feet_are_reconstructed_feet(rolled_rig, tmp_path, capsys, monk
         (Path("shots") / camera.name).mkdir(parents=True)
         for frame in range(frames):
             picture = np.full((480, 640, 3), 127, np.uint8)
-            for (x, y), paint in zip(camera.distort(camera.project(joints[frame])[0]), paints, strict=True):
-                cv2.circle(picture, (round(16 * x), round(16 * y)), 5 * 16, paint, -1, cv2.LINE_AA, 4)
+            for (x, y), paint in zip(
+                camera.distort(camera.project(joints[frame])[0]), paints, strict=True
+            ):
+                cv2.circle(
+                    picture, (round(16 * x), round(16 * y)), 5 * 16, paint, -1, cv2.LINE_AA, 4
+                )
             cv2.imwrite(f"shots/{camera.name}/{frame:02d}.png", picture)
     disc_file(Path("pose.onnx"), 26, (640, 480))
     constant_file(Path("yolox.onnx"), (416, 416), dets=np.array([[[0.0, 0, 416, 416, 0.9]]]))
-    words = "--calibration calibration.json --images shots --network pose.onnx --boxes yolox.onnx --fps 25"
+    words = (
+        "--calibration calibration.json --images shots --network pose.onnx --boxes yolox.onnx "
+        "--fps 25"
+    )
     for line in (f"detect {words} --output found", None):
         if line is None:
             line = re.findall("next: shapepose-fg (.*)", capsys.readouterr().out)[0]
@@ -310,6 +382,10 @@ def test_detected_feet_are_reconstructed_feet(rolled_rig, tmp_path, capsys, monk
     assert np.shape(seen[0]["instances"][0]["keypoints"]) == (26, 2)
     people = Reconstruction.load(tmp_path / "results")
     assert people.joints.shape == (frames, 26, 3) and tuple(people.joint_names) == HALPE_26.joints
-    feet = [HALPE_26.index(f"{side}{part}") for side in "LR" for part in ("BigToe", "SmallToe", "Heel", "Ankle")]
+    feet = [
+        HALPE_26.index(f"{side}{part}")
+        for side in "LR"
+        for part in ("BigToe", "SmallToe", "Heel", "Ankle")
+    ]
     off = np.linalg.norm(people.joints[:, feet] - joints[:, feet], axis=2)
     assert off.mean() < 0.01 and off.max() < 0.03, (off.mean(), off.max())

@@ -24,7 +24,8 @@ def test_what_is_up_in_the_world_is_up_in_the_turned_picture(degrees):
     low, high = xy @ view.input_from_picture[:, :2].T + view.input_from_picture[:, 2]
     across, up = high[0] - low[0], low[1] - high[1]
     assert up > 0
-    # Both sides are rounded to multiples of 16: the axes' scales differ by up to 3 %, a degree at 45.
+    # Both sides are rounded to multiples of 16: the axes' scales differ by up to 3 %, a degree at
+    # 45.
     assert abs(np.degrees(np.arctan2(across, up))) < 1.5
     assert view.size[0] % 16 == 0 and view.size[1] % 16 == 0 and max(view.size) == 656
 
@@ -49,7 +50,9 @@ def test_a_dot_of_the_input_is_where_it_is_in_the_picture(degrees, only_size):
         cv2.circle(picture, (x, y), 12, (255, 255, 255), -1)
         shown = view.input_of(picture)
         assert shown.shape == (view.size[1], view.size[0], 3)
-        weight = shown[..., 0].astype(float) * (shown[..., 0] > 60)  # the mean colour outside is dark
+        weight = shown[..., 0].astype(float) * (
+            shown[..., 0] > 60
+        )  # the mean colour outside is dark
         rows, columns = np.indices(weight.shape)
         middle = np.array([(columns * weight).sum(), (rows * weight).sum()]) / weight.sum()
         # Half a pixel of the input is a pixel of the picture.

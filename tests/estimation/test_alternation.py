@@ -1,4 +1,6 @@
-"""Stage II: the alternation, with a body fitter that only notes what it is given, and with the real one."""
+"""Stage II: the alternation, with a body fitter that only notes what it is given, and with the real
+one.
+"""
 
 import warnings
 from dataclasses import replace
@@ -16,8 +18,17 @@ from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Status
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation import body_step
-from shapepose_fg.estimation.estimator_config import EstimatorConfig, RefineConfig, WindowGraphConfig
-from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, observation_sigmas, triangulate
+from shapepose_fg.estimation.estimator_config import (
+    EstimatorConfig,
+    RefineConfig,
+    WindowGraphConfig,
+)
+from shapepose_fg.estimation.linearisation import (
+    ObservationConfig,
+    linearise,
+    observation_sigmas,
+    triangulate,
+)
 from shapepose_fg.estimation.window_graph import WindowGraph
 from shapepose_fg.estimation.window_solution import WindowSolution
 from shapepose_fg.pipeline.solve_window import solve_window
@@ -26,19 +37,25 @@ WRIST, ELBOW, KNEE = 4, 3, 13
 
 
 class FakeFitter(BodyFitter):
-    """Gives the same body every time to rows with information, none to others; remembers the questions.
+    """Gives the same body every time to rows with information, none to others; remembers the
+    questions.
 
     Its priors are wide, 10 cm, so that one 17 cm off pulls and does not count as a contradiction.
     """
 
-    def __init__(self, prior_xyz: NDArray[np.float64], sigma_m: float = 0.1, fails: bool = False) -> None:
+    def __init__(
+        self, prior_xyz: NDArray[np.float64], sigma_m: float = 0.1, fails: bool = False
+    ) -> None:
         self.prior_xyz, self.sigma_m, self.fails = prior_xyz, sigma_m, fails
         self.targets: list[JointTargets] = []
         self.initials: list[BodyFit | None] = []
         self.fits: list[BodyFit] = []
 
     def fit(
-        self, targets: JointTargets, initial: BodyFit | None = None, groups: NDArray[np.intp] | None = None
+        self,
+        targets: JointTargets,
+        initial: BodyFit | None = None,
+        groups: NDArray[np.intp] | None = None,
     ) -> BodyFit:
         self.targets.append(targets)
         self.initials.append(initial)
@@ -68,7 +85,9 @@ def observed(
     return Observations(xy, np.full(xy.shape[:3], confidence), people.copy())
 
 
-def without(observations: Observations, unseen: NDArray[np.bool_], unknown: NDArray[np.bool_]) -> Observations:
+def without(
+    observations: Observations, unseen: NDArray[np.bool_], unknown: NDArray[np.bool_]
+) -> Observations:
     """Take away observations (P, J, V) and what stage I knows of joints (P, J)."""
     return Observations(
         np.where(unseen[..., None], 0.0, observations.xy),
@@ -87,7 +106,9 @@ def run(
     settled_m=0.0,
     rho_3d=0.25,
 ) -> WindowSolution:
-    """Refine to the end of every X step and of all rounds, by the paper's rho_3D; a warning of NaN is an error."""
+    """Refine to the end of every X step and of all rounds, by the paper's rho_3D; a warning of NaN
+    is an error.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         config = EstimatorConfig(
@@ -95,7 +116,9 @@ def run(
             WindowGraphConfig(rho_3d=rho_3d, max_iterations=100, tolerance=1e-12),
             RefineConfig(alternations=alternations, settled_m=settled_m),
         )
-        return solve_window(observations, Views.of(rig), fitter, config, extra_factors=extra_factors)
+        return solve_window(
+            observations, Views.of(rig), fitter, config, extra_factors=extra_factors
+        )
 
 
 @pytest.fixture
@@ -107,9 +130,13 @@ def doubtful_wrist(five_cameras, two_people) -> Observations:
 
 
 @pytest.mark.parametrize("alternations", [1, 4])
-def test_the_body_is_fitted_in_every_round_from_the_last_one(five_cameras, two_people, alternations):
+def test_the_body_is_fitted_in_every_round_from_the_last_one(
+    five_cameras, two_people, alternations
+):
     fitter = FakeFitter(two_people)
-    result = run(observed(five_cameras, two_people), five_cameras, fitter, alternations=alternations)
+    result = run(
+        observed(five_cameras, two_people), five_cameras, fitter, alternations=alternations
+    )
     assert len(fitter.fits) == alternations
     assert not fitter.initials[0].ok.any()
     for given, last in zip([*fitter.initials[1:], result.fit], fitter.fits, strict=True):
@@ -120,8 +147,9 @@ def test_the_body_is_fitted_in_every_round_from_the_last_one(five_cameras, two_p
 
 @pytest.mark.parametrize("same", [0.0, 2.5])
 def test_people_who_have_settled_are_left_alone(five_cameras, two_people, same, monkeypatch):
-    """One person's views agree: one round. The other's wrist, pulled, moves once, then stays: two rounds. What the
-    views say does not move, so that only a fitter that is asked in any case is asked again.
+    """One person's views agree: one round. The other's wrist, pulled, moves once, then stays: two
+    rounds. What the views say does not move, so that only a fitter that is asked in any case is
+    asked again.
     """
     monkeypatch.setattr(body_step, "_SAME", same)
     seen = observed(five_cameras, two_people)
@@ -134,24 +162,34 @@ def test_people_who_have_settled_are_left_alone(five_cameras, two_people, same, 
 
 
 @pytest.mark.parametrize("kernel", [None, "cauchy"])
-def test_the_fitter_is_told_what_the_views_alone_say(five_cameras, two_people, doubtful_wrist, kernel):
-    """In each round: information and target of the observations at the joints of the round before, no more."""
+def test_the_fitter_is_told_what_the_views_alone_say(
+    five_cameras, two_people, doubtful_wrist, kernel
+):
+    """In each round: information and target of the observations at the joints of the round before,
+    no more.
+    """
     fitter = FakeFitter(two_people + 0.05)
     run(doubtful_wrist, five_cameras, fitter, kernel, alternations=3)
     config = ObservationConfig(kernel=kernel)
     views = Views.of(five_cameras)
-    sigmas = observation_sigmas(doubtful_wrist, doubtful_wrist.initial, views, config, BODY_25.joints)
+    sigmas = observation_sigmas(
+        doubtful_wrist, doubtful_wrist.initial, views, config, BODY_25.joints
+    )
     X = doubtful_wrist.initial
     for n, targets in enumerate(fitter.targets):
         if n > 0:
-            X = run(doubtful_wrist, five_cameras, FakeFitter(two_people + 0.05), kernel, alternations=n).joints
+            X = run(
+                doubtful_wrist, five_cameras, FakeFitter(two_people + 0.05), kernel, alternations=n
+            ).joints
         alone = linearise(doubtful_wrist, sigmas, X, views, config)
         np.testing.assert_allclose(targets.information, alone.information, rtol=1e-6, atol=1e-3)
         np.testing.assert_allclose(targets.xyz, alone.target, atol=1e-6)
 
 
 def test_a_prior_does_not_come_back_through_the_body(five_cameras, two_people, doubtful_wrist):
-    """The prior pulls the wrist by centimetres; where the fitter is told to put it stays where the views say."""
+    """The prior pulls the wrist by centimetres; where the fitter is told to put it stays where the
+    views say.
+    """
     fitter = FakeFitter(two_people + 0.1, sigma_m=0.035)
     pulled = run(doubtful_wrist, five_cameras, fitter)
     alone = run(doubtful_wrist, five_cameras, FakeFitter(two_people, fails=True))
@@ -159,10 +197,12 @@ def test_a_prior_does_not_come_back_through_the_body(five_cameras, two_people, d
     assert (moved > 0.03).all()
     # One Gauss-Newton step from up to 20 cm off: to the second order of that at 3.5 m.
     np.testing.assert_allclose(fitter.targets[-1].xyz, alone.joints, atol=0.012)
-    # The information changes with the point of linearisation by a few per cent, a prior would add 3 / 0.035² to
-    # the 3 / 0.018² or so of five views of confidence 0.1.
+    # The information changes with the point of linearisation by a few per cent, a prior would add 3
+    # / 0.035² to the 3 / 0.018² or so of five views of confidence 0.1.
     before, after = fitter.targets[0].information, fitter.targets[-1].information
-    np.testing.assert_allclose(np.trace(after, axis1=2, axis2=3), np.trace(before, axis1=2, axis2=3), rtol=0.1)
+    np.testing.assert_allclose(
+        np.trace(after, axis1=2, axis2=3), np.trace(before, axis1=2, axis2=3), rtol=0.1
+    )
 
 
 def test_only_joints_of_low_confidence_are_pulled(five_cameras, two_people, doubtful_wrist):
@@ -170,10 +210,15 @@ def test_only_joints_of_low_confidence_are_pulled(five_cameras, two_people, doub
     alone = run(doubtful_wrist, five_cameras, FakeFitter(two_people, fails=True))
     others = np.arange(25) != WRIST
     np.testing.assert_allclose(with_body.joints[:, others], alone.joints[:, others], atol=1e-6)
-    np.testing.assert_allclose(with_body.covariance[:, others], alone.covariance[:, others], rtol=1e-5)
+    np.testing.assert_allclose(
+        with_body.covariance[:, others], alone.covariance[:, others], rtol=1e-5
+    )
     np.testing.assert_allclose(with_body.confidence[:, others], 0.8)
     np.testing.assert_allclose(with_body.confidence[:, WRIST], 0.1)
-    solved = [np.stack([each.solved_covariance[0, WRIST] for each in one.people]) for one in (with_body, alone)]
+    solved = [
+        np.stack([each.solved_covariance[0, WRIST] for each in one.people])
+        for one in (with_body, alone)
+    ]
     assert (solved[0] < solved[1])[:, [0, 1, 2], [0, 1, 2]].all()
 
 
@@ -202,13 +247,17 @@ def test_a_joint_never_seen_comes_from_the_body(five_cameras, two_people):
     solved = np.stack([person.solved_covariance[0] for person in result.people])
     np.testing.assert_allclose(solved[unknown], np.tile(0.07**2 * np.eye(3), (2, 1, 1)), atol=1e-12)
     variance = np.diagonal(result.covariance[unknown], axis1=1, axis2=2)
-    assert (variance > 0.07**2).all() and (variance < 0.2**2).all(), "the body errs rarely and by much"
+    assert (variance > 0.07**2).all() and (variance < 0.2**2).all(), (
+        "the body errs rarely and by much"
+    )
     assert (result.confidence[unknown] == 0).all() and not result.inlier[unknown].any()
     assert np.isfinite(result.joints).all()
 
 
 def test_a_joint_of_one_view_is_the_body_s_moved_onto_the_ray(five_cameras, two_people):
-    """However sure the one view is (1.0 of 5 views is 0.2 on average; the body is needed for the depth)."""
+    """However sure the one view is (1.0 of 5 views is 0.2 on average; the body is needed for the
+    depth).
+    """
     seen = observed(five_cameras, two_people, noise_px=0.0)
     unseen = np.zeros(seen.confidence.shape, dtype=bool)
     unseen[:, WRIST, 1:] = True
@@ -222,9 +271,12 @@ def test_a_joint_of_one_view_is_the_body_s_moved_onto_the_ray(five_cameras, two_
     offset = result.joints[:, WRIST] - two_people[:, WRIST]
     along = np.sum(offset * ray, axis=1)
     across = np.linalg.norm(offset - along[:, None] * ray, axis=1)
-    # 2 to 3 cm of the view against 20 cm of the body: of up to 4 cm across the ray a twentieth is left.
+    # 2 to 3 cm of the view against 20 cm of the body: of up to 4 cm across the ray a twentieth is
+    # left.
     assert (across < 0.004).all()
-    np.testing.assert_allclose(along, np.sum((prior - two_people)[:, WRIST] * ray, axis=1), atol=0.004)
+    np.testing.assert_allclose(
+        along, np.sum((prior - two_people)[:, WRIST] * ray, axis=1), atol=0.004
+    )
 
 
 def test_an_observation_beside_its_joint_is_discarded_in_the_next_round(five_cameras, two_people):
@@ -237,7 +289,9 @@ def test_an_observation_beside_its_joint_is_discarded_in_the_next_round(five_cam
 
 
 def test_views_that_contradict_the_body_are_gated_anew_around_it(five_cameras, two_people):
-    """Two views agree on a knee that is half a metre from where the rest of the body has it, and are wrong."""
+    """Two views agree on a knee that is half a metre from where the rest of the body has it, and
+    are wrong.
+    """
     seen = observed(five_cameras, two_people)
     elsewhere = two_people.copy()
     elsewhere[0, KNEE] += [0.5, 0.0, 0.0]
@@ -254,13 +308,18 @@ def test_views_that_contradict_the_body_are_gated_anew_around_it(five_cameras, t
     rows = result.result(place, five_cameras, BODY_25.joints)
     assert rows.observations is not None
     dropped = np.argwhere(rows.observations.gate == Gate.CONTRADICTS_BODY)
-    assert dropped.tolist() == [[0, KNEE, 0], [0, KNEE, 1]] and rows.observations.reasons()["too far"] == 0
+    assert (
+        dropped.tolist() == [[0, KNEE, 0], [0, KNEE, 1]]
+        and rows.observations.reasons()["too far"] == 0
+    )
     alone = run(seen, five_cameras, FakeFitter(two_people, fails=True))
     np.testing.assert_allclose(alone.joints[0, KNEE], elsewhere[0, KNEE], atol=0.01)
 
 
 def with_a_stranger(rig: Rig, people: NDArray[np.float64], joints: int, views: int) -> Observations:
-    """Two people: one complete, one of whom the first `views` views saw the first `joints` joints."""
+    """Two people: one complete, one of whom the first `views` views saw the first `joints`
+    joints.
+    """
     seen = observed(rig, people)
     unseen = np.zeros(seen.confidence.shape, dtype=bool)
     unseen[1, joints:] = unseen[1, :, views:] = True
@@ -273,7 +332,9 @@ def with_a_stranger(rig: Rig, people: NDArray[np.float64], joints: int, views: i
     ("joints", "views", "solved"),
     [(2, 5, 2), (25, 1, 0), (0, 0, 0)],
 )
-def test_too_few_views_are_a_status_and_harm_nobody_else(five_cameras, two_people, joints, views, solved):
+def test_too_few_views_are_a_status_and_harm_nobody_else(
+    five_cameras, two_people, joints, views, solved
+):
     """Two joints, one view, nothing at all."""
     fitter = FakeFitter(two_people)
     result = run(with_a_stranger(five_cameras, two_people, joints, views), five_cameras, fitter)
@@ -307,7 +368,9 @@ def test_factors_of_one_s_own_stay_through_all_rounds(five_cameras, two_people):
         person = len(asked)
         asked.append(window)
         ends = keys[0, [ELBOW, WRIST]].tolist()
-        return [gtsam.RangeFactor3(*ends, length[person], gtsam.noiseModel.Isotropic.Sigma(1, 1e-4))]
+        return [
+            gtsam.RangeFactor3(*ends, length[person], gtsam.noiseModel.Isotropic.Sigma(1, 1e-4))
+        ]
 
     result = run(seen, five_cameras, FakeFitter(two_people), extra_factors=forearm)
     assert len(asked) == 2
@@ -345,7 +408,9 @@ def test_people_do_not_influence_each_other(five_cameras, two_people, doubtful_w
     both = run(doubtful_wrist, five_cameras, FakeFitter(two_people + 0.05), kernel="cauchy")
     for person in range(2):
         one = slice(person, person + 1)
-        seen = Observations(doubtful_wrist.xy[one], doubtful_wrist.confidence[one], doubtful_wrist.initial[one])
+        seen = Observations(
+            doubtful_wrist.xy[one], doubtful_wrist.confidence[one], doubtful_wrist.initial[one]
+        )
         alone = run(seen, five_cameras, FakeFitter(two_people[one] + 0.05), kernel="cauchy")
         np.testing.assert_allclose(both.joints[one], alone.joints, atol=1e-9)
 
@@ -362,13 +427,19 @@ def test_refuses_settings_that_make_no_sense():
         RefineConfig(alternations=0)
 
 
-def seen_of(rig: Rig, detections: Detections, truth: NDArray[np.float64], within_m: float) -> Observations:
-    """For every true joint and view the nearest detection, if it is `within_m` of it; association made easy.
+def seen_of(
+    rig: Rig, detections: Detections, truth: NDArray[np.float64], within_m: float
+) -> Observations:
+    """For every true joint and view the nearest detection, if it is `within_m` of it; association
+    made easy.
 
     Joints start where the views alone put them, or nowhere.
     """
     true_xy, depth = rig.project(truth)
-    xy, confidence = np.zeros((*truth.shape[:2], len(rig), 2)), np.zeros((*truth.shape[:2], len(rig)))
+    xy, confidence = (
+        np.zeros((*truth.shape[:2], len(rig), 2)),
+        np.zeros((*truth.shape[:2], len(rig))),
+    )
     for row in np.argsort(detections.confidence):
         view, joint = detections.view[row], detections.joint[row]
         off_px = np.linalg.norm(true_xy[view, :, joint] - detections.xy[row], axis=-1)
@@ -383,14 +454,19 @@ def seen_of(rig: Rig, detections: Detections, truth: NDArray[np.float64], within
 
 @pytest.mark.slow
 def test_the_alternation_helps_on_the_built_in_scene():
-    """Joints of low confidence end nearer the truth than triangulated, those of high confidence no farther."""
+    """Joints of low confidence end nearer the truth than triangulated, those of high confidence no
+    farther.
+    """
     from shapepose_fg.body.fitting.fitters import SmplFitter
     from shapepose_fg.simulation import DetectorConfig, built_in_scene, simulate
 
     scene = built_in_scene(frames=12)
     detections = simulate(scene, DetectorConfig(misses=3.0))  # many joints in two views
     seen = Observations.concatenate(
-        [seen_of(scene.rig, detections[n], scene.truth_at(n), within_m=0.3) for n in range(len(scene))]
+        [
+            seen_of(scene.rig, detections[n], scene.truth_at(n), within_m=0.3)
+            for n in range(len(scene))
+        ]
     )
     truth = scene.keypoints.reshape(-1, 25, 3)
     rows = replace(seen, track=np.arange(len(seen)))
@@ -398,7 +474,8 @@ def test_the_alternation_helps_on_the_built_in_scene():
     assert (result.status == Status.OK).all() and np.isfinite(result.joints).all()
     before, after = (np.linalg.norm(X - truth, axis=-1) for X in (seen.initial, result.joints))
     low, both = result.confidence < 0.25, np.isfinite(before)
-    # Measured: 79 low joints 36 -> 19 mm on average (median 32 -> 18), 1075 high ones 16.9 -> 15.9 mm.
+    # Measured: 79 low joints 36 -> 19 mm on average (median 32 -> 18), 1075 high ones 16.9 -> 15.9
+    # mm.
     assert (low & both).sum() >= 10 and (~low & both).sum() >= 800
     assert after[low & both].mean() < 0.7 * before[low & both].mean()
     assert np.median(after[low & both]) < np.median(before[low & both])

@@ -1,4 +1,6 @@
-"""Views that are exposed at other times: joints are measured where they are then, and reported at the frame's."""
+"""Views that are exposed at other times: joints are measured where they are then, and reported at
+the frame's.
+"""
 
 from dataclasses import replace
 
@@ -33,7 +35,9 @@ def moving() -> tuple[np.ndarray, np.ndarray]:
 
 
 def seen_at(rig: Rig, moving, time_s: np.ndarray, shutter_s: float = 0.0) -> np.ndarray:
-    """Exact pixels (T, J, V, 2) of joints that move in straight lines, by views exposed at `time_s` (T, V)."""
+    """Exact pixels (T, J, V, 2) of joints that move in straight lines, by views exposed at `time_s`
+    (T, V).
+    """
     places, velocity = moving
     late = np.zeros((len(time_s), 25, len(rig)))
     for _ in range(20):  # the row that shows a joint depends on when it is shown
@@ -47,18 +51,27 @@ def observed(rig: Rig, moving, time_s: np.ndarray, shutter_s: float = 0.0) -> Ob
     xy = seen_at(rig, moving, time_s, shutter_s)
     here = moving[0] + time_s.mean(axis=1)[:, None, None] * moving[1]
     return Observations(
-        xy, np.full(xy.shape[:3], 0.9), here, track=np.zeros(len(xy), int), frame=np.arange(len(xy)), time_s=time_s
+        xy,
+        np.full(xy.shape[:3], 0.9),
+        here,
+        track=np.zeros(len(xy), int),
+        frame=np.arange(len(xy)),
+        time_s=time_s,
     )
 
 
 def test_a_factor_of_a_moving_point_is_the_projection_to_first_order(five_cameras, moving):
-    """Error and slope of all views together against those of the projection at the views' own times."""
+    """Error and slope of all views together against those of the projection at the views' own
+    times.
+    """
     rig, (places, velocity) = five_cameras, moving
     x, v, uv = places[3], velocity[3], seen_at(five_cameras, moving, LEADS_S[None])[0, 3] + 2.0
     at = x + LEADS_S[:, None] * v
     pixel, _, slope = project_with_jacobian(at, rig.K, rig.cTw)
     keys = [joint_key(0, 3)] * 5, [velocity_key(0, 3)] * 5
-    factors = moving_projection_factors(*keys, LEADS_S, at, slope, pixel - uv, np.full(5, 1.5), "cauchy", 2.0)
+    factors = moving_projection_factors(
+        *keys, LEADS_S, at, slope, pixel - uv, np.full(5, 1.5), "cauchy", 2.0
+    )
     assert len(factors) == 1
     weight = 1 / (1 + (np.linalg.norm(pixel - uv, axis=1) / 1.5 / 2.0) ** 2)
 
@@ -77,11 +90,16 @@ def test_a_factor_of_a_moving_point_is_the_projection_to_first_order(five_camera
     for axis in np.eye(3):
         for along in ((step * axis, nothing), (nothing, 10 * step * axis)):
             back = tuple(-each for each in along)
-            assert error(*along) - error(*back) == pytest.approx(cost(*along) - cost(*back), rel=1e-4, abs=1e-7)
+            assert error(*along) - error(*back) == pytest.approx(
+                cost(*along) - cost(*back), rel=1e-4, abs=1e-7
+            )
 
 
 def test_observations_that_do_not_fit_are_refused():
-    keys, good = ([1, 1], [2, 2], [0.0, 0.01]), (np.ones((2, 3)), np.ones((2, 2, 3)), np.ones((2, 2)), np.ones(2))
+    keys, good = (
+        ([1, 1], [2, 2], [0.0, 0.01]),
+        (np.ones((2, 3)), np.ones((2, 2, 3)), np.ones((2, 2)), np.ones(2)),
+    )
     assert len(moving_projection_factors(*keys, *good)) == 1
     with pytest.raises(ValueError, match=r"points \(D, 3\)"):
         moving_projection_factors(*keys, good[0][:1], *good[1:])
@@ -93,13 +111,19 @@ def test_views_within_a_millisecond_are_of_one_time(five_cameras, moving):
     almost = np.arange(3)[:, None] / FPS + np.linspace(0, 9e-4, 5)
     observations, views = observed(five_cameras, moving, almost), Views.of(five_cameras)
     assert not leads(observations, views).any()
-    assert carried_to_frames(observations, observations.initial, np.ones((3, 25, 3)), views) is observations
+    assert (
+        carried_to_frames(observations, observations.initial, np.ones((3, 25, 3)), views)
+        is observations
+    )
 
 
 @pytest.mark.parametrize("shutter_s", [0.0, 0.02])
 def test_detections_are_carried_to_their_frame(five_cameras, moving, shutter_s):
     """Of straight motion with the true velocity nothing is left: under 0.01 px of up to 60."""
-    rig = replace(five_cameras, cameras=tuple(replace(each, readout_s=shutter_s) for each in five_cameras.cameras))
+    rig = replace(
+        five_cameras,
+        cameras=tuple(replace(each, readout_s=shutter_s) for each in five_cameras.cameras),
+    )
     time_s = np.arange(3)[:, None] / FPS + LEADS_S
     observations, views = observed(rig, moving, time_s, shutter_s), Views.of(rig)
     velocity = np.broadcast_to(moving[1], (3, 25, 3))
@@ -111,10 +135,14 @@ def test_detections_are_carried_to_their_frame(five_cameras, moving, shutter_s):
 
 @pytest.mark.parametrize("shutter_s", [0.0, 0.02])
 def test_a_window_places_joints_at_the_frames_time(five_cameras, moving, shutter_s):
-    """Exact detections, out of step: joints and velocities are right to 0.5 mm and 5 cm/s, by chains and by GTSAM,
-    where the mean of all views, taken for one time, is off by several millimetres.
+    """Exact detections, out of step: joints and velocities are right to 0.5 mm and 5 cm/s, by
+    chains and by GTSAM, where the mean of all views, taken for one time, is off by several
+    millimetres.
     """
-    rig = replace(five_cameras, cameras=tuple(replace(each, readout_s=shutter_s) for each in five_cameras.cameras))
+    rig = replace(
+        five_cameras,
+        cameras=tuple(replace(each, readout_s=shutter_s) for each in five_cameras.cameras),
+    )
     time_s = np.arange(12)[:, None] / FPS + LEADS_S
     timed = observed(rig, moving, time_s, shutter_s)
     motion = MotionModel.load(BODY_25.joints)
@@ -148,29 +176,41 @@ def test_a_window_places_joints_at_the_frames_time(five_cameras, moving, shutter
 def test_velocities_are_slopes_over_a_fifth_of_a_second():
     time_s = np.array([0.0, 0.03, 0.1, 0.13, 0.2])
     points = time_s[:, None, None] * np.array([[1.0, -2.0, 0.5]]) + 3.0
-    np.testing.assert_allclose(velocities(points, time_s), np.broadcast_to([1.0, -2.0, 0.5], (5, 1, 3)))
+    np.testing.assert_allclose(
+        velocities(points, time_s), np.broadcast_to([1.0, -2.0, 0.5], (5, 1, 3))
+    )
     assert np.isnan(velocities(points[:1], time_s[:1])).all()
 
 
 def out_of_step(scene, sub: int, places: list[int]) -> tuple[Recording, Recording]:
-    """A scene of `sub` times the rate: cameras in step, and cameras that are `places` (V,) of its frames late."""
+    """A scene of `sub` times the rate: cameras in step, and cameras that are `places` (V,) of its
+    frames late.
+    """
     of = {}
     for place in sorted({0, *places}):
-        of[place] = simulate(replace(scene, motion=scene.motion[place::sub], fps=scene.fps / sub), seed=4)
+        of[place] = simulate(
+            replace(scene, motion=scene.motion[place::sub], fps=scene.fps / sub), seed=4
+        )
     frames = []
     for t in range(len(of[0])):
         parts = [of[place][t].only(of[place][t].view == view) for view, place in enumerate(places)]
         first = np.cumsum([0, *map(len, parts)])
         columns = [np.concatenate([getattr(part, name) for part in parts])
                    for name in ("view", "joint", "xy", "confidence")]  # fmt: skip
-        pairs = np.concatenate([part.pairs + start for part, start in zip(parts, first, strict=False)])
-        frames.append(Detections(*columns, pairs, np.concatenate([part.affinity for part in parts])))
+        pairs = np.concatenate(
+            [part.pairs + start for part, start in zip(parts, first, strict=False)]
+        )
+        frames.append(
+            Detections(*columns, pairs, np.concatenate([part.affinity for part in parts]))
+        )
     return of[0], Recording(of[0].skeleton, frames)
 
 
 @pytest.mark.slow
 def test_cameras_out_of_step_are_as_good_as_in_step():
-    """Dancers at 8 Hz by four cameras up to 94 ms apart: 7 % more than in step at most, ignored 11 or more."""
+    """Dancers at 8 Hz by four cameras up to 94 ms apart: 7 % more than in step at most, ignored 11
+    or more.
+    """
     sub, places = 8, [0, 6, 2, 4]
     scene = built_in_scene(seed=4, people=2, cameras=4, frames=24 * sub, fps=8.0 * sub)
     in_step, apart = out_of_step(scene, sub, places)

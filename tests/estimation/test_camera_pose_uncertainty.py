@@ -22,7 +22,9 @@ COVARIANCE = ROOT.T @ ROOT
 def on_robot(rig: Rig, first: int) -> Rig:
     """The cameras from `first` on are carried by a robot at POSE, known to COVARIANCE."""
     wTb = POSE.matrix()
-    path = Trajectory("robot", np.array([0.0, 1.0]), np.stack([wTb] * 2), np.stack([COVARIANCE] * 2))
+    path = Trajectory(
+        "robot", np.array([0.0, 1.0]), np.stack([wTb] * 2), np.stack([COVARIANCE] * 2)
+    )
     cameras = [
         replace(each, carrier="robot", bTc=np.linalg.inv(wTb) @ each.wTc) if view >= first else each
         for view, each in enumerate(rig.cameras)
@@ -48,8 +50,11 @@ def test_joints_that_only_one_robot_sees_move_with_it(five_cameras, two_people):
     found = added(on_robot(five_cameras, 0), two_people)
     for person, joint in ((0, 0), (1, 17)):
         H = np.zeros((3, 6), order="F")
-        POSE.transformFrom(POSE.transformTo(two_people[person, joint]), H, np.zeros((3, 3), order="F"))
-        # Of a joint that nothing is said of the rest is made up: a millionth of the information here.
+        POSE.transformFrom(
+            POSE.transformTo(two_people[person, joint]), H, np.zeros((3, 3), order="F")
+        )
+        # Of a joint that nothing is said of the rest is made up: a millionth of the information
+        # here.
         np.testing.assert_allclose(found[person, joint], H @ COVARIANCE @ H.T, rtol=1e-3, atol=1e-9)
 
 
@@ -67,7 +72,9 @@ def test_of_fixed_cameras_and_a_robot_it_is_what_poses_drawn_from_their_covarian
     time_s, ends = np.zeros((2, 5)), []
     for error in rng.multivariate_normal(np.zeros(6), COVARIANCE, 400, method="cholesky"):
         moved = POSE.retract(error).matrix()
-        wrong = replace(rig, trajectories=(replace(rig.trajectories[0], wTb=np.stack([moved] * 2)),))
+        wrong = replace(
+            rig, trajectories=(replace(rig.trajectories[0], wTb=np.stack([moved] * 2)),)
+        )
         views, points = Views.of(wrong, time_s), two_people
         for _ in range(2):
             points = linearise(observations, sigmas, points, views, CONFIG).target

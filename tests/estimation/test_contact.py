@@ -4,11 +4,21 @@ import numpy as np
 import pytest
 
 from shapepose_fg.core.skeleton import BODY_25, COCO_17
-from shapepose_fg.estimation.contact import FIRST, FREE_M2_S, LASTS_S, NEXT, feet_of, smoothed, standing_density
+from shapepose_fg.estimation.contact import (
+    FIRST,
+    FREE_M2_S,
+    LASTS_S,
+    NEXT,
+    feet_of,
+    smoothed,
+    standing_density,
+)
 
 
 def walk(fps: float, noise: float, swing: float = 1.5):
-    """A foot that stands for a second, steps for half of one, and stands again, its velocities seen with noise."""
+    """A foot that stands for a second, steps for half of one, and stands again, its velocities seen
+    with noise.
+    """
     times = np.arange(round(2.5 * fps)) / fps
     speed = np.where((times > 1.0) & (times < 1.5), swing, 0.0)
     velocity = np.stack([speed, np.zeros_like(speed), np.zeros_like(speed)], axis=-1)[:, None]
@@ -43,7 +53,9 @@ def test_what_was_not_seen_says_nothing():
 
 
 def test_without_evidence_it_is_as_often_as_ever():
-    """Rates and shares of the three ways to move agree: a chain that nothing is seen of keeps its shares."""
+    """Rates and shares of the three ways to move agree: a chain that nothing is seen of keeps its
+    shares.
+    """
     rate = (NEXT - np.eye(3)) / LASTS_S[:, None]
     np.testing.assert_allclose(NEXT.sum(axis=1), 1.0)
     np.testing.assert_allclose(FIRST @ rate, 0.0, atol=0.06)

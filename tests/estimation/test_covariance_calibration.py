@@ -18,8 +18,8 @@ def clues(**changed):
     """One joint, known to 2 cm, that nothing speaks against."""
     nothing = np.zeros((1, 1, 3, 3))
     plain = CovarianceFeatures(
-        np.zeros(1, dtype=int), np.zeros((1, 1, 3)), np.full((1, 1), 2), np.full((1, 1, 3, 3), 4e-4 * I3),
-        np.zeros((1, 1)), nothing, nothing, nothing,
+        np.zeros(1, dtype=int), np.zeros((1, 1, 3)), np.full((1, 1), 2),
+        np.full((1, 1, 3, 3), 4e-4 * I3), np.zeros((1, 1)), nothing, nothing, nothing,
     )  # fmt: skip
     return replace(plain, **changed)
 
@@ -30,27 +30,44 @@ def test_each_clue_widens_what_it_speaks_of():
     )
     plain = calibration.covariance(clues())
     np.testing.assert_allclose(plain[0, 0], 0.8 * 4e-4 * I3)
-    np.testing.assert_allclose(calibration.covariance(clues(disagreement=np.full((1, 1), 3.0))), 2 * plain)
+    np.testing.assert_allclose(
+        calibration.covariance(clues(disagreement=np.full((1, 1), 3.0))), 2 * plain
+    )
     unseen = {"views": np.zeros((1, 1), dtype=int)}
-    np.testing.assert_allclose(calibration.covariance(clues(**unseen)), plain, err_msg="it is known to 2 cm")
-    for times, most in ((2.0, 2.0), (10.0, 4.0)):  # the person is known to so many times 2 cm; 4 is the most
+    np.testing.assert_allclose(
+        calibration.covariance(clues(**unseen)), plain, err_msg="it is known to 2 cm"
+    )
+    for times, most in (
+        (2.0, 2.0),
+        (10.0, 4.0),
+    ):  # the person is known to so many times 2 cm; 4 is the most
         wider = {"covariance": times**2 * clues().covariance}
         whole = np.exp(0.4 * np.log(most) ** 2) * times**2 * plain
         np.testing.assert_allclose(calibration.covariance(clues(**wider)), whole)
         carried = min(times, 3.0) ** 2
-        np.testing.assert_allclose(calibration.covariance(clues(**unseen, **wider)), carried * whole)
+        np.testing.assert_allclose(
+            calibration.covariance(clues(**unseen, **wider)), carried * whole
+        )
     along_x = np.diag([0.01, 0, 0])[None, None]
     for name, weight in (("association", 7.0), ("draft", 2.0), ("exchange", 0.5)):
-        np.testing.assert_allclose(calibration.covariance(clues(**{name: along_x})), plain + weight * along_x)
+        np.testing.assert_allclose(
+            calibration.covariance(clues(**{name: along_x})), plain + weight * along_x
+        )
 
 
 def test_the_numbers_that_ship():
-    """Both sides alike, joints that are not named as the mean; whoever is sure and agreed with is narrowed."""
+    """Both sides alike, joints that are not named as the mean; whoever is sure and agreed with is
+    narrowed.
+    """
     found = Calibration.load((*BODY_25.joints, "Tail"))
     by_name = dict(zip((*BODY_25.joints, "Tail"), found.scale.tolist(), strict=True))
-    assert all(by_name["L" + name[1:]] == scale for name, scale in by_name.items() if name.startswith("R"))
+    assert all(
+        by_name["L" + name[1:]] == scale for name, scale in by_name.items() if name.startswith("R")
+    )
     assert min(found.scale) < by_name["Tail"] < max(found.scale) < 1.5
-    assert by_name["Nose"] < by_name["RHip"], "a detector's hip is off for as long as somebody stands"
+    assert by_name["Nose"] < by_name["RHip"], (
+        "a detector's hip is off for as long as somebody stands"
+    )
     assert 0 < found.power < 2 and 0 < found.unseen < 2 and 0 < found.person < 2
     assert found.association > 1, "doubts of neighbouring joints and frames are one"
     assert 0 < found.exchange < 1, "a probability"
@@ -58,8 +75,9 @@ def test_the_numbers_that_ship():
 
 
 def test_disagreement_is_the_distance_in_both_sigmas():
-    """10 cm between a joint of 3 cm and a body of 4 cm is two sigmas. A body that says nothing contradicts
-    nobody, and nobody contradicts a joint that is not known."""
+    """10 cm between a joint of 3 cm and a body of 4 cm is two sigmas. A body that says nothing
+    contradicts nobody, and nobody contradicts a joint that is not known.
+    """
     joints = np.zeros((1, 3, 3))
     joints[0, 2] = np.nan
     covariance = np.broadcast_to(9e-4 * I3, (1, 3, 3, 3))
@@ -75,7 +93,9 @@ def test_disagreement_is_the_distance_in_both_sigmas():
 
 
 def test_doubt_lasts_and_is_carried_through_a_gap():
-    """One doubtful frame among eleven; then ten without a view, which have the doubt of those nearest to them."""
+    """One doubtful frame among eleven; then ten without a view, which have the doubt of those
+    nearest to them.
+    """
     times = np.arange(21) / 20
     spread, seen = np.zeros((21, 1, 3, 3)), np.ones((21, 1), dtype=bool)
     spread[10, 0], seen[11:] = np.eye(3) * 1e-4, False
@@ -84,7 +104,9 @@ def test_doubt_lasts_and_is_carried_through_a_gap():
     np.testing.assert_allclose(found[5], 1e-4 * weight[10] / weight.sum(), rtol=1e-6)
     assert (np.diff(found) > 0).all(), "the farther on from the frames that were certain, the more"
     assert found[-1] < 1e-4
-    np.testing.assert_allclose(smoothed_in_time(spread[10:11], times[10:11], LASTS_S, seen[10:11]), spread[10:11])
+    np.testing.assert_allclose(
+        smoothed_in_time(spread[10:11], times[10:11], LASTS_S, seen[10:11]), spread[10:11]
+    )
 
 
 @pytest.mark.parametrize("per_s", [10, 60])
@@ -93,5 +115,7 @@ def test_what_lasts_is_the_same_at_any_rate(per_s):
     times = np.arange(3 * per_s) / per_s
     values = ((times >= 1.0) & (times < 1.5)).astype(float)[:, None]
     found = smoothed_in_time(values, times, LASTS_S)[:, 0]
-    assert found[np.searchsorted(times, 1.25)] == pytest.approx(0.68, abs=0.06), "one sigma on either side"
+    assert found[np.searchsorted(times, 1.25)] == pytest.approx(0.68, abs=0.06), (
+        "one sigma on either side"
+    )
     assert found[np.searchsorted(times, 2.5)] < 1e-3

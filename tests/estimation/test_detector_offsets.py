@@ -69,7 +69,9 @@ def exact(scene: Scene) -> JointTargets:
 
 
 def left_out_error_mm(model: BodyModel, scene: Scene) -> float:
-    """How far from a joint the body puts it that is fitted to all the others: mean, exact targets."""
+    """How far from a joint the body puts it that is fitted to all the others: mean, exact
+    targets.
+    """
     targets = exact(scene)
     fit = SmplFitter(model).fit(targets)
     assert fit.ok.all()
@@ -90,10 +92,12 @@ def test_the_body_predicts_the_joints_of_the_detector(scene, odd_scene, odd_offs
 def test_offsets_that_no_pose_explains_are_recovered(odd_offsets):
     offsets = odd_offsets
     error = dict(zip(BODY_25.joints, 1e3 * (offsets.xyz_m - ODD.xyz_m), strict=True))
-    # Hips farther apart, the nose farther out: no turn of a bone does that. Two sigmas of some 8 mm.
+    # Hips farther apart, the nose farther out: no turn of a bone does that. Two sigmas of some 8
+    # mm.
     assert abs(error["LHip"][0]) < 16 and abs(error["RHip"][0]) < 16
     assert abs(error["Nose"][2]) < 16 and abs(error["Neck"][1]) < 16
-    # All of them, also what a turn of a bone or a longer limb could be, are nearer to the truth than zero is.
+    # All of them, also what a turn of a bone or a longer limb could be, are nearer to the truth
+    # than zero is.
     off = np.linalg.norm(offsets.xyz_m - ODD.xyz_m, axis=1)
     moved = np.linalg.norm(ODD.xyz_m, axis=1) > 0
     assert off[moved].mean() < 0.6 * np.linalg.norm(ODD.xyz_m[moved], axis=1).mean()
@@ -105,7 +109,8 @@ def test_offsets_that_no_pose_explains_are_recovered(odd_offsets):
 def test_no_offsets_are_found_where_there_are_none(scene):
     recording = simulate(scene, seed=0)
     offsets = estimate_offsets(recording, scene.rig)
-    # Learnt from 64 bodies with errors of 20 mm and of a pose prior that never fits exactly: some millimetres.
+    # Learnt from 64 bodies with errors of 20 mm and of a pose prior that never fits exactly: some
+    # millimetres.
     assert np.linalg.norm(offsets.xyz_m, axis=1).mean() < 0.006
     harmed = left_out_error_mm(scene.body.with_keypoint_offsets(offsets), scene)
     assert harmed < left_out_error_mm(scene.body, scene) + 1.0
@@ -113,7 +118,9 @@ def test_no_offsets_are_found_where_there_are_none(scene):
 
 @pytest.mark.slow
 def test_offsets_are_learnt_from_frames_that_are_thinned_as_in_a_run(scene):
-    """Every detection is there four times, 2 px aside; eight of a joint stay in a view, of four people."""
+    """Every detection is there four times, 2 px aside; eight of a joint stay in a view, of four
+    people.
+    """
     config = PipelineConfig(people=PeopleConfig(most_pairs=1000))
     rng, frames = np.random.default_rng(0), []
     for seen in simulate(scene, seed=0, frames=range(3)):
@@ -121,13 +128,23 @@ def test_offsets_are_learnt_from_frames_that_are_thinned_as_in_a_run(scene):
         confidence = np.tile(seen.confidence, 4) * np.repeat([1.0, 0.99, 0.98, 0.97], len(seen))
         view, joint = np.tile(seen.view, 4), np.tile(seen.joint, 4)
         frames.append(
-            replace(seen, view=view, joint=joint, xy=xy, confidence=confidence, place=None, mirrored=None)
+            replace(
+                seen,
+                view=view,
+                joint=joint,
+                xy=xy,
+                confidence=confidence,
+                place=None,
+                mirrored=None,
+            )
         )
     recording = Recording(BODY_25, frames)
     thinned = ThinnedFrames(recording, scene.rig, config.candidates)
     assert all(thinned.is_thinned(frame) for frame in range(3))
     found = estimate_offsets(recording, scene.rig, config)
-    expected = estimate_offsets(Recording(BODY_25, [thinned[frame] for frame in range(3)]), scene.rig, config)
+    expected = estimate_offsets(
+        Recording(BODY_25, [thinned[frame] for frame in range(3)]), scene.rig, config
+    )
     np.testing.assert_array_equal(found.xyz_m, expected.xyz_m)
 
 
@@ -153,7 +170,8 @@ def test_nothing_to_learn_from_is_nothing_learnt(scene):
     for targets in (nobody, unseen):
         offsets = learn_offsets(targets, scene.body)
         assert not offsets.xyz_m.any() and not offsets.count.any()
-        # The prior's sigma: half of the variance is symmetric, half is not, and only the first half is wide.
+        # The prior's sigma: half of the variance is symmetric, half is not, and only the first half
+        # is wide.
         assert (offsets.sigma_m > 0.011).all() and (offsets.sigma_m < 0.02).all()
 
 
@@ -175,7 +193,9 @@ def seen_by(views: int, confidence: float, scene: Scene) -> Observations:
     return Observations(xy, np.broadcast_to(seen, xy.shape[:3]).copy(), truth)
 
 
-@pytest.mark.parametrize(("views", "confidence", "used"), [(6, 0.8, True), (2, 0.8, False), (6, 0.3, False)])
+@pytest.mark.parametrize(
+    ("views", "confidence", "used"), [(6, 0.8, True), (2, 0.8, False), (6, 0.3, False)]
+)
 def test_only_what_three_views_see_well_is_learnt_from(scene, views, confidence, used):
     observations = seen_by(views, confidence, scene)
     targets = confident_targets(observations, scene.rig, ObservationConfig())
@@ -191,7 +211,9 @@ def test_frames_are_spread_over_the_recording():
 
 
 @pytest.mark.slow
-def test_the_run_records_the_offsets_and_a_file_brings_them_back(scene, odd_recording, odd_offsets, tmp_path):
+def test_the_run_records_the_offsets_and_a_file_brings_them_back(
+    scene, odd_recording, odd_offsets, tmp_path
+):
     learnt = reconstruct(odd_recording, scene.rig, frames=range(2))
     learnt.save(tmp_path)
     recorded = KeypointOffsets.load(tmp_path / "run.json")
@@ -222,7 +244,10 @@ class PlainFitter(BodyFitter):
         self._fitter = SmplFitter()
 
     def fit(
-        self, targets: JointTargets, initial: BodyFit | None = None, groups: np.ndarray | None = None
+        self,
+        targets: JointTargets,
+        initial: BodyFit | None = None,
+        groups: np.ndarray | None = None,
     ) -> BodyFit:
         return self._fitter.fit(targets, initial)
 
@@ -245,4 +270,8 @@ def test_a_detector_s_own_skeleton_moves_the_candidates_and_not_the_people(scene
     distance = np.linalg.norm(seen.xy[here][:, None] - true_xy[0, :, hip], axis=-1).min(axis=1)
     assert here.any() and distance.max() < 1e-6
     np.testing.assert_array_equal(scene.vertices_at(0), odd_scene.vertices_at(0))
-    assert json.loads(json.dumps(exactly.as_dict()))["offsets"]["joints"]["LHip"]["xyz_mm"] == [35.0, 30.0, 0.0]
+    assert json.loads(json.dumps(exactly.as_dict()))["offsets"]["joints"]["LHip"]["xyz_mm"] == [
+        35.0,
+        30.0,
+        0.0,
+    ]

@@ -36,9 +36,13 @@ def with_a_neighbour_s_leg(alone: bool, scene: Scene = SCENE) -> tuple[Observati
     xy, wrong = (np.moveaxis(scene.rig.project(joints)[0], 0, 2) for joints in (noisy, aside))
     xy[:, LEG, 3:] = wrong[:, LEG, 3:]
     N = len(truth)
-    rows = Observations(xy, np.full(xy.shape[:3], 0.8), np.full(truth.shape, np.nan), frame=np.array(FRAMES))
+    rows = Observations(
+        xy, np.full(xy.shape[:3], 0.8), np.full(truth.shape, np.nan), frame=np.array(FRAMES)
+    )
     rows = replace(rows, track=np.arange(N) if alone else np.zeros(N, dtype=int))
-    return replace(rows, time_s=np.broadcast_to(np.array(FRAMES)[:, None] / scene.fps, rows.time_s.shape)), truth
+    return replace(
+        rows, time_s=np.broadcast_to(np.array(FRAMES)[:, None] / scene.fps, rows.time_s.shape)
+    ), truth
 
 
 def ankle_errors(fitter, alone: bool) -> np.ndarray:
@@ -50,9 +54,11 @@ def ankle_errors(fitter, alone: bool) -> np.ndarray:
 
 
 def test_a_neighbour_s_leg_loses_its_hold_on_the_body(fitter, monkeypatch):
-    """Half of the views say it is half a metre aside, and nothing but the rest of the body can tell.
+    """Half of the views say it is half a metre aside, and nothing but the rest of the body can
+    tell.
 
-    Over five scenes 275 mm without, 170 with, between 8 and 317: on the way from between the two legs to his own.
+    Over five scenes 275 mm without, 170 with, between 8 and 317: on the way from between the two
+    legs to his own.
     """
     for alone in (True, False):
         after = ankle_errors(fitter, alone)
@@ -77,15 +83,20 @@ class Counting(BodyFitter):
 
 
 def test_bodies_are_fitted_again_only_where_their_targets_have_changed(fitter, monkeypatch):
-    """Of three scenes twenty rows, half of them with the neighbour's leg in three views: about as when all are
-    fitted every time.
+    """Of three scenes twenty rows, half of them with the neighbour's leg in three views: about as
+    when all are fitted every time.
     """
     count, moved_m, apart_m = len(FRAMES), draft.MOVED_M, []
-    for scene in (SCENE, *(built_in_scene(seed, people=2, frames=40, cameras=6) for seed in (4, 5))):
+    for scene in (
+        SCENE,
+        *(built_in_scene(seed, people=2, frames=40, cameras=6) for seed in (4, 5)),
+    ):
         disturbed, truth = with_a_neighbour_s_leg(True, scene)
         noisy = truth + np.random.default_rng(1).normal(0, 5e-3, truth.shape)
         clean = np.moveaxis(scene.rig.project(noisy)[0], 0, 2)
-        rows = Observations.concatenate([disturbed, replace(disturbed, xy=clean, track=disturbed.track + count)])
+        rows = Observations.concatenate(
+            [disturbed, replace(disturbed, xy=clean, track=disturbed.track + count)]
+        )
         drafts, fitted = [], []
         for again_m in (moved_m, -1.0):
             monkeypatch.setattr(draft, "MOVED_M", again_m)
@@ -94,15 +105,22 @@ def test_bodies_are_fitted_again_only_where_their_targets_have_changed(fitter, m
             fitted.append(counting.rows)
         assert fitted[1] == [2 * count] * (1 + len(draft.NARROWING_M))
         # At first every disturbed row, a clean one hardly ever; later those that have not settled.
-        assert fitted[0][0] == 2 * count and count / 2 < fitted[0][1] and max(fitted[0][1:]) < 2 * count
+        assert (
+            fitted[0][0] == 2 * count
+            and count / 2 < fitted[0][1]
+            and max(fitted[0][1:]) < 2 * count
+        )
         apart_m.append(np.linalg.norm(drafts[0] - drafts[1], axis=-1).max(axis=1))
         assert apart_m[-1][count:].max() < 1e-3
-    # A detection near its gate may fall on either side of it. With targets that count as unmoved: 2.8 to 24 mm.
+    # A detection near its gate may fall on either side of it. With targets that count as unmoved:
+    # 2.8 to 24 mm.
     assert np.mean(apart_m) < moved_m / 8
 
 
 def test_rows_whose_detections_stay_keep_their_drafts(fitter):
-    """Of ten rows three get a neighbour's leg: they are drafted as from the start, nobody else is fitted again."""
+    """Of ten rows three get a neighbour's leg: they are drafted as from the start, nobody else is
+    fitted again.
+    """
     rows, truth = with_a_neighbour_s_leg(True)
     xy = np.moveaxis(SCENE.rig.project(truth)[0], 0, 2)
     clean, views, others = replace(rows, xy=xy), Views.of(SCENE.rig), [2, 5, 8]
@@ -148,6 +166,8 @@ def test_a_probability_that_creeps_is_drafted_anew_when_it_has_gone_far(fitter):
         now = rows.probability.copy()
         now[4, LEG[1], 0] = probability
         counting = Counting(fitter)
-        last = draft.redraft(last, replace(rows, probability=now), views, counting, EstimatorConfig())
+        last = draft.redraft(
+            last, replace(rows, probability=now), views, counting, EstimatorConfig()
+        )
         fitted.append(counting.rows[:1])
     assert fitted == [[], [1], []]

@@ -9,7 +9,9 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 def feet(heights, seed: int = 0):
-    """Soles somewhere in a room of 4 x 4 m, one look of five frames at each of these heights, to 1 cm."""
+    """Soles somewhere in a room of 4 x 4 m, one look of five frames at each of these heights, to 1
+    cm.
+    """
     rng = np.random.default_rng(seed)
     places = np.column_stack([rng.uniform(-2, 2, (len(heights), 2)), heights])
     look = np.repeat(np.arange(len(heights)), 5)
@@ -22,9 +24,12 @@ def test_most_feet_say_where_it_is():
     floor = find_floor(points, look, UP)
     assert isinstance(floor, Floor)
     assert floor.looks == 50 and floor.share == pytest.approx(0.8)
-    # 200 points to 1 cm: a millimetre under their middle, and three at the corners, for it may lean.
+    # 200 points to 1 cm: a millimetre under their middle, and three at the corners, for it may
+    # lean.
     assert abs(floor.height_m - 0.3) < 0.006
-    np.testing.assert_allclose(floor.above(np.array([[2.0, 2.0, 0.3], [0.0, 0.0, 1.3]])), [0.0, 1.0], atol=0.005)
+    np.testing.assert_allclose(
+        floor.above(np.array([[2.0, 2.0, 0.3], [0.0, 0.0, 1.3]])), [0.0, 1.0], atol=0.005
+    )
     assert Floor.from_dict(floor.as_dict()).above(UP) == floor.above(UP)
     assert Floor.from_dict({"found": False, "why": "dark"}) is None
 
@@ -38,7 +43,9 @@ def test_a_few_feet_that_are_placed_badly_are_no_floor():
 def test_it_may_lean_and_up_may_be_any_axis():
     points, look = feet([0.0] * 60)
     lean = np.deg2rad(0.8)
-    points = points @ np.array([[np.cos(lean), 0, np.sin(lean)], [0, 1, 0], [-np.sin(lean), 0, np.cos(lean)]])
+    points = points @ np.array(
+        [[np.cos(lean), 0, np.sin(lean)], [0, 1, 0], [-np.sin(lean), 0, np.cos(lean)]]
+    )
     floor = find_floor(points[:, [1, 2, 0]], look, np.array([0.0, 1.0, 0.0]))
     assert isinstance(floor, Floor)
     # 60 measurements outweigh a prior of half a degree.
@@ -65,5 +72,7 @@ def test_there_may_be_none(heights, why):
 def test_a_look_counts_once_however_long_it_is():
     points, look = feet([0.0] * 12 + [0.5] * 4)
     long = np.repeat(np.flatnonzero(look == 15), 200)
-    floor = find_floor(np.concatenate([points, points[long]]), np.concatenate([look, look[long]]), UP)
+    floor = find_floor(
+        np.concatenate([points, points[long]]), np.concatenate([look, look[long]]), UP
+    )
     assert isinstance(floor, Floor) and abs(floor.height_m) < 0.01

@@ -11,7 +11,9 @@ SURE, OPEN = 1e-4 * np.eye(3), 0.25 * np.eye(3)
 
 
 def arm(elbow, wrist):
-    """A person (1, 25, 3) with a right arm, elbow and wrist uncertain by 50 cm; and which joints may move."""
+    """A person (1, 25, 3) with a right arm, elbow and wrist uncertain by 50 cm; and which joints
+    may move.
+    """
     joints = np.full((1, 25, 3), np.nan)
     joints[0, [SHOULDER, ELBOW, WRIST]] = [0.0, 0.0, 1.4], elbow, wrist
     covariance = np.tile(SURE, (1, 25, 1, 1))
@@ -41,7 +43,9 @@ def test_the_length_is_the_body_s_over_all_frames():
 
 
 def test_a_torn_arm_comes_together_and_what_is_known_stays():
-    """The forearm is 70 cm long and should be 25: nine tenths of what is too much goes, the shoulder stays."""
+    """The forearm is 70 cm long and should be 25: nine tenths of what is too much goes, the
+    shoulder stays.
+    """
     joints, covariance, moved = arm([0.0, 0.0, 1.1], [0.0, 0.7, 1.1])
     done = with_lengths(joints, covariance, moved, lengths(0.3, 0.25), LIMBS)[0]
     assert abs(np.linalg.norm(done[WRIST] - done[ELBOW]) - 0.25) < 0.045

@@ -1,4 +1,6 @@
-"""A detector that reports nothing where a joint is in plain view: counted by hand in a room with four cameras."""
+"""A detector that reports nothing where a joint is in plain view: counted by hand in a room with
+four cameras.
+"""
 
 import numpy as np
 import pytest
@@ -22,10 +24,14 @@ def variance(rig, people, strong):
 
 
 def raised(two_people):
-    """The first person with the right arm stretched out to the side, high: no limb is before the wrist."""
+    """The first person with the right arm stretched out to the side, high: no limb is before the
+    wrist.
+    """
     person = two_people[:1].copy()
     away = person[0, BODY_25.index("RShoulder")] - person[0, BODY_25.index("LShoulder")]
-    person[0, BODY_25.index("RElbow")] = person[0, BODY_25.index("RShoulder")] + 0.3 * away / 0.36 + [0, 0, 0.3]
+    person[0, BODY_25.index("RElbow")] = (
+        person[0, BODY_25.index("RShoulder")] + 0.3 * away / 0.36 + [0, 0, 0.3]
+    )
     person[0, WRIST] = person[0, BODY_25.index("RElbow")] + [0, 0, 0.3]
     return person
 
@@ -43,7 +49,9 @@ def test_a_wrist_that_nobody_reports_is_elsewhere_the_likelier_the_more_views_lo
     assert not np.delete(found, WRIST, axis=1).any(), "what one view reports is where it reports it"
 
 
-def test_a_wrist_behind_somebody_is_hidden_and_one_outside_the_picture_is_not_looked_at(five_cameras, two_people):
+def test_a_wrist_behind_somebody_is_hidden_and_one_outside_the_picture_is_not_looked_at(
+    five_cameras, two_people
+):
     """A second person halfway to a camera takes it away; so does a step out of its picture."""
     rig, person = Rig(five_cameras.cameras[:3], five_cameras.up), raised(two_people)
     strong = np.ones((1, 25, 3), dtype=bool)

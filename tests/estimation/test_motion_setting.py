@@ -28,10 +28,14 @@ class NoFitter(BodyFitter):
 
 @pytest.mark.slow
 def test_constant_acceleration_the_whole_way():
-    """Two people before four cameras: tracked, solved, bodies linked, as near to the truth as by default."""
+    """Two people before four cameras: tracked, solved, bodies linked, as near to the truth as by
+    default.
+    """
     scene = built_in_scene(people=2, cameras=4, frames=24)
     detections, by_default = simulate(scene), PipelineConfig()
-    config = replace(by_default, solving=replace(by_default.solving, motion="constant acceleration"))
+    config = replace(
+        by_default, solving=replace(by_default.solving, motion="constant acceleration")
+    )
     errors = []
     for each in (by_default, config):
         people = reconstruct(detections, scene.rig, each, times=FrameTimes.from_fps(scene.fps, 24))
@@ -47,8 +51,8 @@ def test_constant_acceleration_the_whole_way():
         ):
             away = (found - truth)[..., None]
             inside = (away.mT @ np.linalg.solve(covariance, away))[..., 0, 0] < 7.815
-            # Of two people few errors are independent: 83 to 94 %. With half the covariance 52 to 69 % of joints,
-            # with a quarter 50 to 71 % of velocities.
+            # Of two people few errors are independent: 83 to 94 %. With half the covariance 52 to
+            # 69 % of joints, with a quarter 50 to 71 % of velocities.
             assert 0.75 < inside.mean() <= 1.0
         assert (people.status == Status.OK).all() and np.isfinite(people.body_pose).all()
     assert errors[1] < 1.1 * errors[0]
@@ -57,7 +61,8 @@ def test_constant_acceleration_the_whole_way():
 
 def test_the_setting_is_checked():
     with pytest.raises(
-        ValueError, match="motion must be one of constant velocity, constant acceleration, got straight"
+        ValueError,
+        match="motion must be one of constant velocity, constant acceleration, got straight",
     ):
         SolvingConfig(motion="straight")
 
@@ -74,10 +79,14 @@ def test_other_processes_need_not_know_a_model_of_one_s_own(monkeypatch, five_ca
 
 
 def test_densities_are_those_of_equal_uncertainty():
-    """After the time that is asked for, white accelerations and the model's own noise leave positions alike."""
+    """After the time that is asked for, white accelerations and the model's own noise leave
+    positions alike.
+    """
     law = PipelineConfig(solving=SolvingConfig(motion="constant acceleration")).law
     speed = np.array([0.0, 2.0])[:, None]
     own, by_default = MotionModel.load(("RWrist",), law=law), MotionModel.load(("RWrist",))
     for within_s in (0.1, 0.4):
         expected = by_default.law.noise(within_s, by_default.density(speed))[..., 0, 0]
-        np.testing.assert_allclose(law.noise(within_s, own.density(speed, within_s))[..., 0, 0], expected)
+        np.testing.assert_allclose(
+            law.noise(within_s, own.density(speed, within_s))[..., 0, 0], expected
+        )

@@ -1,4 +1,6 @@
-"""How far a detector's joints lie from the true ones, learnt without truth; what covariances make of it."""
+"""How far a detector's joints lie from the true ones, learnt without truth; what covariances make
+of it.
+"""
 
 import json
 from dataclasses import replace
@@ -16,7 +18,13 @@ from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.core.storage.kept_arrays import InMemory
 from shapepose_fg.estimation.detector_offsets import OffsetConfig
 from shapepose_fg.estimation.linearisation import ObservationConfig
-from shapepose_fg.estimation.noise_law import GROSS_M, NoiseLaw, Residuals, core_sigma_m, variance_ratio
+from shapepose_fg.estimation.noise_law import (
+    GROSS_M,
+    NoiseLaw,
+    Residuals,
+    core_sigma_m,
+    variance_ratio,
+)
 from shapepose_fg.evaluation.metrics import covariance_calibration, match_people
 from shapepose_fg.pipeline import offsets
 from shapepose_fg.pipeline.config import PipelineConfig
@@ -32,7 +40,9 @@ SCORES = np.array([0.2, 0.4, 0.6, 0.75, 0.85, 0.95])
 
 
 def residuals(rig, rows, noise=1.0, gross=0.0, seed=0) -> Residuals:
-    """Of people who stand about; errors are `noise` times those of Eq. 1's weights, a share of them `gross`."""
+    """Of people who stand about; errors are `noise` times those of Eq. 1's weights, a share of them
+    `gross`.
+    """
     rng = np.random.default_rng(seed)
     points = rng.uniform(-1.0, 1.0, (rows, len(BODY_25), 3)) + np.array([0.0, 0.0, 1.0])
     xy, depth = (np.moveaxis(each, 0, 2) for each in rig.project(points))
@@ -60,11 +70,17 @@ def test_the_law_is_found_without_truth(five_cameras, noise, gross):
 def test_few_detections_keep_what_ships(five_cameras):
     few, many = residuals(five_cameras, 1, noise=2.0), residuals(five_cameras, 60, noise=2.0)
     shipped = NoiseLaw.shipped()
-    one = Residuals(few.score[:5], few.scatter[:5], few.squared[:5], few.others[:5], few.of_others[:5])
+    one = Residuals(
+        few.score[:5], few.scatter[:5], few.squared[:5], few.others[:5], few.of_others[:5]
+    )
     np.testing.assert_allclose(one.law().times, shipped.times, rtol=0.2)
-    apart = [np.abs(np.log(np.divide(each.law().times, shipped.times))).max() for each in (few, many)]
+    apart = [
+        np.abs(np.log(np.divide(each.law().times, shipped.times))).max() for each in (few, many)
+    ]
     assert apart[0] < 0.8 * apart[1]
-    nothing = Residuals(few.score[:0], few.scatter[:0], few.squared[:0], few.others[:0], few.of_others[:0])
+    nothing = Residuals(
+        few.score[:0], few.scatter[:0], few.squared[:0], few.others[:0], few.of_others[:0]
+    )
     np.testing.assert_allclose(nothing.law().times, shipped.times, rtol=1e-4)
     np.testing.assert_allclose(nothing.law().gross, shipped.gross, atol=1e-4)
 
@@ -88,7 +104,9 @@ def test_covariances_follow_the_law():
     assert ratio(half, alone=True) == 1.0, "the graph of one frame is the least"
     assert 1.0 < ratio(twice, body=1e5) < 4.0, "the body's errors average over time"
     assert ratio(twice, body=1e5, alone=True) == pytest.approx(4.0, rel=1e-3)
-    assert ratio(shipped, score=0.2) == 1.0, "over time, covariances are calibrated with gross errors"
+    assert ratio(shipped, score=0.2) == 1.0, (
+        "over time, covariances are calibrated with gross errors"
+    )
     gross = (np.array(shipped.gross)[1] - np.array(shipped.gross)[4:].mean()) * GROSS_M**2 / 0.02**2
     assert ratio(shipped, score=0.2, alone=True) == pytest.approx(1 + gross, rel=0.05)
     assert ratio(twice, views=0, body=1e4) == 1.0, "nothing of the person was seen"
@@ -121,7 +139,9 @@ def test_2d_people_are_taken_whole_but_for_what_others_have(five_cameras, two_pe
     away = np.linalg.norm(found.xy[:, None] - xy[found.view, :, found.joint], axis=-1)
     own = np.full((2, 25, 5), -1)
     own[away.argmin(axis=1), found.joint, found.view] = np.arange(len(found))
-    chosen = np.where(np.arange(25)[:, None] < 20, own, -1)  # five joints of each 2D person were not used
+    chosen = np.where(
+        np.arange(25)[:, None] < 20, own, -1
+    )  # five joints of each 2D person were not used
     np.testing.assert_array_equal(whole_people(chosen, found), own)
     other = chosen.copy()
     other[1, 22, 0] = own[0, 22, 0]
@@ -135,7 +155,11 @@ def test_2d_people_are_taken_whole_but_for_what_others_have(five_cameras, two_pe
 def noisy():
     """Four people before five cameras, 20 frames; the detector has twice the usual errors."""
     scene = built_in_scene(seed=3, cameras=5, frames=20)
-    return scene, simulate(scene, DetectorConfig(noise=2.0), seed=3), FrameTimes.from_fps(scene.fps, 20)
+    return (
+        scene,
+        simulate(scene, DetectorConfig(noise=2.0), seed=3),
+        FrameTimes.from_fps(scene.fps, 20),
+    )
 
 
 @pytest.fixture
@@ -179,7 +203,9 @@ def test_regions_hold_for_a_detector_with_twice_the_errors(noisy, of_few_frames,
         return covariance_calibration(off, people.covariance[found.row]).coverage[0.95]
 
     people = reconstruct(recording, scene.rig, times=times)
-    usual = reconstruct(recording, scene.rig, PipelineConfig(offsets=OffsetConfig("none")), times=times)
+    usual = reconstruct(
+        recording, scene.rig, PipelineConfig(offsets=OffsetConfig("none")), times=times
+    )
     assert abs(inside(people) - 0.95) < 0.5 * abs(inside(usual) - 0.95)
     assert inside(people) > 0.8
     two = reconstruct(recording, scene.rig, times=times, execution=Execution(workers=2))

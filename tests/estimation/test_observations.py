@@ -27,7 +27,9 @@ def observations_of(
     rng = np.random.default_rng(seed)
     xy = np.moveaxis(rig.project(people)[0], 0, 2)
     xy = xy + rng.normal(0, noise_px, xy.shape)
-    return Observations(xy, rng.uniform(0.3, 1.0, xy.shape[:3]), people if initial is None else initial)
+    return Observations(
+        xy, rng.uniform(0.3, 1.0, xy.shape[:3]), people if initial is None else initial
+    )
 
 
 def without(observations: Observations, unseen: NDArray[np.bool_]) -> Observations:
@@ -40,10 +42,14 @@ def without(observations: Observations, unseen: NDArray[np.bool_]) -> Observatio
 
 @pytest.fixture(scope="module")
 def two_views() -> Rig:
-    """One at the origin looks along z, one at (2, 0, 2) along -x: 1000 px, joints are 2 m from both."""
+    """One at the origin looks along z, one at (2, 0, 2) along -x: 1000 px, joints are 2 m from
+    both.
+    """
     K = np.array([[1000.0, 0, 500], [0, 1000, 400], [0, 0, 1]])
     side = np.array([[0.0, 0, -1, 2], [0, 1, 0, 0], [1, 0, 0, 2], [0, 0, 0, 1]])
-    return Rig((Camera("front", K, np.eye(4), (1000, 800)), Camera("side", K, side, (1000, 800))), "-y")
+    return Rig(
+        (Camera("front", K, np.eye(4), (1000, 800)), Camera("side", K, side, (1000, 800))), "-y"
+    )
 
 
 def seen_at(rig: Rig, xy: NDArray[np.float64], point: NDArray[np.float64]) -> Observations:
@@ -54,18 +60,27 @@ def seen_at(rig: Rig, xy: NDArray[np.float64], point: NDArray[np.float64]) -> Ob
 def test_sigma_is_the_detector_s_error_at_the_joint_s_depth(two_views):
     config = ObservationConfig(sigma_m=0.02, floor_rad=0.003)
     points = np.array([[[0.0, 0, 2], [0, 0, 1], [0, 0, np.nan]]])
-    seen = Observations(np.zeros((1, 3, 2, 2)), np.array([[[1.0, 0.0], [1.0, 0.25], [1.0, 0.0]]]), points)
-    sigma = observation_sigmas(seen, points, Views.of(two_views), config, ("Snout", "RAnkle", "Tail"))[0]
-    # 2 cm are 10 px at 2 m and 20 px at 1 m; unknown joints are taken at the mean depth of the others, 1.5 m.
+    seen = Observations(
+        np.zeros((1, 3, 2, 2)), np.array([[[1.0, 0.0], [1.0, 0.25], [1.0, 0.0]]]), points
+    )
+    sigma = observation_sigmas(
+        seen, points, Views.of(two_views), config, ("Snout", "RAnkle", "Tail")
+    )[0]
+    # 2 cm are 10 px at 2 m and 20 px at 1 m; unknown joints are taken at the mean depth of the
+    # others, 1.5 m.
     expected = np.hypot(3.0, [10.0, 20.0, 20.0 / 1.5])
     np.testing.assert_allclose(sigma[:, 0], expected)
     assert sigma[0, 1] == 0 and sigma[2, 1] == 0, "unseen"
     weight = (0.25**config.confidence_power + config.least_weight) / (1 + config.least_weight)
-    assert sigma[1, 1] == pytest.approx(np.hypot(3.0, 10.0) / np.sqrt(weight)) and weight < 0.1, "the less sure"
+    assert sigma[1, 1] == pytest.approx(np.hypot(3.0, 10.0) / np.sqrt(weight)) and weight < 0.1, (
+        "the less sure"
+    )
     joints = ("MidHip", "RAnkle", "LEye")
     by_joint = observation_sigmas(seen, points, Views.of(two_views), config, joints)[0, :, 0]
     np.testing.assert_allclose(by_joint / expected, config.scatter(joints))
-    assert by_joint[0] / expected[0] > 1.2 and by_joint[2] / expected[2] < 0.8, "an eye is sharper than a hip"
+    assert by_joint[0] / expected[0] > 1.2 and by_joint[2] / expected[2] < 0.8, (
+        "an eye is sharper than a hip"
+    )
     alike = replace(config, by_joint=False)
     np.testing.assert_allclose(
         observation_sigmas(seen, points, Views.of(two_views), alike, joints)[0, :, 0], expected
@@ -79,7 +94,9 @@ def test_the_paper_s_weight_is_the_confidence():
 
 
 @pytest.mark.parametrize("kernel", [None, "cauchy"])
-def test_exact_observations_have_the_information_of_their_geometry(five_cameras, two_people, kernel):
+def test_exact_observations_have_the_information_of_their_geometry(
+    five_cameras, two_people, kernel
+):
     """Residuals are zero, so every kernel's weight is one."""
     config = ObservationConfig(kernel=kernel)
     seen = observations_of(five_cameras, two_people)
@@ -88,7 +105,12 @@ def test_exact_observations_have_the_information_of_their_geometry(five_cameras,
     joint, view = (index.ravel() for index in np.indices(sigmas.shape[1:]))
     for person in range(2):
         expected = joint_information(
-            two_people[person], joint, view, sigmas[person].ravel(), five_cameras.K, five_cameras.cTw
+            two_people[person],
+            joint,
+            view,
+            sigmas[person].ravel(),
+            five_cameras.K,
+            five_cameras.cTw,
         )
         np.testing.assert_allclose(evidence.information[person], expected, rtol=1e-9, atol=1e-6)
     assert evidence.inlier.all()
@@ -97,7 +119,9 @@ def test_exact_observations_have_the_information_of_their_geometry(five_cameras,
 
 @pytest.mark.parametrize("kernel", [None, "cauchy", "huber"])
 def test_information_and_gradient_are_those_of_the_graph(five_cameras, two_people, kernel):
-    """At a point beside the truth, with noise, a gated and an unseen observation: GTSAM's own linearisation."""
+    """At a point beside the truth, with noise, a gated and an unseen observation: GTSAM's own
+    linearisation.
+    """
     config = ObservationConfig(kernel=kernel)
     rng = np.random.default_rng(1)
     seen = observations_of(five_cameras, two_people[:1], noise_px=8.0)
@@ -131,7 +155,9 @@ def test_the_gate_is_rho_as_a_length_at_the_joint_s_depth(two_views):
     for off_px, kept in ((74.999, True), (75.001, False)):
         for direction in ([1.0, 0.0], [0.0, -1.0], [0.6, 0.8]):
             seen = seen_at(two_views, centre + np.array([[off_px], [0.0]]) * direction, point)
-            evidence = linearise(seen, np.full((1, 1, 2), 10.0), point[None, None], Views.of(two_views), config)
+            evidence = linearise(
+                seen, np.full((1, 1, 2), 10.0), point[None, None], Views.of(two_views), config
+            )
             assert evidence.inlier[0, 0].tolist() == [kept, True]
             np.testing.assert_allclose(np.linalg.norm(evidence.residual_px[0, 0, 0]), off_px)
 
@@ -142,7 +168,9 @@ def test_what_is_gated_says_nothing(two_views):
     config, sigmas = ObservationConfig(), np.full((1, 1, 2), 10.0)
     alone = without(seen_at(two_views, xy, point), np.array([[[False, True]]]))
     far = seen_at(two_views, xy + np.array([[0.0, 0.0], [400.0, 0.0]]), point)
-    one = linearise(alone, np.array([[[10.0, 0.0]]]), point[None, None], Views.of(two_views), config)
+    one = linearise(
+        alone, np.array([[[10.0, 0.0]]]), point[None, None], Views.of(two_views), config
+    )
     both = linearise(far, sigmas, point[None, None], Views.of(two_views), config)
     np.testing.assert_array_equal(one.information, both.information)
     np.testing.assert_array_equal(one.target, both.target)
@@ -155,7 +183,11 @@ def test_a_joint_behind_the_camera_is_not_seen_by_it(two_views):
     seen = seen_at(two_views, np.stack([mirrored, [500.0, 400.0]]), behind)
     with np.errstate(all="raise"):
         evidence = linearise(
-            seen, np.full((1, 1, 2), 10.0), behind[None, None], Views.of(two_views), ObservationConfig()
+            seen,
+            np.full((1, 1, 2), 10.0),
+            behind[None, None],
+            Views.of(two_views),
+            ObservationConfig(),
         )
     assert not evidence.inlier[0, 0, 0]
     assert np.isfinite(evidence.information).all()
@@ -181,11 +213,16 @@ def test_one_view_moves_a_joint_onto_its_ray_and_leaves_the_depth(two_views):
     xy = two_views.project(point)[0] + [[6.0, -4.0], [0.0, 0.0]]
     seen = without(seen_at(two_views, xy, point), np.array([[[False, True]]]))
     evidence = linearise(
-        seen, np.array([[[10.0, 0.0]]]), point[None, None], Views.of(two_views), ObservationConfig(kernel="none")
+        seen,
+        np.array([[[10.0, 0.0]]]),
+        point[None, None],
+        Views.of(two_views),
+        ObservationConfig(kernel="none"),
     )
     target = evidence.target[0, 0]
     assert np.linalg.matrix_rank(evidence.information[0, 0], tol=1.0) == 2
-    # The step is across the ray, and one Gauss-Newton step of 7 px is exact to its second order: 7² / 1000 px.
+    # The step is across the ray, and one Gauss-Newton step of 7 px is exact to its second order: 7²
+    # / 1000 px.
     assert (target - point) @ point == pytest.approx(0.0, abs=1e-9)
     np.testing.assert_allclose(two_views.cameras[0].project(target)[0], xy[0], atol=0.05)
 
@@ -195,7 +232,11 @@ def test_two_views_move_a_joint_where_they_meet(two_views):
     seen = seen_at(two_views, two_views.project(truth)[0], truth)
     beside = truth + np.array([0.01, -0.02, 0.015])
     evidence = linearise(
-        seen, np.full((1, 1, 2), 10.0), beside[None, None], Views.of(two_views), ObservationConfig(kernel="none")
+        seen,
+        np.full((1, 1, 2), 10.0),
+        beside[None, None],
+        Views.of(two_views),
+        ObservationConfig(kernel="none"),
     )
     # 2.7 cm off at 2 m: the second order is 0.027² / 2 m.
     np.testing.assert_allclose(evidence.target[0, 0], truth, atol=5e-4)
@@ -241,8 +282,11 @@ def test_what_too_few_or_contradicting_views_saw_stays_unknown(two_views):
     config = ObservationConfig()
     xy = two_views.project(truth)[0]
     both = seen_at(two_views, xy, unknown)
-    np.testing.assert_allclose(triangulate(both, Views.of(two_views), config)[0, 0], truth, atol=1e-5)
-    # Rays that pass each other a metre apart: both cameras are upright, so the height cannot be explained away.
+    np.testing.assert_allclose(
+        triangulate(both, Views.of(two_views), config)[0, 0], truth, atol=1e-5
+    )
+    # Rays that pass each other a metre apart: both cameras are upright, so the height cannot be
+    # explained away.
     contradicting = seen_at(two_views, xy + np.array([[0.0, 250.0], [0.0, -250.0]]), unknown)
     assert np.isnan(triangulate(contradicting, Views.of(two_views), config)).all()
     alone = without(both, np.array([[[False, True]]]))

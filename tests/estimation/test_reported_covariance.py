@@ -1,4 +1,6 @@
-"""What is said of solved joints: how each is known, what its covariance leaves out, what went wrong."""
+"""What is said of solved joints: how each is known, what its covariance leaves out, what went
+wrong.
+"""
 
 from types import SimpleNamespace
 
@@ -18,7 +20,9 @@ I3 = np.eye(3)
 
 
 def message(sigma_m, known=None):
-    """Information of joints (N, J) known alike in all directions, at the origin; sigma infinite: none."""
+    """Information of joints (N, J) known alike in all directions, at the origin; sigma infinite:
+    none.
+    """
     sigma = np.asarray(sigma_m, dtype=float)
     information = np.where(np.isfinite(sigma), sigma, np.inf)[..., None, None] ** -2.0 * I3
     known = np.isfinite(sigma) if known is None else np.asarray(known)
@@ -26,8 +30,9 @@ def message(sigma_m, known=None):
 
 
 def test_a_joint_is_seen_or_the_body_s_or_carried_by_motion():
-    """Seen by one view of three; by none, with 70 % and 72 % of the body's sigma; without a body; not placed; by
-    two views, of which one is weak, or as probably of somebody else, or neither."""
+    """Seen by one view of three; by none, with 70 % and 72 % of the body's sigma; without a body;
+    not placed; by two views, of which one is weak, or as probably of somebody else, or neither.
+    """
     sigma = np.array([[0.09, 0.07, 0.072, 0.07, 0.07, 0.02, 0.02, 0.02]])
     covariance = sigma[..., None, None] ** 2 * I3
     inlier = np.zeros((1, 8, 3), dtype=bool)
@@ -56,11 +61,12 @@ def window(times_s, with_offsets):
 
 
 def test_errors_that_last_are_added_to_what_the_graph_knows():
-    """Joint 0 is seen in all four frames; joint 1 in the second and the last; joint 2 is solved with offsets.
+    """Joint 0 is seen in all four frames; joint 1 in the second and the last; joint 2 is solved
+    with offsets.
 
-    Of a share f of the views' error that is new in every frame, the graph's marginal holds all, of which motion
-    takes too much by `kept`; what lasts is that of the nearest frame in which the joint was seen. What sees little
-    of it is solved with an offset, whose error the marginal has.
+    Of a share f of the views' error that is new in every frame, the graph's marginal holds all, of
+    which motion takes too much by `kept`; what lasts is that of the nearest frame in which the
+    joint was seen. What sees little of it is solved with an offset, whose error the marginal has.
     """
     f, kept = 0.3, 0.2
     sigma = np.full((4, 3), 0.02)
@@ -85,7 +91,9 @@ def test_errors_that_last_are_added_to_what_the_graph_knows():
 
 
 def test_the_nearest_frame_in_which_it_was_seen_is_carried_along():
-    """Seen in the first frame to 1 cm and in the last to 8: between them by the clock, not by the count."""
+    """Seen in the first frame to 1 cm and in the last to 8: between them by the clock, not by the
+    count.
+    """
     sigma = np.array([[0.01], [np.inf], [np.inf], [0.08]])
     nobody = message(np.full((4, 1), np.inf))
     marginal = np.broadcast_to(0.03**2 * I3, (4, 1, 3, 3))
@@ -98,7 +106,9 @@ def test_the_nearest_frame_in_which_it_was_seen_is_carried_along():
 
 
 def solved(away_m, sigma_m=0.02, body_sigma_m=np.inf):
-    """One frame: joints at the origin but for `away_m` (J,) along x, views and body at the origin."""
+    """One frame: joints at the origin but for `away_m` (J,) along x, views and body at the
+    origin.
+    """
     away = np.asarray(away_m, dtype=float)
     joints = np.zeros((1, len(away), 3))
     joints[0, :, 0] = away
@@ -118,7 +128,9 @@ def reasons(solution, here, covariance=None, first=None):
 
 
 def test_a_joint_far_from_all_that_is_said_of_it_ran_away():
-    """Half a metre and 20 standard deviations, both: 0.49 m is 24 of 2 cm, 0.6 m only 15 of 4 cm."""
+    """Half a metre and 20 standard deviations, both: 0.49 m is 24 of 2 cm, 0.6 m only 15 of 4
+    cm.
+    """
     here = window([0.0], [False, False])
     assert set(reasons(solved([0.51, 0.49]), here)) == {0}
     assert reasons(solved([0.6, 0.0], sigma_m=0.04), here) == {}
@@ -139,14 +151,20 @@ def test_what_nothing_determines_and_what_the_solver_says():
     here = window([0.0], [False, False])
     covariance = np.full((1, 2, 3, 3), np.nan)
     covariance[0, 1] = I3
-    assert reasons(solved([0.0, 0.0]), here, covariance) == {0: "undetermined: its system is singular"}
+    assert reasons(solved([0.0, 0.0]), here, covariance) == {
+        0: "undetermined: its system is singular"
+    }
     here.failure = "the solver diverged"
     solution = solved([0.0, np.nan])
-    assert reasons(solution, here, covariance) == {0: here.failure}, "who is not placed has no problem"
+    assert reasons(solution, here, covariance) == {0: here.failure}, (
+        "who is not placed has no problem"
+    )
 
 
 def evidence(points, sigma_m) -> ViewEvidence:
-    """Views that put joints exactly at `points` (N, J, 3), known to `sigma_m` (N, J); infinite: not at all."""
+    """Views that put joints exactly at `points` (N, J, 3), known to `sigma_m` (N, J); infinite: not
+    at all.
+    """
     information = message(sigma_m).information
     none = np.zeros((*np.shape(sigma_m), 1))
     return ViewEvidence(points, none > 0, none, information, np.zeros_like(points))
@@ -158,10 +176,14 @@ def body_at(joints, sigma_m, ok=True) -> BodyFit:
 
 
 def test_a_draft_is_between_views_and_body_by_what_each_knows():
-    """A body 4 cm off, known to 3 cm and 2 for the model; views to 2 cm: 13 to 4. Views 20 cm off do not count."""
+    """A body 4 cm off, known to 3 cm and 2 for the model; views to 2 cm: 13 to 4. Views 20 cm off
+    do not count.
+    """
     views = np.array([[[0.04, 0, 0], [0.2, 0, 0], [0.04, 0, 0]]])
     sigma = np.array([[0.02, 0.02, np.inf]])
-    at, covariance = drafted(evidence(views, sigma), body_at(np.zeros((1, 3, 3)), 0.03), disagreement=4.8)
+    at, covariance = drafted(
+        evidence(views, sigma), body_at(np.zeros((1, 3, 3)), 0.03), disagreement=4.8
+    )
     whole = 0.03**2 + 0.02**2
     share = whole / (whole + 0.02**2)
     np.testing.assert_allclose(at[0], [[share * 0.04, 0, 0], [0, 0, 0], [0, 0, 0]], atol=1e-12)
@@ -169,7 +191,9 @@ def test_a_draft_is_between_views_and_body_by_what_each_knows():
     np.testing.assert_allclose(covariance[0, 1:], np.stack([whole * I3] * 2))
     # 20 cm are sqrt(17) x 1 cm, 4.85 times: with a little more patience the views count.
     np.testing.assert_allclose(np.hypot(np.sqrt(whole), 0.02), np.sqrt(17) / 100)
-    patient, _ = drafted(evidence(views[:, 1:2], sigma[:, 1:2]), body_at(np.zeros((1, 1, 3)), 0.03), 4.9)
+    patient, _ = drafted(
+        evidence(views[:, 1:2], sigma[:, 1:2]), body_at(np.zeros((1, 1, 3)), 0.03), 4.9
+    )
     np.testing.assert_allclose(patient[0, 0, 0], share * 0.2)
 
 
@@ -179,7 +203,9 @@ def test_a_draft_without_a_body_is_the_views_and_without_both_nothing():
     at, covariance = drafted(evidence(views, np.array([[0.02, 0.9, 1.1]])), fit, disagreement=6.0)
     np.testing.assert_allclose(at[0, :2], views[0, :2])
     np.testing.assert_allclose(covariance[0, :2], np.stack([0.02**2 * I3, 0.9**2 * I3]))
-    assert np.isnan(at[0, 2]).all() and np.isnan(covariance[0, 2]).all(), "determined to a metre, or not at all"
+    assert np.isnan(at[0, 2]).all() and np.isnan(covariance[0, 2]).all(), (
+        "determined to a metre, or not at all"
+    )
 
 
 class Beside(BodyFitter):
@@ -191,7 +217,9 @@ class Beside(BodyFitter):
 
 
 def test_unseen_joints_go_towards_the_body_the_more_the_less_they_are_known():
-    """C / (C + (3 cm)²) of 30 cm: half at 3 cm, nine tenths at 9; seen joints and those not placed stay."""
+    """C / (C + (3 cm)²) of 30 cm: half at 3 cm, nine tenths at 9; seen joints and those not placed
+    stay.
+    """
     joints = np.zeros((2, 4, 3))
     joints[0, 3] = np.nan
     sigma = np.array([[0.03, 0.09, 0.09, 0.09], [0.03] * 4])
@@ -201,7 +229,9 @@ def test_unseen_joints_go_towards_the_body_the_more_the_less_they_are_known():
     np.testing.assert_allclose(steps[0, :, 2], [0.15, 0.27, 0.0, 0.0])
     assert (steps[1] == 0).all() and (steps[..., :2] == 0).all()
     assert fitter.targets.xyz.shape == (1, 4, 3), "only people with such a joint are fitted"
-    np.testing.assert_allclose(fitter.targets.information[0, :3], sigma[0, :3, None, None] ** -2.0 * I3)
+    np.testing.assert_allclose(
+        fitter.targets.information[0, :3], sigma[0, :3, None, None] ** -2.0 * I3
+    )
     assert (fitter.targets.information[0, 3] == 0).all()
     assert (limb_steps(joints, sigma[..., None, None] ** 2 * I3, unseen & False, fitter) == 0).all()  # type: ignore[arg-type]
 
@@ -215,7 +245,9 @@ def test_smoothing_in_time_is_a_gaussian_mean():
 
 @pytest.mark.parametrize(("first_sigma", "second_sigma"), [(0.3, 0.3), (0.1, 0.5), (0.0, 0.3)])
 def test_the_ends_of_a_limb_share_what_is_missing_by_what_is_not_known(first_sigma, second_sigma):
-    """One limb of 50 cm that should be 30: in each of four sweeps v / (v + (10 cm)²) of what is left goes."""
+    """One limb of 50 cm that should be 30: in each of four sweeps v / (v + (10 cm)²) of what is
+    left goes.
+    """
     joints = np.array([[[0.0, 0, 0], [0.5, 0, 0]]])
     sigma = np.array([[max(first_sigma, 1e-9), second_sigma]])
     covariance = sigma[..., None, None] ** 2 * I3
@@ -224,9 +256,12 @@ def test_the_ends_of_a_limb_share_what_is_missing_by_what_is_not_known(first_sig
     variance = first_sigma**2 + second_sigma**2
     missing = 0.2 * (1 - (0.1**2 / (variance + 0.1**2)) ** 4)
     np.testing.assert_allclose(
-        found[0, :, 0], [missing * first_sigma**2 / variance, 0.5 - missing * second_sigma**2 / variance]
+        found[0, :, 0],
+        [missing * first_sigma**2 / variance, 0.5 - missing * second_sigma**2 / variance],
     )
     unknown = with_lengths(joints, covariance, moved, np.array([np.nan]), [(0, 1)])
     np.testing.assert_array_equal(unknown, joints)
-    lost = with_lengths(np.where(joints == 0.5, np.nan, joints), covariance, moved, np.array([0.3]), [(0, 1)])
+    lost = with_lengths(
+        np.where(joints == 0.5, np.nan, joints), covariance, moved, np.array([0.3]), [(0, 1)]
+    )
     np.testing.assert_array_equal(lost[0, 0], joints[0, 0])

@@ -1,4 +1,6 @@
-"""Drafts smoothed over time, against the whole problem solved at once and against a wrong stretch of drafts."""
+"""Drafts smoothed over time, against the whole problem solved at once and against a wrong stretch
+of drafts.
+"""
 
 from dataclasses import replace
 
@@ -14,7 +16,9 @@ WRIST = BODY_25.index("RWrist")
 
 
 def test_it_is_the_least_squares_solution_over_all_frames(monkeypatch):
-    """With weights that stay 1: positions and velocities of all frames solved as one dense system."""
+    """With weights that stay 1: positions and velocities of all frames solved as one dense
+    system.
+    """
     monkeypatch.setattr(smoothing, "KERNEL", 1e12)
     motion = replace(MOTION, psd_speed=np.zeros(len(BODY_25.joints)))
     rng, T, J = np.random.default_rng(0), 9, len(BODY_25.joints)
@@ -36,7 +40,9 @@ def test_it_is_the_least_squares_solution_over_all_frames(monkeypatch):
 
 
 def test_a_wrong_draft_of_two_frames_does_not_lead_the_joint_away():
-    """A neighbour's wrist half a metre off in two frames, of two people of whom one walks and one stands."""
+    """A neighbour's wrist half a metre off in two frames, of two people of whom one walks and one
+    stands.
+    """
     T, J = 30, len(BODY_25.joints)
     times = np.tile(np.arange(T) / 30, 2)
     true = np.zeros((2 * T, J, 3))
@@ -56,7 +62,9 @@ def test_what_is_never_known_stays_unknown_and_gaps_grow_uncertain():
     joints = np.zeros((T, J, 3))
     joints[:, 0], joints[5:15, 1] = np.nan, np.nan
     covariance = np.where(np.isfinite(joints)[..., None], 1e-4 * np.eye(3), np.nan)
-    mean, found = smoothing.smoothed(joints, covariance, np.zeros(T, dtype=int), np.arange(T) / 30, MOTION)
+    mean, found = smoothing.smoothed(
+        joints, covariance, np.zeros(T, dtype=int), np.arange(T) / 30, MOTION
+    )
     assert np.isnan(mean[:, 0]).all() and np.isnan(found[:, 0]).all()
     assert mean[:, 1] == pytest.approx(0.0, abs=1e-6)
     sigma = np.sqrt(found[:, 1, 0, 0])

@@ -22,10 +22,12 @@ def test_every_column_is_of_the_same_row(five_cameras, two_people):
         found = rng.normal(size=(N, *shape, 3, 3))
         return found @ found.swapaxes(-1, -2) + 1e-3 * np.eye(3)
 
-    seen, inlier, contradicts = (rng.random(shape) < 0.6 for shape in ((N, J, V), (N, J, V), (N, J)))
+    seen, inlier, contradicts = (
+        rng.random(shape) < 0.6 for shape in ((N, J, V), (N, J, V), (N, J))
+    )
     fit = BodyFit(
-        rng.normal(size=(N, 10)), rng.normal(size=(N, 3)), rng.normal(size=(N, 23, 3)), rng.normal(size=(N, 3)),
-        joints, spread(J), joints, spread(J), rng.random(N),
+        rng.normal(size=(N, 10)), rng.normal(size=(N, 3)), rng.normal(size=(N, 23, 3)),
+        rng.normal(size=(N, 3)), joints, spread(J), joints, spread(J), rng.random(N),
         np.array([FitStatus.OK, FitStatus.TOO_FEW_JOINTS, FitStatus.OK, FitStatus.OK]),
     )  # fmt: skip
     known = rng.choice([Known.SEEN, Known.WEAK, Known.BODY, Known.MOTION], (N, J)).astype(np.uint8)
@@ -40,28 +42,45 @@ def test_every_column_is_of_the_same_row(five_cameras, two_people):
         probability=rng.random((N, J, V)),
     )
     solution = WindowSolution(
-        observations, joints, spread(J), rng.normal(size=(N, J, 3)), spread(J), rng.random((N, J)), inlier & seen,
-        contradicts, rng.normal(size=(N, J, V, 2)), known, fit, status,
+        observations, joints, spread(J), rng.normal(size=(N, J, 3)), spread(J), rng.random((N, J)),
+        inlier & seen, contradicts, rng.normal(size=(N, J, V, 2)), known, fit, status,
     )  # fmt: skip
     place = rng.integers(0, 9, (N, J, V))
     rows = solution.result(place, five_cameras, BODY_25.joints)
 
     assert rows.frame.tolist() == [7, 7, 8, 8] and rows.person.tolist() == [5, 6, 5, 6]
     np.testing.assert_allclose(rows.time_s, [0.72, 0.72, 0.82, 0.82])
-    for name in ("joints", "covariance", "velocity", "velocity_covariance", "known", "confidence", "status"):
+    for name in (
+        "joints",
+        "covariance",
+        "velocity",
+        "velocity_covariance",
+        "known",
+        "confidence",
+        "status",
+    ):
         np.testing.assert_array_equal(getattr(rows, name), getattr(solution, name), err_msg=name)
     for name in ("betas", "global_orient", "body_pose", "transl"):
         found, expected = getattr(rows, name), getattr(fit, name)
         np.testing.assert_array_equal(found[[0, 2, 3]], expected[[0, 2, 3]], err_msg=name)
-        assert np.isnan(found[1]).all() and np.isfinite(expected[1]).all(), "no body was fitted there"
+        assert np.isnan(found[1]).all() and np.isfinite(expected[1]).all(), (
+            "no body was fitted there"
+        )
 
     table = rows.observations
-    assert table.frame.tolist() == rows.frame.tolist() and table.person.tolist() == rows.person.tolist()
+    assert (
+        table.frame.tolist() == rows.frame.tolist()
+        and table.person.tolist() == rows.person.tolist()
+    )
     np.testing.assert_array_equal(table.used, solution.inlier)
     np.testing.assert_array_equal(table.gate == Gate.NOT_SEEN, ~seen)
     out, placed = seen & ~solution.inlier, np.isfinite(joints).all(axis=2)[..., None]
-    np.testing.assert_array_equal(table.gate == Gate.CONTRADICTS_BODY, out & placed & contradicts[..., None])
-    np.testing.assert_array_equal(table.gate == Gate.TOO_FAR, out & placed & ~contradicts[..., None])
+    np.testing.assert_array_equal(
+        table.gate == Gate.CONTRADICTS_BODY, out & placed & contradicts[..., None]
+    )
+    np.testing.assert_array_equal(
+        table.gate == Gate.TOO_FAR, out & placed & ~contradicts[..., None]
+    )
     np.testing.assert_array_equal(table.gate == Gate.NOT_PLACED, out & ~placed)
     np.testing.assert_array_equal(table.candidate, np.where(seen, place, -1))
     np.testing.assert_allclose(table.xy[seen], observations.xy[seen], rtol=1e-6)
@@ -70,7 +89,9 @@ def test_every_column_is_of_the_same_row(five_cameras, two_people):
     moved = joints[:, :, None] + 0.01 * (np.arange(V) - 2)[:, None] * solution.velocity[:, :, None]
     then, _, _ = project_with_jacobian(moved, five_cameras.K, five_cameras.cTw)
     there &= np.isfinite(then).all(axis=-1)
-    np.testing.assert_allclose(table.residual_px[there], (then - observations.xy)[there], rtol=1e-4, atol=1e-3)
+    np.testing.assert_allclose(
+        table.residual_px[there], (then - observations.xy)[there], rtol=1e-4, atol=1e-3
+    )
     np.testing.assert_allclose(table.lead_s, np.tile(0.01 * (np.arange(V) - 2), (N, 1)), atol=1e-6)
     again = table.observations(joints, rows.time_s)
     np.testing.assert_allclose(again.time_s, observations.time_s, atol=1e-6)

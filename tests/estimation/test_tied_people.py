@@ -1,4 +1,6 @@
-"""Factors that join people of a window: one graph, against the closed form of linear Gaussian estimation."""
+"""Factors that join people of a window: one graph, against the closed form of linear Gaussian
+estimation.
+"""
 
 import gtsam
 import numpy as np
@@ -23,7 +25,9 @@ APART_M, SIGMA_M = np.array([0.3, 0.0, 0.05]), 0.01
 
 @pytest.fixture
 def seen(five_cameras, two_people):
-    """Detections of three people (the third a metre beside the first), 6 px of noise: (3, 25, 5, 2)."""
+    """Detections of three people (the third a metre beside the first), 6 px of noise: (3, 25, 5,
+    2).
+    """
     truth = np.concatenate([two_people, two_people[:1] + np.array([1.0, 0.0, 0.0])])
     xy = np.moveaxis(five_cameras.project(truth)[0], 0, 2)
     return truth, xy + np.random.default_rng(0).normal(0, 6.0, xy.shape)
@@ -42,7 +46,10 @@ def graphs(rig, truth, xy, frames=1) -> list[WindowGraph]:
             np.repeat(0.1 * np.arange(frames)[:, None], V, axis=1),
         )
         settings = EstimatorConfig(ObservationConfig(kernel="none"), EXACT)
-        sigmas, first = np.full((frames, 25, V), 6.0), np.repeat(truth[number][None], frames, axis=0)
+        sigmas, first = (
+            np.full((frames, 25, V), 6.0),
+            np.repeat(truth[number][None], frames, axis=0),
+        )
         people.append(WindowGraph(seen, sigmas, Views.of(rig), settings, MOTION, first=first))
     return people
 
@@ -52,8 +59,14 @@ def solve(people: list[WindowGraph], truth) -> None:
     nothing = JointTargets(np.full((T, 25, 3), np.nan), np.zeros((T, 25, 3, 3)))
     information = np.tile(np.eye(3) / 0.03**2, (T, 25, 1, 1))
     for number, person in enumerate(people):
-        of_views = JointTargets(np.repeat(truth[number][None], T, axis=0), information) if T > 1 else nothing
-        person.prepare(np.ones((T, 25, 5), bool), of_views, nothing, np.repeat(truth[number][None], T, axis=0))
+        of_views = (
+            JointTargets(np.repeat(truth[number][None], T, axis=0), information)
+            if T > 1
+            else nothing
+        )
+        person.prepare(
+            np.ones((T, 25, 5), bool), of_views, nothing, np.repeat(truth[number][None], T, axis=0)
+        )
     for person in people:
         if person is person.ties.people[0]:
             person.optimise()
@@ -64,7 +77,9 @@ def box(window, keys):
     for other in window.partners:
         if {window.track, other.track} == {0, 1}:
             mine, theirs = window.shared(other)
-            for right, left in zip(keys[mine, R].tolist(), other.keys[theirs, L].tolist(), strict=True):
+            for right, left in zip(
+                keys[mine, R].tolist(), other.keys[theirs, L].tolist(), strict=True
+            ):
                 yield gtsam.BetweenFactorPoint3(right, left, APART_M, isotropic(3, SIGMA_M))
 
 
@@ -76,7 +91,9 @@ def test_the_joint_posterior_is_that_of_the_closed_form(five_cameras, seen):
     before = [each[0][0] for each in state_covariances(alone)]
     tied = graphs(five_cameras, truth, xy)
     add_factors(tied, [box])
-    assert [person.track for person in tied[0].ties.people] == [0, 1] and tied[2].ties.people == [tied[2]]
+    assert [person.track for person in tied[0].ties.people] == [0, 1] and tied[2].ties.people == [
+        tied[2]
+    ]
     solve(tied, truth)
     after = [each[0][0] for each in state_covariances(tied)]
 
@@ -84,9 +101,15 @@ def test_the_joint_posterior_is_that_of_the_closed_form(five_cameras, seen):
     gain = np.linalg.inv(A + B + SIGMA_M**2 * np.eye(3))
     missing = (b - a) - APART_M
     # The projections are not linear: 20 cm away their information is a little another.
-    np.testing.assert_allclose(tied[0].positions[0, R] - a, A @ gain @ missing, atol=0.1 * np.linalg.norm(missing))
+    np.testing.assert_allclose(
+        tied[0].positions[0, R] - a, A @ gain @ missing, atol=0.1 * np.linalg.norm(missing)
+    )
     expected = A - A @ gain @ A
-    assert np.linalg.norm(after[0][R] - expected) < 0.25 * np.linalg.norm(expected) < 0.25 * np.linalg.norm(A)
+    assert (
+        np.linalg.norm(after[0][R] - expected)
+        < 0.25 * np.linalg.norm(expected)
+        < 0.25 * np.linalg.norm(A)
+    )
     across = gtsam.Marginals(tied[0].graph, tied[0].values).jointMarginalCovariance(
         gtsam.KeyVector([int(tied[0].keys[0, R]), int(tied[1].keys[0, L])])
     )
@@ -95,7 +118,9 @@ def test_the_joint_posterior_is_that_of_the_closed_form(five_cameras, seen):
     assert np.linalg.norm(found - expected) < 0.3 * np.linalg.norm(expected)
     # Joints that no factor is on, and people whom none ties, are as they were.
     others = np.delete(np.arange(25), [R])
-    np.testing.assert_allclose(tied[0].positions[0, others], alone[0].positions[0, others], atol=1e-6)
+    np.testing.assert_allclose(
+        tied[0].positions[0, others], alone[0].positions[0, others], atol=1e-6
+    )
     np.testing.assert_array_equal(tied[2].positions, alone[2].positions)
 
 
@@ -125,16 +150,25 @@ def test_a_shared_point_of_the_user_s_own(five_cameras, seen):
 
 def test_over_time_both_move_and_both_are_surer(five_cameras, seen):
     truth, xy = seen
-    alone, tied = graphs(five_cameras, truth, xy, frames=4), graphs(five_cameras, truth, xy, frames=4)
+    alone, tied = (
+        graphs(five_cameras, truth, xy, frames=4),
+        graphs(five_cameras, truth, xy, frames=4),
+    )
     add_factors(tied, [box])
     solve(alone, truth)
     solve(tied, truth)
     apart = tied[1].positions[:, L] - tied[0].positions[:, R]
     assert np.linalg.norm(apart - APART_M, axis=1).max() < 0.05
     for one, other in ((tied[0], alone[0]), (tied[1], alone[1])):
-        assert one.failure == "" and np.isfinite(one.positions).all() and np.isfinite(one.velocity).all()
+        assert (
+            one.failure == ""
+            and np.isfinite(one.positions).all()
+            and np.isfinite(one.velocity).all()
+        )
         assert np.abs(one.positions - other.positions).max() > 0.01
-    reported = [each[0][:, joint] for each, joint in zip(state_covariances(tied), (R, L), strict=False)]
+    reported = [
+        each[0][:, joint] for each, joint in zip(state_covariances(tied), (R, L), strict=False)
+    ]
     assert all(np.isfinite(each).all() for each in reported)
     # With the error that lasts in it the box is known to its sigma, whoever holds it.
     marginals = gtsam.Marginals(tied[0].graph, tied[0].values)
@@ -146,14 +180,18 @@ def test_over_time_both_move_and_both_are_surer(five_cameras, seen):
 
 
 def test_joints_that_another_person_s_factors_tie_are_coupled(five_cameras, seen):
-    """A body's prior for one wrist must not have the other's views, where both are tied to a third."""
+    """A body's prior for one wrist must not have the other's views, where both are tied to a
+    third.
+    """
     truth, xy = seen
     people = graphs(five_cameras, truth, xy)
 
     def both_wrists(window, keys):
         for other in window.partners:
             for wrist in (R, L):
-                yield gtsam.RangeFactor3(int(keys[0, wrist]), int(other.keys[0, R]), 0.5, isotropic(1, 0.05))
+                yield gtsam.RangeFactor3(
+                    int(keys[0, wrist]), int(other.keys[0, R]), 0.5, isotropic(1, 0.05)
+                )
 
     add_factors(people[:2], [both_wrists])
     assert people[0].coupled == [{R, L}] and people[1].coupled == []

@@ -1,4 +1,6 @@
-"""What is asked of joints with errors: blocks of joint marginals, probabilities of distances, named failures."""
+"""What is asked of joints with errors: blocks of joint marginals, probabilities of distances, named
+failures.
+"""
 
 from dataclasses import replace
 
@@ -45,7 +47,9 @@ def test_blocks_are_what_is_reported(people):
     both = marginal(people, *everything)
     row = int(np.flatnonzero((people.person == who) & (people.frame == 4))[0])
     for joint in (0, WRIST, 24):
-        np.testing.assert_allclose(both.block(25 + joint, 25 + joint), people.covariance[row, joint], atol=1e-12)
+        np.testing.assert_allclose(
+            both.block(25 + joint, 25 + joint), people.covariance[row, joint], atol=1e-12
+        )
     assert np.linalg.eigvalsh(both.covariance).min() > 0  # 150 numbers that can be known together
     other = int(people.person[people.person != who][0])
     apart = marginal(people, JointAt(who, "Neck", 1), JointAt(other, "Neck", 1))
@@ -65,17 +69,24 @@ def test_correlation_is_the_product_along_the_limbs():
 
 @pytest.mark.slow
 def test_what_one_robot_sees_errs_with_it(scene):
-    """A robot carries all cameras: joints of two people, and of two frames, share the error of its pose, and as
-    they turn with it their distance is known as well as if it stood still.
+    """A robot carries all cameras: joints of two people, and of two frames, share the error of its
+    pose, and as they turn with it their distance is known as well as if it stood still.
     """
     rng = np.random.default_rng(3)
     root = rng.normal(0, [0.01] * 3 + [0.05] * 3, (6, 6))
     pose, covariance = np.eye(4), root.T @ root / 6
     pose[:3, 3] = 0.5, 0.2, 0.0
     path = Trajectory(
-        "robot", np.linspace(0, 0.4, 3), np.stack([pose] * 3), np.stack([covariance] * 3), refined=True
+        "robot",
+        np.linspace(0, 0.4, 3),
+        np.stack([pose] * 3),
+        np.stack([covariance] * 3),
+        refined=True,
     )
-    cameras = [replace(each, carrier="robot", bTc=np.linalg.inv(pose) @ each.wTc) for each in scene.rig.cameras]
+    cameras = [
+        replace(each, carrier="robot", bTc=np.linalg.inv(pose) @ each.wTc)
+        for each in scene.rig.cameras
+    ]
     rig = replace(scene.rig, cameras=tuple(cameras), trajectories=(path,))
     people = reconstruct(simulate(scene), rig)
     one, other = (JointAt(int(who), "Neck", 2) for who in np.unique(people.person)[:2])
@@ -86,14 +97,17 @@ def test_what_one_robot_sees_errs_with_it(scene):
         gtsam.Pose3(pose).transformFrom(both.mean[n] - pose[:3, 3], H, np.zeros((3, 3), order="F"))
         ways.append(H)
         np.testing.assert_allclose(both.block(n, n), apart.block(n, n), atol=1e-9)
-    # Of a pose known to 5 cm nearly all is theirs: what the cameras add, 1 cm, makes no difference to a tenth.
+    # Of a pose known to 5 cm nearly all is theirs: what the cameras add, 1 cm, makes no difference
+    # to a tenth.
     expected = ways[0] @ covariance @ ways[1].T
     np.testing.assert_allclose(both.block(0, 1), expected, atol=0.1 * np.trace(expected))
     assert not apart.block(0, 1).any()
     sigma = [float(distance(people, one, other, rig=each).sigma_m) for each in (rig, None)]
     assert sigma[0] < 0.6 * sigma[1]
     later = JointAt(other.person, "RAnkle", 5)
-    fades = np.exp(-float(people.time_s[people.frame == 5][0] - people.time_s[people.frame == 2][0]) / 3)
+    fades = np.exp(
+        -float(people.time_s[people.frame == 5][0] - people.time_s[people.frame == 2][0]) / 3
+    )
     shared = marginal(people, one, later, rig=rig).block(0, 1)
     same = marginal(people, one, replace(later, frame=2), rig=rig).block(0, 1)
     np.testing.assert_allclose(shared, fades * same, atol=0.1 * np.abs(same).max())
@@ -102,20 +116,30 @@ def test_what_one_robot_sees_errs_with_it(scene):
 
 def test_a_ball_around_nothing_is_a_noncentral_chi_square():
     """Alike in all directions a distance has a known distribution, far into the tails."""
-    for mean, sigma, limit in (([0.1, 0.2, 0.05], 0.02, 0.2), ([0, 0, 0], 0.03, 0.05), ([0.5, 0, 0], 0.02, 0.4)):
+    for mean, sigma, limit in (
+        ([0.1, 0.2, 0.05], 0.02, 0.2),
+        ([0, 0, 0], 0.03, 0.05),
+        ([0.5, 0, 0], 0.02, 0.4),
+    ):
         apart = np.array(mean, dtype=float)
         true = chndtr((limit / sigma) ** 2, 3, max(apart @ apart / sigma**2, 1e-12))
-        assert float(Distance(apart, sigma**2 * np.eye(3)).below(limit)) == pytest.approx(true, rel=1e-3)
+        assert float(Distance(apart, sigma**2 * np.eye(3)).below(limit)) == pytest.approx(
+            true, rel=1e-3
+        )
 
 
 def test_any_ellipsoid_is_as_drawn():
     rng = np.random.default_rng(0)
     A = rng.normal(size=(3, 3)) * [0.01, 0.03, 0.06]
     apart, covariance = np.array([0.05, 0.02, -0.03]), A @ A.T
-    drawn = np.linalg.norm(rng.multivariate_normal(apart, covariance, 200_000, method="cholesky"), axis=1)
+    drawn = np.linalg.norm(
+        rng.multivariate_normal(apart, covariance, 200_000, method="cholesky"), axis=1
+    )
     found = Distance(apart, covariance)
     for limit in (0.01, 0.05, 0.1, 0.2):
-        assert float(found.below(limit)) == pytest.approx((drawn < limit).mean(), abs=4e-3)  # drawn to 1e-3
+        assert float(found.below(limit)) == pytest.approx(
+            (drawn < limit).mean(), abs=4e-3
+        )  # drawn to 1e-3
     assert float(found.mean_m) == pytest.approx(drawn.mean(), rel=0.01)
     assert float(found.sigma_m) == pytest.approx(drawn.std(), rel=0.02)
     assert float(found.quantile(0.9)) == pytest.approx(np.quantile(drawn, 0.9), rel=0.02)
@@ -123,7 +147,9 @@ def test_any_ellipsoid_is_as_drawn():
 
 @pytest.mark.slow
 def test_an_interval_holds_the_truth_at_any_distance():
-    """300 measurements of each distance, from contact on: 1.3 in 100 more or less are chance, of all 0.6."""
+    """300 measurements of each distance, from contact on: 1.3 in 100 more or less are chance, of
+    all 0.6.
+    """
     rng = np.random.default_rng(1)
     covariance, held = np.diag([0.01, 0.02, 0.015]) ** 2, list[float]()
     for true in (0.0, 0.01, 0.05, 0.5):
@@ -148,7 +174,9 @@ def test_joints_that_err_together_are_nearer_known_apart(people):
 
 
 def test_every_joint_has_its_distance_to_a_point(people):
-    """From where a wrist is said to be it is as far as its Gaussian says: 10,000 draws are right to 0.01."""
+    """From where a wrist is said to be it is as far as its Gaussian says: 10,000 draws are right to
+    0.01.
+    """
     near = distances(people, people.joints[:, WRIST]).below(0.1)
     assert near.shape == people.joints.shape[:2]
     drawn = np.random.default_rng(0).normal(size=(10_000, 3))
@@ -171,7 +199,12 @@ def test_a_point_before_a_chest(people):
         true = np.linalg.norm(vertices[0] - vertices[0][vertex] - away * out, axis=1).min()
         assert found.signed_m == pytest.approx(true, abs=0.01)
         assert found.below(found.signed_m) == pytest.approx(0.5)
-    assert surface_distance(people, body, *who, people.joints[rows[0], BODY_25.index("MidHip")]).signed_m < 0
+    assert (
+        surface_distance(
+            people, body, *who, people.joints[rows[0], BODY_25.index("MidHip")]
+        ).signed_m
+        < 0
+    )
 
 
 def test_what_has_no_place_is_named(people):
@@ -179,18 +212,24 @@ def test_what_has_no_place_is_named(people):
     joints[0, WRIST] = np.nan
     lost = replace(people, joints=joints)
     who = int(people.person[0]), int(people.frame[0])
-    with pytest.raises(NotDetermined, match=f"RWrist of person {who[0]} in frame {who[1]} .* is not determined"):
+    with pytest.raises(
+        NotDetermined, match=f"RWrist of person {who[0]} in frame {who[1]} .* is not determined"
+    ):
         distance(lost, JointAt(who[0], "RWrist", who[1]), [0, 0, 0])
     with pytest.raises(ValueError, match="person 99 is not in frame 0"):
         marginal(people, JointAt(99, "RWrist", 0))
 
 
 def test_a_failure_of_gtsam_is_named(people, scene):
-    """A distance alone does not place a wrist: GTSAM tells a number, the graph whose it is and when."""
+    """A distance alone does not place a wrist: GTSAM tells a number, the graph whose it is and
+    when.
+    """
     solution = next(window_solutions(people, scene.rig))
     wrist, elbow = (int(solution.keys[2, joint]) for joint in (WRIST, ELBOW))
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    graph.push_back(gtsam.RangeFactor3(wrist, elbow, 0.25, gtsam.noiseModel.Isotropic.Sigma(1, 0.01)))
+    graph.push_back(
+        gtsam.RangeFactor3(wrist, elbow, 0.25, gtsam.noiseModel.Isotropic.Sigma(1, 0.01))
+    )
     for key in (wrist, elbow):
         values.insert(key, solution.values.atPoint3(key))
     with pytest.raises(RuntimeError) as told:

@@ -1,4 +1,6 @@
-"""The X step: one person's graph of one frame and of many, against closed forms and against SciPy."""
+"""The X step: one person's graph of one frame and of many, against closed forms and against
+SciPy.
+"""
 
 import gtsam
 import numpy as np
@@ -24,7 +26,9 @@ MOTION = MotionModel.load(BODY_25.joints)
 
 
 @pytest.fixture(scope="module")
-def person(five_cameras, two_people) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def person(
+    five_cameras, two_people
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Truth (25, 3), observations (25, 5, 2) with 6 px of noise, sigmas (25, 5) of 4 to 12 px."""
     rng = np.random.default_rng(0)
     xy = np.moveaxis(five_cameras.project(two_people[0])[0], 0, 1)
@@ -54,7 +58,9 @@ def window_of(rig: Rig, xy, sigmas, config, kernel, frames, person=0) -> WindowG
 
 
 class OneFrame:
-    """A window of one frame, gates and priors set one after the other, arrays without the frame's axis."""
+    """A window of one frame, gates and priors set one after the other, arrays without the frame's
+    axis.
+    """
 
     def __init__(self, rig: Rig, xy, sigmas, config, kernel, person, frame) -> None:
         self.window = window_of(rig, xy[None], sigmas[None], config, kernel, [frame], person)
@@ -87,23 +93,31 @@ def graph_of(rig: Rig, xy, sigmas, config=EXACT, kernel=None, person=0, frame=0)
 def numeric_jacobian(rig: Rig, point: NDArray[np.float64]) -> NDArray[np.float64]:
     """(V, 2, 3) pixels per metre, by central differences."""
     step = 1e-6 * np.eye(3)
-    return np.stack([(rig.project(point + h)[0] - rig.project(point - h)[0]) / 2e-6 for h in step], axis=-1)
+    return np.stack(
+        [(rig.project(point + h)[0] - rig.project(point - h)[0]) / 2e-6 for h in step], axis=-1
+    )
 
 
 def information_of(rig: Rig, points, sigmas) -> NDArray[np.float64]:
     J = np.stack([numeric_jacobian(rig, point) for point in points])
-    return np.einsum("jvki,jvkl,jv->jil", J, J, np.where(sigmas > 0, 1.0 / np.maximum(sigmas, 1e-9) ** 2, 0.0))
+    return np.einsum(
+        "jvki,jvkl,jv->jil", J, J, np.where(sigmas > 0, 1.0 / np.maximum(sigmas, 1e-9) ** 2, 0.0)
+    )
 
 
 @pytest.mark.parametrize("kernel", [None, "cauchy"])
 def test_solution_is_the_minimum_of_the_robust_problem(five_cameras, person, kernel):
-    """Every joint's cost minimised by SciPy's BFGS; one observation is 60 px off, so that the kernel matters."""
+    """Every joint's cost minimised by SciPy's BFGS; one observation is 60 px off, so that the
+    kernel matters.
+    """
     truth, xy, sigmas = person
     xy = xy.copy()
     xy[:, 2, 0] += 60.0
 
     def cost(point: NDArray[np.float64], joint: int) -> float:
-        squared = np.sum((five_cameras.project(point)[0] - xy[joint]) ** 2, axis=1) / sigmas[joint] ** 2
+        squared = (
+            np.sum((five_cameras.project(point)[0] - xy[joint]) ** 2, axis=1) / sigmas[joint] ** 2
+        )
         if kernel is None:
             return 0.5 * squared.sum()
         width = DEFAULT_WIDTH_SIGMA[kernel] ** 2
@@ -112,7 +126,8 @@ def test_solution_is_the_minimum_of_the_robust_problem(five_cameras, person, ker
     solution = graph_of(five_cameras, xy, sigmas, kernel=kernel).solve(truth)
     for joint in range(0, 25, 4):
         best = minimize(cost, truth[joint], args=(joint,), method="BFGS", options={"gtol": 1e-6})
-        # A robust cost is flat, and BFGS has numeric gradients: 0.001 is a twentieth of a standard deviation.
+        # A robust cost is flat, and BFGS has numeric gradients: 0.001 is a twentieth of a standard
+        # deviation.
         assert abs(cost(solution[joint], joint) - best.fun) < 1e-3
         np.testing.assert_allclose(solution[joint], best.x, atol=2e-5 if kernel is None else 3e-3)
 
@@ -122,10 +137,14 @@ def test_the_kernel_makes_one_wrong_view_harmless(five_cameras, person):
     xy = xy.copy()
     xy[:, 2, 0] += 60.0
     off = {
-        kernel: np.linalg.norm(graph_of(five_cameras, xy, sigmas, kernel=kernel).solve(truth) - truth, axis=1)
+        kernel: np.linalg.norm(
+            graph_of(five_cameras, xy, sigmas, kernel=kernel).solve(truth) - truth, axis=1
+        )
         for kernel in (None, "cauchy")
     }
-    assert np.median(off["cauchy"]) < 0.65 * np.median(off[None])  # 0.37 +- 0.06 over cameras and noise
+    assert np.median(off["cauchy"]) < 0.65 * np.median(
+        off[None]
+    )  # 0.37 +- 0.06 over cameras and noise
 
 
 def test_covariance_is_the_inverse_of_the_information(five_cameras, person):
@@ -135,12 +154,15 @@ def test_covariance_is_the_inverse_of_the_information(five_cameras, person):
     graph = graph_of(five_cameras, xy, sigmas)
     solution = graph.solve(truth)
     expected = np.linalg.inv(information_of(five_cameras, solution, sigmas))
-    # The Jacobians are numeric ones, good to seven digits; two nearly opposite views lose a few when inverted.
+    # The Jacobians are numeric ones, good to seven digits; two nearly opposite views lose a few
+    # when inverted.
     np.testing.assert_allclose(graph.covariance(), expected, rtol=1e-4, atol=1e-9)
 
 
 def test_covariance_is_the_scatter_of_the_solutions(five_cameras, two_people):
-    """300 draws of the noise: the square of a normalised error has mean 3 per joint, here to within 5 %."""
+    """300 draws of the noise: the square of a normalised error has mean 3 per joint, here to within
+    5 %.
+    """
     rng = np.random.default_rng(0)
     xy = np.moveaxis(five_cameras.project(two_people[0])[0], 0, 1)
     sigmas = np.full(xy.shape[:2], 5.0)
@@ -149,7 +171,8 @@ def test_covariance_is_the_scatter_of_the_solutions(five_cameras, two_people):
         graph = graph_of(five_cameras, xy + rng.normal(0, 5.0, xy.shape), sigmas)
         error = graph.solve(two_people[0]) - two_people[0]
         squares.append(np.einsum("ji,jik,jk->j", error, np.linalg.inv(graph.covariance()), error))
-    # The mean of 300 chi-square variables of 3 degrees has a standard deviation of sqrt(6 / 300) = 0.14.
+    # The mean of 300 chi-square variables of 3 degrees has a standard deviation of sqrt(6 / 300) =
+    # 0.14.
     assert np.mean(squares) == pytest.approx(3.0, abs=0.42)
 
 
@@ -163,7 +186,9 @@ def test_a_gated_observation_has_no_influence_and_comes_back(five_cameras, perso
     gates[7, :2] = True
     graph.set_gates(gates)
     fewer = graph.solve(truth)
-    unseen = graph_of(five_cameras, np.where(gates[..., None], xy, 9999.0), np.where(gates, sigmas, 0.0))
+    unseen = graph_of(
+        five_cameras, np.where(gates[..., None], xy, 9999.0), np.where(gates, sigmas, 0.0)
+    )
     np.testing.assert_allclose(fewer, unseen.solve(truth), atol=1e-9)
     np.testing.assert_allclose(graph.covariance(), unseen.covariance(), rtol=1e-7, atol=1e-15)
     moved = np.linalg.norm(fewer - everything, axis=1) > 1e-4
@@ -191,15 +216,23 @@ def test_a_prior_and_one_view_are_fused_as_gaussians_are(five_cameras, person):
     """Covariance (P^-1 + J^T J / sigma²)^-1; linearised at the solution, the mean is exact too."""
     truth, xy, sigmas = person
     sigmas = np.where(np.arange(5) == 1, sigmas, 0.0)
-    mean, covariance = truth + np.random.default_rng(1).normal(0, 0.03, truth.shape), random_covariances(25, 0.04)
+    mean, covariance = (
+        truth + np.random.default_rng(1).normal(0, 0.03, truth.shape),
+        random_covariances(25, 0.04),
+    )
     graph = graph_of(five_cameras, xy, sigmas)
     graph.set_priors(np.ones(25, dtype=bool), mean, covariance)
     solution = graph.solve(mean)
     information = information_of(five_cameras, solution, sigmas)
     prior = np.linalg.inv(covariance)
-    np.testing.assert_allclose(graph.covariance(), np.linalg.inv(prior + information), rtol=1e-5, atol=1e-10)
+    np.testing.assert_allclose(
+        graph.covariance(), np.linalg.inv(prior + information), rtol=1e-5, atol=1e-10
+    )
     # Linearised at the solution: x = (prior + information)^-1 (prior mean + information target).
-    J = np.stack([numeric_jacobian(five_cameras, point)[1] for point in solution]) / sigmas[:, 1, None, None]
+    J = (
+        np.stack([numeric_jacobian(five_cameras, point)[1] for point in solution])
+        / sigmas[:, 1, None, None]
+    )
     r = (five_cameras.project(solution)[0][1] - xy[:, 1]) / sigmas[:, 1, None]
     right = np.einsum("jik,jk->ji", prior, mean) + np.einsum(
         "jki,jk->ji", J, np.einsum("jki,ji->jk", J, solution) - r
@@ -233,7 +266,10 @@ def test_weights_divide_the_covariances(five_cameras, person):
     plain = graph_of(five_cameras, xy, sigmas)
     plain.solve(truth)
     heavy = graph_of(
-        five_cameras, xy, sigmas, WindowGraphConfig(weight_2d=4.0, max_iterations=100, tolerance=1e-12)
+        five_cameras,
+        xy,
+        sigmas,
+        WindowGraphConfig(weight_2d=4.0, max_iterations=100, tolerance=1e-12),
     )
     heavy.solve(truth)
     np.testing.assert_allclose(4.0 * heavy.covariance(), plain.covariance(), rtol=1e-6)
@@ -246,8 +282,12 @@ def test_weights_divide_the_covariances(five_cameras, person):
 
 @pytest.mark.parametrize("kernel", ["huber", "cauchy", "geman_mcclure", "tukey"])
 @pytest.mark.parametrize("frames", [1, 2])
-def test_the_weight_of_the_views_multiplies_their_cost_kernel_and_all(five_cameras, person, kernel, frames):
-    """One view is 60 px off, where every kernel bends: four times the weight is four times the cost."""
+def test_the_weight_of_the_views_multiplies_their_cost_kernel_and_all(
+    five_cameras, person, kernel, frames
+):
+    """One view is 60 px off, where every kernel bends: four times the weight is four times the
+    cost.
+    """
     truth, xy, sigmas = person
     xy = xy.copy()
     xy[:, 2, 0] += 60.0
@@ -317,12 +357,19 @@ def test_people_and_frames_compose_into_one_graph(five_cameras, two_people):
         xy = np.moveaxis(five_cameras.project(truth)[0], 0, 1)
         sigmas = np.full(xy.shape[:2], 5.0)
         graph = graph_of(
-            five_cameras, xy + rng.normal(0, 5, xy.shape), sigmas, kernel="cauchy", person=name, frame=frame
+            five_cameras,
+            xy + rng.normal(0, 5, xy.shape),
+            sigmas,
+            kernel="cauchy",
+            person=name,
+            frame=frame,
         )
         gates = rng.random(sigmas.shape) < 0.9
         gates[:, :3] = True
         graph.set_gates(gates)
-        assert [split_key(key) for key in graph.keys.tolist()] == [(name, joint, frame) for joint in range(25)]
+        assert [split_key(key) for key in graph.keys.tolist()] == [
+            (name, joint, frame) for joint in range(25)
+        ]
         alone.append((graph.keys, graph.solve(truth)))
         whole.push_back(graph.graph)
         for key, point in zip(graph.keys.tolist(), truth, strict=True):
@@ -333,7 +380,9 @@ def test_people_and_frames_compose_into_one_graph(five_cameras, two_people):
     assert together.size() == 75
     for keys, solution in alone:
         # A robust problem converges linearly: both stop some 10 um before the end.
-        np.testing.assert_allclose([together.atPoint3(key) for key in keys.tolist()], solution, atol=5e-5)
+        np.testing.assert_allclose(
+            [together.atPoint3(key) for key in keys.tolist()], solution, atol=5e-5
+        )
 
 
 def test_a_bone_length_of_one_s_own_is_kept(five_cameras, person):
@@ -362,8 +411,12 @@ def test_refuses_settings_that_make_no_sense():
 
 
 @pytest.mark.parametrize(("error", "failure"), [(RuntimeError, "singular"), (None, "diverged")])
-def test_a_solver_that_fails_says_so_and_leaves_the_joints(five_cameras, person, monkeypatch, error, failure):
-    """GTSAM raises RuntimeError where its system is indeterminate, and may end with an error that is NaN."""
+def test_a_solver_that_fails_says_so_and_leaves_the_joints(
+    five_cameras, person, monkeypatch, error, failure
+):
+    """GTSAM raises RuntimeError where its system is indeterminate, and may end with an error that
+    is NaN.
+    """
     truth, xy, sigmas = person
 
     class Failing(gtsam.LevenbergMarquardtOptimizer):
@@ -387,15 +440,23 @@ def test_a_solver_that_fails_says_so_and_leaves_the_joints(five_cameras, person,
 def test_an_empty_problem_after_a_failure_is_no_failure(five_cameras, person):
     truth, xy, sigmas = person
     graph = graph_of(five_cameras, xy, sigmas)
-    graph.add(gtsam.PriorFactorPoint3(int(graph.keys[4]), np.full(3, np.nan), gtsam.noiseModel.Unit.Create(3)))
+    graph.add(
+        gtsam.PriorFactorPoint3(
+            int(graph.keys[4]), np.full(3, np.nan), gtsam.noiseModel.Unit.Create(3)
+        )
+    )
     graph.solve(truth)
     assert graph.window.failure
     assert np.isnan(graph.solve(np.full((25, 3), np.nan))).all()
     assert graph.window.failure == ""
 
 
-def test_of_a_joint_that_one_view_saw_there_is_no_covariance_and_the_others_have_theirs(five_cameras, person):
-    """Its depth is open, so that the whole system is singular; what hangs together with it is nothing."""
+def test_of_a_joint_that_one_view_saw_there_is_no_covariance_and_the_others_have_theirs(
+    five_cameras, person
+):
+    """Its depth is open, so that the whole system is singular; what hangs together with it is
+    nothing.
+    """
     truth, xy, sigmas = person
     graph = OneFrame(five_cameras, xy, sigmas, EXACT, None, 0, 0)
     inlier = np.ones(sigmas.shape, dtype=bool)
@@ -414,7 +475,9 @@ def test_of_a_joint_that_one_view_saw_there_is_no_covariance_and_the_others_have
 
 
 def test_what_is_known_to_more_than_ten_metres_is_not_determined(five_cameras, person):
-    """In some direction: 11 m along x are too much, 9 m along every axis are not, and no path to it matters."""
+    """In some direction: 11 m along x are too much, 9 m along every axis are not, and no path to it
+    matters.
+    """
     truth, xy, sigmas = person
     for whole_system_is_singular in (False, True):
         graph = graph_of(five_cameras, xy, np.where(np.arange(25)[:, None] == 6, sigmas, 0.0))
@@ -431,7 +494,9 @@ def test_what_is_known_to_more_than_ten_metres_is_not_determined(five_cameras, p
 
 
 def test_in_a_frame_alone_a_joint_lost_from_sight_is_pulled_as_any_other(five_cameras, person):
-    """Offsets are for windows of several frames: here the body's pull counts, whatever is said to be lost."""
+    """Offsets are for windows of several frames: here the body's pull counts, whatever is said to
+    be lost.
+    """
     truth, xy, sigmas = person
     graph = OneFrame(five_cameras, xy, sigmas, EXACT, None, 0, 0)
     pulled = np.arange(25) == 4

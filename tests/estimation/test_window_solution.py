@@ -1,4 +1,6 @@
-"""The graph of a solved window says what is reported: values, marginals, and what one makes of it."""
+"""The graph of a solved window says what is reported: values, marginals, and what one makes of
+it.
+"""
 
 from dataclasses import replace
 
@@ -35,7 +37,9 @@ def ratios(solution: PersonGraph) -> np.ndarray:
     """(K,) sigmas of the graph's marginals over the reported ones, of all known joints."""
     found = gtsam.Marginals(solution.graph, solution.values)
     known = np.isfinite(solution.covariance).all(axis=(2, 3))
-    graph = np.array([np.trace(found.marginalCovariance(key)) for key in solution.keys[known].tolist()])
+    graph = np.array(
+        [np.trace(found.marginalCovariance(key)) for key in solution.keys[known].tolist()]
+    )
     return np.sqrt(graph / np.trace(solution.covariance[known], axis1=1, axis2=2))
 
 
@@ -60,17 +64,24 @@ def test_marginals_are_the_reported_covariances_and_values_the_reported_joints(p
         at = np.array([solution.values.atPoint3(key) for key in solution.keys[known].tolist()])
         np.testing.assert_allclose(at, mine.joints[known], atol=1e-6)
         assert solution.person == mine.person[0] and np.array_equal(solution.frames, mine.frame)
-        # The solver's own graph has only what is new in every frame: a third of the reported sigmas.
+        # The solver's own graph has only what is new in every frame: a third of the reported
+        # sigmas.
         assert np.median(ratios(solution)) == pytest.approx(1.0, abs=1e-3)
         bare = gtsam.Marginals(solution.window.graph, solution.window.values)
         wrist = solution.window.keys[6, WRIST]
-        assert np.trace(bare.marginalCovariance(wrist)) < 0.5 * np.trace(solution.covariance[6, WRIST])
+        assert np.trace(bare.marginalCovariance(wrist)) < 0.5 * np.trace(
+            solution.covariance[6, WRIST]
+        )
 
 
 @pytest.mark.slow
 def test_frame_by_frame_every_frame_has_a_graph_of_its_own(scene):
-    """A number is no identity there: rows of the same number in two frames are not tied by motion."""
-    alone = reconstruct(simulate(scene), scene.rig, replace(PipelineConfig(), temporal=False), frames=range(3))
+    """A number is no identity there: rows of the same number in two frames are not tied by
+    motion.
+    """
+    alone = reconstruct(
+        simulate(scene), scene.rig, replace(PipelineConfig(), temporal=False), frames=range(3)
+    )
     found = solutions(alone, scene)
     assert sorted(int(each.frames[0]) for each in found) == sorted(alone.frame.tolist())
     assert alike(found) > 0.9
@@ -91,8 +102,8 @@ def test_what_a_graph_cannot_be_made_of_is_refused(people, scene):
 
 
 def test_the_reported_error_lasts_from_frame_to_frame(people, scene):
-    """Two measurements of the same detector are no two: the errors of neighbouring frames correlate, of frames
-    farther apart less (0.64 and 0.23, mean of all joints).
+    """Two measurements of the same detector are no two: the errors of neighbouring frames
+    correlate, of frames farther apart less (0.64 and 0.23, mean of all joints).
     """
     near, far = [], []
     for solution in solutions(people, scene):
@@ -108,7 +119,9 @@ def test_the_reported_error_lasts_from_frame_to_frame(people, scene):
 
 
 def test_a_users_isam2_takes_a_person_and_learns_of_a_wrist(people, scene):
-    """Somebody else sees a wrist 5 cm beside, to 1 cm: it goes there, and so does the frame after it."""
+    """Somebody else sees a wrist 5 cm beside, to 1 cm: it goes there, and so does the frame after
+    it.
+    """
     solution = solutions(people, scene)[0]
     isam = gtsam.ISAM2()
     isam.update(solution.graph, solution.values)
@@ -121,9 +134,15 @@ def test_a_users_isam2_takes_a_person_and_learns_of_a_wrist(people, scene):
     more.push_back(gtsam.PriorFactorPoint3(before, seen, isotropic(3, 0.01)))
     isam.update(more, gtsam.Values())
     now = isam.calculateEstimate()
-    moved = [now.atPoint3(key)[0] - solution.joints[frame, WRIST, 0] for key, frame in ((before, 6), (after, 7))]
+    moved = [
+        now.atPoint3(key)[0] - solution.joints[frame, WRIST, 0]
+        for key, frame in ((before, 6), (after, 7))
+    ]
     said = solution.covariance[6, WRIST, 0, 0]
-    assert moved[0] == pytest.approx(0.05 * said / (said + 1e-4), rel=0.2) and 0.4 * moved[0] < moved[1] < moved[0]
+    assert (
+        moved[0] == pytest.approx(0.05 * said / (said + 1e-4), rel=0.2)
+        and 0.4 * moved[0] < moved[1] < moved[0]
+    )
     assert np.trace(isam.marginalCovariance(before)) < 3.1e-4
 
 

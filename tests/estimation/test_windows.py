@@ -1,4 +1,6 @@
-"""Stage II over several frames: motion, joints lost from sight, factors of one's own, what went wrong."""
+"""Stage II over several frames: motion, joints lost from sight, factors of one's own, what went
+wrong.
+"""
 
 import json
 from dataclasses import replace
@@ -32,10 +34,13 @@ WRIST, OTHER_WRIST, NOSE = (BODY_25.index(name) for name in ("RWrist", "LWrist",
 
 
 class BesideFitter(BodyFitter):
-    """Puts each row's body where the seen joints are, moved by `beside` (3,) metres; remembers what it was
-    asked."""
+    """Puts each row's body where the seen joints are, moved by `beside` (3,) metres; remembers what
+    it was asked.
+    """
 
-    def __init__(self, shape: NDArray[np.float64], beside=(0.0, 0.0, 0.0), sigma_m: float = 0.1) -> None:
+    def __init__(
+        self, shape: NDArray[np.float64], beside=(0.0, 0.0, 0.0), sigma_m: float = 0.1
+    ) -> None:
         self.shape, self.beside, self.sigma_m = shape, np.array(beside), sigma_m
         self.groups: list[NDArray[np.intp] | None] = []
         self.without: list[set[int]] = []
@@ -48,7 +53,9 @@ class BesideFitter(BodyFitter):
         apart = np.where(seen[..., None], targets.xyz - self.shape, 0.0).sum(axis=1)
         moved = apart / np.maximum(seen.sum(axis=1), 1)[:, None]
         xyz = self.shape + moved[:, None] + self.beside
-        failed = BodyFit.failed(np.where(ok, FitStatus.OK, FitStatus.TOO_FEW_JOINTS), self.shape.shape[0])
+        failed = BodyFit.failed(
+            np.where(ok, FitStatus.OK, FitStatus.TOO_FEW_JOINTS), self.shape.shape[0]
+        )
         covariance = np.tile(self.sigma_m**2 * np.eye(3), (*seen.shape, 1, 1))
         return replace(
             failed,
@@ -65,7 +72,9 @@ class NobodyFitter(BodyFitter):
 
 
 class PlacingFitter(BesideFitter):
-    """The same, with a body, known to `sigma_m`: its joints are not aside, only what it says without them is."""
+    """The same, with a body, known to `sigma_m`: its joints are not aside, only what it says
+    without them is.
+    """
 
     def fit(self, targets, initial=None, groups=None) -> BodyFit:
         fit = super().fit(targets, initial, groups)
@@ -84,7 +93,9 @@ def walk(five_cameras, two_people):
     xy = xy + np.random.default_rng(0).normal(0, 3.0, xy.shape)
     frame, track = np.divmod(np.arange(2 * FRAMES), 2)
     time_s = np.repeat(frame[:, None] / FPS, 5, axis=1)
-    return Observations(xy, np.full(xy.shape[:3], 0.8), np.full(truth.shape, np.nan), track, frame, time_s), truth
+    return Observations(
+        xy, np.full(xy.shape[:3], 0.8), np.full(truth.shape, np.nan), track, frame, time_s
+    ), truth
 
 
 def hidden(observations: Observations, rows, joint: int) -> Observations:
@@ -121,7 +132,9 @@ def test_a_row_without_others_of_its_track_stands_alone(walk, five_cameras, two_
     assert np.isnan(together.velocity).all() and np.isnan(together.velocity_covariance).all()
 
 
-def test_a_lone_row_is_what_it_is_by_itself_beside_somebody_s_window(walk, five_cameras, two_people):
+def test_a_lone_row_is_what_it_is_by_itself_beside_somebody_s_window(
+    walk, five_cameras, two_people
+):
     """Its wrist, which one view saw, is not placed by the draft that windows start from."""
     observations, _ = walk
     track = np.where(observations.track == 0, 0, np.arange(len(observations)))
@@ -136,7 +149,9 @@ def test_a_lone_row_is_what_it_is_by_itself_beside_somebody_s_window(walk, five_
 
 
 def test_a_start_that_is_not_complete_is_for_frames_alone(walk, five_cameras, two_people):
-    """Nothing placed by stage I and no triangulation: alone there is nobody, a window has its draft."""
+    """Nothing placed by stage I and no triangulation: alone there is nobody, a window has its
+    draft.
+    """
     observations, truth = walk
     config = EstimatorConfig(refine=RefineConfig(complete_start=False))
     asked = Views.of(five_cameras), NobodyFitter(), config
@@ -146,10 +161,13 @@ def test_a_start_that_is_not_complete_is_for_frames_alone(walk, five_cameras, tw
 
 
 @pytest.mark.parametrize("views_left", [0, *slow(1)])
-def test_a_wrist_out_of_sight_goes_where_the_body_can_have_it(walk, five_cameras, two_people, views_left):
-    """From frame 5 on no view sees the first wrist, or one does: it drifts towards what the body says without it,
-    aside or along the ray. With `keep_limbs` it goes towards the body's joint, and its forearm gets its length
-    where a ray leaves it open; nothing else moves, and others' covariances stay.
+def test_a_wrist_out_of_sight_goes_where_the_body_can_have_it(
+    walk, five_cameras, two_people, views_left
+):
+    """From frame 5 on no view sees the first wrist, or one does: it drifts towards what the body
+    says without it, aside or along the ray. With `keep_limbs` it goes towards the body's joint, and
+    its forearm gets its length where a ray leaves it open; nothing else moves, and others'
+    covariances stay.
     """
     observations, truth = walk
     rows = np.flatnonzero((observations.track == 0) & (observations.frame >= 5))
@@ -164,7 +182,10 @@ def test_a_wrist_out_of_sight_goes_where_the_body_can_have_it(walk, five_cameras
     kept, carried = (solve(seen, five_cameras, fitter, keep_limbs=keep) for keep in (True, False))
     late = rows[-10:]
 
-    off = [np.linalg.norm((each.joints - truth)[late, WRIST], axis=-1).mean() for each in (carried, kept)]
+    off = [
+        np.linalg.norm((each.joints - truth)[late, WRIST], axis=-1).mean()
+        for each in (carried, kept)
+    ]
     ends = [each.joints[late][:, [elbow, WRIST]] for each in (carried, kept)]
     wrong = [abs(np.linalg.norm(np.diff(each, axis=1), axis=-1).mean() - length) for each in ends]
     # Measured: 64 to 13 mm aside and 41 to 17 along the ray.
@@ -175,12 +196,18 @@ def test_a_wrist_out_of_sight_goes_where_the_body_can_have_it(walk, five_cameras
     # Lengths are kept for 0.1 s around, three frames.
     assert not changed[(observations.track == 1) | (observations.frame < 2)].any()
     # The wrist's knows where it may hide, which depends on its place.
-    np.testing.assert_array_equal(*(np.delete(each.covariance, WRIST, axis=1) for each in (kept, carried)))
+    np.testing.assert_array_equal(
+        *(np.delete(each.covariance, WRIST, axis=1) for each in (kept, carried))
+    )
 
 
 @pytest.mark.slow
-def test_a_joint_with_a_factor_of_one_s_own_stays_where_that_leaves_it(walk, five_cameras, two_people):
-    """The same wrist, out of sight, with a factor that says next to nothing: `keep_limbs` leaves it alone."""
+def test_a_joint_with_a_factor_of_one_s_own_stays_where_that_leaves_it(
+    walk, five_cameras, two_people
+):
+    """The same wrist, out of sight, with a factor that says next to nothing: `keep_limbs` leaves it
+    alone.
+    """
     observations, truth = walk
     rows = np.flatnonzero((observations.track == 0) & (observations.frame >= 5))
     seen = observations
@@ -207,8 +234,8 @@ def test_motion_takes_noise_away_and_knows_the_velocity(walk, five_cameras, two_
     found = solve(observations, five_cameras, BesideFitter(two_people[0]))
     before, after = (np.linalg.norm(each.joints - truth, axis=-1) for each in (alone, found))
     assert (found.status == Status.OK).all() and not found.problems
-    # The noise here is white; the model says that 30 % of it are, and smooths no more than that deserves.
-    # Measured: 0.57.
+    # The noise here is white; the model says that 30 % of it are, and smooths no more than that
+    # deserves. Measured: 0.57.
     assert after.mean() < 0.65 * before.mean()
     expected = np.array([[0.5, 0.0, 0.0], [0.0, -1.0, 0.0]])[observations.track]
     np.testing.assert_allclose(found.velocity.mean(axis=1), expected, atol=0.1)
@@ -237,26 +264,39 @@ def test_rows_of_a_track_are_one_group_of_the_fitter(walk, five_cameras, two_peo
 @pytest.mark.slow
 @pytest.mark.usefixtures("out_of_sight")
 def test_a_joint_lost_from_sight_keeps_its_place_beside_the_body(walk, five_cameras, two_people):
-    """The body is 12 cm beside the joints. A wrist hidden for ten frames stays where it is, not where the body
-    is."""
+    """The body is 12 cm beside the joints. A wrist hidden for ten frames stays where it is, not
+    where the body is.
+    """
     observations, truth = walk
-    rows = np.flatnonzero((observations.track == 0) & (observations.frame >= 10) & (observations.frame < 20))
+    rows = np.flatnonzero(
+        (observations.track == 0) & (observations.frame >= 10) & (observations.frame < 20)
+    )
     seen = hidden(observations, rows, WRIST)
     beside = (0.0, 0.12, 0.0)
     found = solve(seen, five_cameras, BesideFitter(two_people[0], beside, sigma_m=0.15))
     error = np.linalg.norm(found.joints[rows, WRIST] - truth[rows, WRIST], axis=-1)
-    alone = solve(seen, five_cameras, BesideFitter(two_people[0], beside, sigma_m=0.15), temporal=False)
-    np.testing.assert_allclose(np.linalg.norm(alone.joints - truth, axis=-1)[rows, WRIST], 0.12, atol=0.02)
+    alone = solve(
+        seen, five_cameras, BesideFitter(two_people[0], beside, sigma_m=0.15), temporal=False
+    )
+    np.testing.assert_allclose(
+        np.linalg.norm(alone.joints - truth, axis=-1)[rows, WRIST], 0.12, atol=0.02
+    )
     assert error.max() < 0.04
-    assert (found.known[rows, WRIST] == Known.MOTION).all() and (alone.known[rows, WRIST] == Known.BODY).all()
+    assert (found.known[rows, WRIST] == Known.MOTION).all() and (
+        alone.known[rows, WRIST] == Known.BODY
+    ).all()
     assert (np.delete(found.known, rows, axis=0) == Known.SEEN).all()
     sigma = np.sqrt(np.trace(found.covariance[rows, WRIST], axis1=1, axis2=2))
-    assert sigma[4] > 1.5 * sigma[0] and sigma[5] > 1.5 * sigma[-1], "surest where it was seen a moment ago"
+    assert sigma[4] > 1.5 * sigma[0] and sigma[5] > 1.5 * sigma[-1], (
+        "surest where it was seen a moment ago"
+    )
 
 
-def test_two_cameras_that_face_each_other_are_not_averaged_over_time(walk, five_cameras, two_people):
-    """Cameras in a line with the wrist see it 4 px too high and too low in all frames, 24 cm along the line: the
-    body has it to 2 cm, and thirty frames of the same error are no better than one.
+def test_two_cameras_that_face_each_other_are_not_averaged_over_time(
+    walk, five_cameras, two_people
+):
+    """Cameras in a line with the wrist see it 4 px too high and too low in all frames, 24 cm along
+    the line: the body has it to 2 cm, and thirty frames of the same error are no better than one.
     """
     observations, truth = walk
     target = truth[observations.track == 0][:, WRIST].mean(axis=0)
@@ -280,12 +320,15 @@ def test_two_cameras_that_face_each_other_are_not_averaged_over_time(walk, five_
 
 @pytest.mark.usefixtures("out_of_sight")
 def test_a_joint_lost_for_long_goes_to_the_body(walk, five_cameras, two_people):
-    """Hidden from frame 5 on: after a second, what was known of it has faded, and the covariance is about the
-    body's 15 cm."""
+    """Hidden from frame 5 on: after a second, what was known of it has faded, and the covariance is
+    about the body's 15 cm.
+    """
     observations, truth = walk
     rows = np.flatnonzero((observations.track == 0) & (observations.frame >= 5))
     beside = np.array([0.0, 0.12, 0.0])
-    found = solve(hidden(observations, rows, WRIST), five_cameras, BesideFitter(two_people[0], beside, 0.15))
+    found = solve(
+        hidden(observations, rows, WRIST), five_cameras, BesideFitter(two_people[0], beside, 0.15)
+    )
     off = (found.joints[rows, WRIST] - truth[rows, WRIST]) @ beside / 0.12
     assert off[0] < 0.02 < 0.04 < off[-1] and (np.diff(off[3:]) > 0).all()
     sigma = np.sqrt(np.trace(found.covariance[rows, WRIST], axis1=1, axis2=2) / 3)
@@ -308,7 +351,9 @@ def test_a_foot_that_stands_still_stays_still(walk, five_cameras, two_people):
 
     def stands(window, keys):
         for before, after in zip(keys[:-1, heel].tolist(), keys[1:, heel].tolist(), strict=True):
-            yield gtsam.BetweenFactorPoint3(before, after, np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, 1e-4))
+            yield gtsam.BetweenFactorPoint3(
+                before, after, np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, 1e-4)
+            )
 
     found = solve(observations, five_cameras, BesideFitter(two_people[0]), stands)
     for track in (0, 1):
@@ -319,12 +364,16 @@ def test_a_foot_that_stands_still_stays_still(walk, five_cameras, two_people):
 
 @pytest.mark.slow
 def test_velocities_take_factors_too(walk, five_cameras, two_people):
-    """Wrists that stand still by decree; in a frame alone there are no velocities, and the factors rest."""
+    """Wrists that stand still by decree; in a frame alone there are no velocities, and the factors
+    rest.
+    """
     observations, _ = walk
 
     def still(window, keys):
         for key in window.velocity_keys[:, WRIST].tolist():
-            yield gtsam.PriorFactorPoint3(key, np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, 1e-4))
+            yield gtsam.PriorFactorPoint3(
+                key, np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, 1e-4)
+            )
 
     found = solve(observations, five_cameras, BesideFitter(two_people[0]), still)
     assert np.abs(found.velocity[:, WRIST]).max() < 0.01
@@ -358,7 +407,9 @@ def test_a_joint_thrown_away_is_a_status_with_a_name(walk, five_cameras, two_peo
     def throw(window, keys):
         if window.track == who and 4 in window.frames:
             key = int(keys[window.frames == 4, WRIST][0])
-            yield gtsam.PriorFactorPoint3(key, [1000.0, 0, 0], gtsam.noiseModel.Isotropic.Sigma(3, 1e-3))
+            yield gtsam.PriorFactorPoint3(
+                key, [1000.0, 0, 0], gtsam.noiseModel.Isotropic.Sigma(3, 1e-3)
+            )
 
     found = solve(observations, five_cameras, BesideFitter(two_people[0]), throw, temporal=temporal)
     assert (found.status[bad] == Status.NOT_SOLVED).all()
@@ -381,7 +432,9 @@ def test_factors_that_make_no_sense_end_no_run(walk, five_cameras, two_people):
 
     found = solve(observations, five_cameras, BesideFitter(two_people[0]), nonsense)
     first = observations.track == 0
-    assert (found.status[first] == Status.OK).all() and (found.status[~first] == Status.NOT_SOLVED).all()
+    assert (found.status[first] == Status.OK).all() and (
+        found.status[~first] == Status.NOT_SOLVED
+    ).all()
     np.testing.assert_allclose(found.joints[first], truth[first], atol=0.03)
 
 
@@ -410,13 +463,22 @@ def test_near_in_time_reaches_both_ways():
     marked = np.zeros((6, 1), dtype=bool)
     marked[2] = True
     times = np.array([0.0, 0.4, 0.6, 0.8, 1.2, 2.0])
-    assert near_in_time(marked, times, 0.25)[:, 0].tolist() == [False, True, True, True, False, False]
+    assert near_in_time(marked, times, 0.25)[:, 0].tolist() == [
+        False,
+        True,
+        True,
+        True,
+        False,
+        False,
+    ]
 
 
 def test_the_motion_model_is_read_by_name_and_checked(tmp_path):
     model = MotionModel.load(("RWrist", "MidHip", "NoSuchJoint"))
     assert model.psd_still[0] > model.psd_still[1] > 0, "wrists turn faster than hips"
-    np.testing.assert_allclose(model.density([[2.0, 0, 0]])[0, 0], model.psd_still[0] + 4 * model.psd_speed[0])
+    np.testing.assert_allclose(
+        model.density([[2.0, 0, 0]])[0, 0], model.psd_still[0] + 4 * model.psd_speed[0]
+    )
     doubled = MotionModel.load(("RWrist",), MotionConfig(psd_scale=2.0))
     assert doubled.psd_still[0] == pytest.approx(2 * model.psd_still[0])
     (tmp_path / "other.json").write_text('{"format": "something else"}', encoding="utf-8")
@@ -432,25 +494,30 @@ def test_the_motion_model_is_read_by_name_and_checked(tmp_path):
 @pytest.mark.parametrize(
     ("key", "value"),
     [("white_share", 1.5), ("white_share", 1.0), ("white_share", 0.0), ("white_share", -1.0),
-     ("white_share", np.nan), ("correlation_s", -2.0), ("correlation_s", 0.0), ("correlation_s", np.inf),
-     ("kept", 7.0), ("kept", -0.1), ("kept", np.nan)],
+     ("white_share", np.nan), ("correlation_s", -2.0), ("correlation_s", 0.0),
+     ("correlation_s", np.inf), ("kept", 7.0), ("kept", -0.1), ("kept", np.nan)],
 )  # fmt: skip
 def test_impossible_errors_in_a_motion_model_are_refused(tmp_path, source, key, value):
     shipped = files("shapepose_fg.estimation") / "data" / "motion.json"
     data = json.loads(shipped.read_text(encoding="utf-8"))
     data[source][key] = value
     (tmp_path / "motion.json").write_text(json.dumps(data), encoding="utf-8")
-    with pytest.raises(InputError, match=r"motion\.json: .*(white_share must be between|not a motion model|JSON)"):
+    with pytest.raises(
+        InputError, match=r"motion\.json: .*(white_share must be between|not a motion model|JSON)"
+    ):
         MotionModel.load(("RWrist",), MotionConfig(model=str(tmp_path / "motion.json")))
 
 
 @pytest.mark.parametrize(
     ("densities", "possible"),
-    [([0.5, 0.0, 0.0], True), ([0.0, 1.0, 1.0], False), ([0.5, -0.5, 1.0], False), ([0.5, 1.0, -0.5], False),
+    [([0.5, 0.0, 0.0], True), ([0.0, 1.0, 1.0], False), ([0.5, -0.5, 1.0], False),
+     ([0.5, 1.0, -0.5], False),
      ([0.5, np.inf, 1.0], False)],
 )  # fmt: skip
 def test_densities_that_are_none_are_refused(tmp_path, densities, possible):
-    data = json.loads((files("shapepose_fg.estimation") / "data" / "motion.json").read_text(encoding="utf-8"))
+    data = json.loads(
+        (files("shapepose_fg.estimation") / "data" / "motion.json").read_text(encoding="utf-8")
+    )
     data["joints"]["RWrist"] = densities
     (tmp_path / "motion.json").write_text(json.dumps(data), encoding="utf-8")
     config = MotionConfig(model=str(tmp_path / "motion.json"))
@@ -462,8 +529,12 @@ def test_densities_that_are_none_are_refused(tmp_path, densities, possible):
 
 
 def test_another_format_is_refused_whatever_it_holds(tmp_path):
-    data = json.loads((files("shapepose_fg.estimation") / "data" / "motion.json").read_text(encoding="utf-8"))
-    (tmp_path / "motion.json").write_text(json.dumps(data | {"format": "shapepose-fg motion model 2"}))
+    data = json.loads(
+        (files("shapepose_fg.estimation") / "data" / "motion.json").read_text(encoding="utf-8")
+    )
+    (tmp_path / "motion.json").write_text(
+        json.dumps(data | {"format": "shapepose-fg motion model 2"})
+    )
     with pytest.raises(InputError, match=r"motion\.json: is not a motion model"):
         MotionModel.load(("RWrist",), MotionConfig(model=str(tmp_path / "motion.json")))
 
@@ -474,12 +545,17 @@ def nothing(window, keys):
 
 def steady(window, keys):
     for before, after in zip(keys[:-1, WRIST].tolist(), keys[1:, WRIST].tolist(), strict=True):
-        yield gtsam.BetweenFactorPoint3(before, after, np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, 0.01))
+        yield gtsam.BetweenFactorPoint3(
+            before, after, np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, 0.01)
+        )
 
 
 def far_apart(window, keys):
     yield gtsam.BetweenFactorPoint3(
-        int(keys[0, WRIST]), int(keys[-1, WRIST]), np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, 0.01)
+        int(keys[0, WRIST]),
+        int(keys[-1, WRIST]),
+        np.zeros(3),
+        gtsam.noiseModel.Isotropic.Sigma(3, 0.01),
     )
 
 
@@ -488,11 +564,17 @@ def far_apart(window, keys):
     [(nothing, 0), *slow((steady, 1), (far_apart, 1)), (box, 1)],
     ids=["no factors", "a chain", "frames far apart tied", "two joints tied"],
 )
-def test_chains_have_the_covariances_of_gtsam(walk, five_cameras, two_people, monkeypatch, factors, calls):
-    """A wrist lost twice, frames missing, one person in fewer frames, a joint that no view sees: the same numbers,
-    to rounding. GTSAM is asked once, only where there are factors of the user's own."""
+def test_chains_have_the_covariances_of_gtsam(
+    walk, five_cameras, two_people, monkeypatch, factors, calls
+):
+    """A wrist lost twice, frames missing, one person in fewer frames, a joint that no view sees:
+    the same numbers, to rounding. GTSAM is asked once, only where there are factors of the user's
+    own.
+    """
     observations, _ = walk
-    gone = (observations.track == 1) & (observations.frame > 20) | np.isin(observations.frame, [7, 8])
+    gone = (observations.track == 1) & (observations.frame > 20) | np.isin(
+        observations.frame, [7, 8]
+    )
     observations = observations.rows(np.flatnonzero(~gone))
     lost = np.isin(observations.frame, [4, 5, 24]) & (observations.track == 0)
     observations = hidden(hidden(observations, np.flatnonzero(lost), WRIST), slice(None), NOSE)
@@ -506,7 +588,9 @@ def test_chains_have_the_covariances_of_gtsam(walk, five_cameras, two_people, mo
     solve(observations, five_cameras, beside, captured, around_s=0.1)
     whole = [gtsam.Marginals(graph.graph, graph.values) for graph in graphs]
     asked, marginals = list[int](), gtsam.Marginals
-    monkeypatch.setattr(gtsam, "Marginals", lambda graph, values: (asked.append(1), marginals(graph, values))[1])
+    monkeypatch.setattr(
+        gtsam, "Marginals", lambda graph, values: (asked.append(1), marginals(graph, values))[1]
+    )
     found = state_covariances(graphs)
     assert [len(graph) for graph in graphs] == [28, 19] and len(asked) == calls
     for graph, (positions, velocities), known in zip(graphs, found, whole, strict=True):
@@ -521,8 +605,12 @@ def test_chains_have_the_covariances_of_gtsam(walk, five_cameras, two_people, mo
 
 
 @pytest.mark.parametrize("frames", [1, 2, 6])
-def test_joints_of_which_nobody_says_anything_cost_nobody_a_status(walk, five_cameras, two_people, frames):
-    """Three joints in five views, X_0 of all 25: too few to place a body, but these three have covariances."""
+def test_joints_of_which_nobody_says_anything_cost_nobody_a_status(
+    walk, five_cameras, two_people, frames
+):
+    """Three joints in five views, X_0 of all 25: too few to place a body, but these three have
+    covariances.
+    """
     observations, truth = walk
     rows = np.flatnonzero((observations.track == 0) & (observations.frame < frames))
     seen = replace(observations.rows(rows), initial=truth[rows])
@@ -531,11 +619,15 @@ def test_joints_of_which_nobody_says_anything_cost_nobody_a_status(walk, five_ca
     found = solve(seen, five_cameras, BesideFitter(two_people[0]))
     assert (found.status == Status.TOO_FEW_VIEWS).all() and not found.problems
     determined = np.isfinite(found.covariance).all(axis=(2, 3))
-    np.testing.assert_array_equal(determined, np.isin(np.arange(25), [1, 8, 9]) & np.ones((frames, 1), dtype=bool))
+    np.testing.assert_array_equal(
+        determined, np.isin(np.arange(25), [1, 8, 9]) & np.ones((frames, 1), dtype=bool)
+    )
     np.testing.assert_array_equal(np.isfinite(found.joints).all(axis=2), determined)
 
 
-def test_a_joint_with_a_factor_of_one_s_own_stays_without_views_and_body(walk, five_cameras, two_people):
+def test_a_joint_with_a_factor_of_one_s_own_stays_without_views_and_body(
+    walk, five_cameras, two_people
+):
     """What the user says of a joint that nobody else mentions is in the problem."""
     observations, truth = walk
     rows = np.flatnonzero((observations.track == 0) & (observations.frame < 6))
@@ -555,14 +647,18 @@ def test_a_joint_with_a_factor_of_one_s_own_stays_without_views_and_body(walk, f
 
 @pytest.mark.slow
 def test_somebody_undetermined_takes_nothing_from_anybody_else(walk, five_cameras, two_people):
-    """The user says how fast the first person's wrist is, nobody where: it is not known, and all else is."""
+    """The user says how fast the first person's wrist is, nobody where: it is not known, and all
+    else is.
+    """
     observations, truth = walk
     first = observations.track == 0
     seen = replace(hidden(observations, first, WRIST), initial=truth)
 
     def still(window, keys):
         for key in window.velocity_keys[:, WRIST].tolist() if window.track == 0 else ():
-            yield gtsam.PriorFactorPoint3(key, np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, 0.1))
+            yield gtsam.PriorFactorPoint3(
+                key, np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, 0.1)
+            )
 
     found = solve(seen, five_cameras, NobodyFitter(), still)
     unknown = ~np.isfinite(found.covariance).all(axis=(2, 3))

@@ -1,4 +1,6 @@
-"""Experiments: each works at a small scale; a run that was stopped goes on; old figures are measured again."""
+"""Experiments: each works at a small scale; a run that was stopped goes on; old figures are
+measured again.
+"""
 
 import importlib.util
 import json
@@ -32,7 +34,9 @@ def test_every_experiment_makes_a_table_of_plain_figures(name, tmp_path):
     rows = [line for line in experiment.table(figures) if line.startswith("|")]
     assert len(rows) >= 3
     assert len({row.count("|") for row in rows}) == 1, "rows of different length"
-    assert any(re.search(r"\d", cell) for cell in rows[-1].split("|")[2:]), "no figure in the last row"
+    assert any(re.search(r"\d", cell) for cell in rows[-1].split("|")[2:]), (
+        "no figure in the last row"
+    )
 
 
 def test_what_has_no_data_is_no_experiment():
@@ -81,7 +85,9 @@ def test_damaged_figures_are_named(tmp_path):
 
 
 def test_a_row_pools_its_cases():
-    """Means, but of shares of joints by how many joints there are; what is not measured has no say."""
+    """Means, but of shares of joints by how many joints there are; what is not measured has no
+    say.
+    """
     cases = {
         "a": {"f1": 90.0, "joints_unseen": 6, "unseen_inside_50": 100.0},
         "b": {"f1": 80.0, "joints_unseen": 2, "unseen_inside_50": 50.0},
@@ -90,7 +96,11 @@ def test_a_row_pools_its_cases():
     made = [Case(name, dict) for name in cases]
     columns = [
         *(Column("mean", "f1"), Column("least", "f1", 0, "least"), Column("most", "f1", 0, "most")),
-        *(Column("u", "joints_unseen", 0, "sum"), Column("u 50 %", "unseen_inside_50"), Column("none", "other")),
+        *(
+            Column("u", "joints_unseen", 0, "sum"),
+            Column("u 50 %", "unseen_inside_50"),
+            Column("none", "other"),
+        ),
     ]
     experiment = Experiment("pooled", {"first": made[:1], "all": made}, columns)
     assert [case.name for case in experiment.cases] == ["a", "b", "c"]
@@ -107,7 +117,9 @@ def test_a_row_pools_its_cases():
 def script(monkeypatch):
     """The script as a function of its words."""
     monkeypatch.syspath_prepend(str(SCRIPTS))
-    spec = importlib.util.spec_from_file_location("reproduce_tables", SCRIPTS / "reproduce_tables.py")
+    spec = importlib.util.spec_from_file_location(
+        "reproduce_tables", SCRIPTS / "reproduce_tables.py"
+    )
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -121,11 +133,17 @@ def script(monkeypatch):
 
 
 def test_cases_are_asked_for_by_their_words(script, tmp_path, capsys, monkeypatch):
-    """All of them, in any order: `crowd 0` is in `crowd 0:300`, `crowd 10 Hz` in cases of `who is there`."""
+    """All of them, in any order: `crowd 0` is in `crowd 0:300`, `crowd 10 Hz` in cases of `who is
+    there`.
+    """
     name = "crowd 6301 3 cameras 10 Hz"
-    assert all(script.has_words(name, words) for words in ("crowd", "crowd 3 cameras", "6301 10 hz"))
+    assert all(
+        script.has_words(name, words) for words in ("crowd", "crowd 3 cameras", "6301 10 hz")
+    )
     assert not any(script.has_words(name, words) for words in ("crossing", "crowd 30 Hz", "630"))
-    assert script.has_words("crowd 0:300", "crowd 0") and not script.has_words("salsa 108:408", "crowd 0")
+    assert script.has_words("crowd 0:300", "crowd 0") and not script.has_words(
+        "salsa 108:408", "crowd 0"
+    )
     (tmp_path / "data" / "cmu_mocap").mkdir(parents=True)
     words = ["--results", str(tmp_path), "--data", str(tmp_path), "--quick", "--seeds", "7"]
     script(*words, "--only", "who is there", "--list", "--cases", "people 7")
@@ -153,7 +171,9 @@ def test_a_folder_without_recordings_is_named(script, tmp_path, capsys):
 
 @pytest.mark.slow
 def test_nothing_was_learnt_from_anybody_who_is_held_back(shared_data):
-    """By the clips that each sequence says it is made of: 60 and 61 dance, all others are test subjects."""
+    """By the clips that each sequence says it is made of: 60 and 61 dance, all others are test
+    subjects.
+    """
     for segment in scenes.held_back_segments(shared_data / "cmu_mocap" / "cmu_smpl24.npz"):
         scene = segment.scene
         assert len(scene) == 300 and len(scene.clips) == len(scene.cuts) + 1

@@ -45,7 +45,9 @@ def test_a_recording_without_a_view(recording):
 
 
 def test_true_covariances_hold_95_percent(scene):
-    """Joints scattered by C, detections by the graph's own sigma: 20,000 draws, so one sigma is 0.15 %."""
+    """Joints scattered by C, detections by the graph's own sigma: 20,000 draws, so one sigma is
+    0.15 %.
+    """
     rng = np.random.default_rng(0)
     camera, count = scene.rig.cameras[0], 20000
     point = scene.keypoints[0, 0, 8]
@@ -55,11 +57,18 @@ def test_true_covariances_hold_95_percent(scene):
     confidence = np.full(count, 0.8)
     scatter = np.full(count, 1.3)
     weight = (0.8**CONFIG.confidence_power + CONFIG.least_weight) / (1 + CONFIG.least_weight)
-    sigma = 1.3 * camera.K[0, 0] * np.hypot(CONFIG.sigma_m / depth[0], CONFIG.floor_rad) / np.sqrt(weight)
+    sigma = (
+        1.3
+        * camera.K[0, 0]
+        * np.hypot(CONFIG.sigma_m / depth[0], CONFIG.floor_rad)
+        / np.sqrt(weight)
+    )
     xy = true + rng.normal(size=(count, 2)) * sigma
     covariance = np.broadcast_to(root @ root.T, (count, 3, 3))
     squared = squared_distances(camera, xy, confidence, points, covariance, scatter, CONFIG)
-    assert squared.mean() == pytest.approx(2.0, abs=0.06)  # linear to a per cent at 2 % of the depth
+    assert squared.mean() == pytest.approx(
+        2.0, abs=0.06
+    )  # linear to a per cent at 2 % of the depth
     assert (squared <= INSIDE_95).mean() == pytest.approx(0.95, abs=0.006)
 
 
@@ -68,13 +77,21 @@ def test_behind_the_camera_there_is_no_distance(scene):
     behind = camera.centre - camera.wTc[:3, 2]
     assert np.isnan(
         squared_distances(
-            camera, np.zeros((1, 2)), np.ones(1), behind[None], 1e-4 * np.eye(3)[None], np.ones(1), CONFIG
+            camera,
+            np.zeros((1, 2)),
+            np.ones(1),
+            behind[None],
+            1e-4 * np.eye(3)[None],
+            np.ones(1),
+            CONFIG,
         )
     )
 
 
 def test_the_same_people_have_their_own_detections_inside(scene, people):
-    """What was used lies near the projected joint: most are inside. A joint 30 cm off has all outside."""
+    """What was used lies near the projected joint: most are inside. A joint 30 cm off has all
+    outside.
+    """
     camera = scene.rig.cameras[0]
     same = compare_view(camera, 0, people, people, CONFIG)
     assert same.inside > 0.9

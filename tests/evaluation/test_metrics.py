@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.evaluation.metrics import covariance_calibration, joint_metrics, match_people, mean_distance
+from shapepose_fg.evaluation.metrics import (
+    covariance_calibration,
+    joint_metrics,
+    match_people,
+    mean_distance,
+)
 
 J = 25
 MIRROR = np.array(BODY_25.mirror)
@@ -36,7 +41,9 @@ def test_order_of_people_and_rows_does_not_matter(truth):
 
 
 def test_one_person_with_left_and_right_swapped(truth):
-    """A person whose left and right are exactly 0.3 m apart: 3 of 25 joints stay, 22 are 0.3 m away."""
+    """A person whose left and right are exactly 0.3 m apart: 3 of 25 joints stay, 22 are 0.3 m
+    away.
+    """
     side = np.sign(MIRROR - np.arange(J))
     truth[0, 0] = np.stack([0.15 * side, np.zeros(J), np.ones(J)], axis=1)
     predicted = truth.copy()
@@ -72,7 +79,9 @@ def test_a_second_prediction_of_someone_and_one_of_nobody_cost_precision_only(tr
 
 def test_the_double_that_is_nearer_is_the_person(truth):
     predicted = [np.concatenate([truth[0] + 0.1, truth[0, 1:2]]), *truth[1:]]
-    matches = match_people(np.repeat(np.arange(6), [4, 3, 3, 3, 3, 3]), np.concatenate(predicted), truth)
+    matches = match_people(
+        np.repeat(np.arange(6), [4, 3, 3, 3, 3, 3]), np.concatenate(predicted), truth
+    )
     assert matches.duplicated.tolist() == [1]
     assert dict(zip(matches.row.tolist(), matches.person.tolist(), strict=True))[3] == 1
 
@@ -111,7 +120,9 @@ def test_joints_at_the_bound(truth):
 
 def test_frames_that_were_not_run_are_left_out(truth):
     """A reconstruction of frames 10 and 12 only."""
-    people = SimpleNamespace(frame=np.repeat([10, 12, 99], 3), joints=truth[[0, 1, 2]].reshape(-1, J, 3))
+    people = SimpleNamespace(
+        frame=np.repeat([10, 12, 99], 3), joints=truth[[0, 1, 2]].reshape(-1, J, 3)
+    )
     metrics = joint_metrics(people, truth[:2], frames=[10, 12])
     assert metrics.people_true == metrics.people_found == 6
     assert metrics.everyone_once
@@ -157,7 +168,9 @@ def test_someone_far_does_not_decide_about_the_near():
 def test_mean_distance_by_hand():
     predicted = np.array([[[0.0, 0, 0], [np.nan, 0, 0], [1, 1, 1]]])
     truth = np.array([[[0.0, 0.3, 0], [0, 0, 0], [np.nan, 0, 0]], np.full((3, 3), np.nan)])
-    np.testing.assert_allclose(mean_distance(predicted[:, None], truth), [[(0.3 + 0.5) / 2, np.inf]])
+    np.testing.assert_allclose(
+        mean_distance(predicted[:, None], truth), [[(0.3 + 0.5) / 2, np.inf]]
+    )
 
 
 def test_shapes_that_disagree_are_refused(truth):
@@ -175,14 +188,17 @@ def test_true_covariances_are_called_true():
     covariance = root @ root.transpose(0, 2, 1) + 1e-8 * np.eye(3)
     error = np.einsum("nij,nj->ni", np.linalg.cholesky(covariance), rng.normal(size=(20000, 3)))
     calibration = covariance_calibration(error, covariance)
-    # Standard error of the mean of 20,000 chi-squared(3): sqrt(6 / 20000) = 0.017; of a share: 0.0035. Four each.
+    # Standard error of the mean of 20,000 chi-squared(3): sqrt(6 / 20000) = 0.017; of a share:
+    # 0.0035. Four each.
     assert calibration.mean_nees == pytest.approx(3.0, abs=0.07)
     for level, share in calibration.coverage.items():
         assert share == pytest.approx(level, abs=0.014)
 
 
 def test_a_covariance_that_promises_too_much_is_seen():
-    """Half the true sigma: NEES is four times 3, and the 95 % ellipsoid holds P(chi2_3 < 7.81 / 4) = 41.8 %."""
+    """Half the true sigma: NEES is four times 3, and the 95 % ellipsoid holds P(chi2_3 < 7.81 / 4)
+    = 41.8 %.
+    """
     rng = np.random.default_rng(0)
     calibration = covariance_calibration(
         rng.normal(size=(20000, 3)), np.broadcast_to(0.25 * np.eye(3), (20000, 3, 3))

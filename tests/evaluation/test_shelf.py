@@ -28,7 +28,8 @@ UPRIGHT = dict(
     REar=(0.07, 0, 1.6),
     LEar=(-0.07, 0, 1.6),
 )
-"""Someone who stands upright at the origin and faces +y (right is +x): head and limbs of known lengths."""
+"""Someone who stands upright at the origin and faces +y (right is +x): head and limbs of known
+lengths."""
 
 
 def upright(*at):
@@ -42,7 +43,9 @@ def upright(*at):
 def people(*rows, frame=None, **more):
     joints = np.concatenate(rows) if rows else np.zeros((0, 25, 3))
     return SimpleNamespace(
-        frame=np.zeros(len(joints), int) if frame is None else np.array(frame), joints=joints, **more
+        frame=np.zeros(len(joints), int) if frame is None else np.array(frame),
+        joints=joints,
+        **more,
     )
 
 
@@ -80,14 +83,20 @@ def test_what_is_unknown_stays_unknown():
     joints = upright(*HERE)
     joints[0, [BODY_25.index("REar"), BODY_25.index("LEar"), BODY_25.index("RWrist")]] = np.nan
     unknown = np.isnan(shelf_joints(joints)[0]).any(axis=1)
-    assert [name for name, u in zip(SHELF_JOINTS, unknown, strict=True) if u] == ["RWrist", "Neck", "HeadTop"]
+    assert [name for name, u in zip(SHELF_JOINTS, unknown, strict=True) if u] == [
+        "RWrist",
+        "Neck",
+        "HeadTop",
+    ]
     with pytest.raises(ValueError, match=r"\(N, 25, 3\)"):
         shelf_joints(np.zeros((1, 17, 3)))
     assert shelf_joints(np.zeros((0, 25, 3))).shape == (0, 15, 3)
 
 
 def test_perfect_is_exactly_100():
-    score = evaluate_shelf(people(upright(*HERE), upright(*THERE)), annotated(upright(*HERE), upright(*THERE)))
+    score = evaluate_shelf(
+        people(upright(*HERE), upright(*THERE)), annotated(upright(*HERE), upright(*THERE))
+    )
     assert score.pcp[:2].tolist() == [100.0, 100.0]
     assert np.isnan(score.pcp[2])
     assert score.pcp_average == score.pcp_pooled == 100.0
@@ -97,7 +106,9 @@ def test_perfect_is_exactly_100():
 
 
 def test_one_limb_wrong_by_hand():
-    """The right wrist 26 cm off: the lower arm is 25 cm long, half of it 12.5 cm, the mean error 13 cm."""
+    """The right wrist 26 cm off: the lower arm is 25 cm long, half of it 12.5 cm, the mean error 13
+    cm.
+    """
     predicted = upright(*HERE)
     predicted[0, BODY_25.index("RWrist"), 1] += 0.26
     score = evaluate_shelf(people(predicted), annotated(upright(*HERE)))
@@ -121,18 +132,29 @@ def test_both_ends_share_the_error():
     predicted[0, [BODY_25.index("RWrist"), BODY_25.index("RElbow")], 1] += 0.12
     assert evaluate_shelf(people(predicted), annotated(upright(*HERE))).pcp[0] == 100.0
     predicted[0, [BODY_25.index("RWrist"), BODY_25.index("RElbow")], 1] += 0.01
-    assert evaluate_shelf(people(predicted), annotated(upright(*HERE))).pcp[0] == pytest.approx(90.0)
+    assert evaluate_shelf(people(predicted), annotated(upright(*HERE))).pcp[0] == pytest.approx(
+        90.0
+    )
 
 
 def test_left_and_right_swapped_by_hand():
-    """Arms are 40 cm apart: all four arm limbs wrong (25 cm long). Legs 18 cm apart against half of 40: right.
+    """Arms are 40 cm apart: all four arm limbs wrong (25 cm long). Legs 18 cm apart against half of
+    40: right.
 
-    The head goes wrong too: forward becomes backward, so that HeadTop is 25 cm off, 12.5 cm in the mean,
-    against half of |(0.125, 0.145)| = 9.6 cm.
+    The head goes wrong too: forward becomes backward, so that HeadTop is 25 cm off, 12.5 cm in the
+    mean, against half of |(0.125, 0.145)| = 9.6 cm.
     """
-    score = evaluate_shelf(people(upright(*HERE)[:, list(BODY_25.mirror)]), annotated(upright(*HERE)))
+    score = evaluate_shelf(
+        people(upright(*HERE)[:, list(BODY_25.mirror)]), annotated(upright(*HERE))
+    )
     wrong = {LIMB_NAMES[i] for i in np.flatnonzero(score.limbs_right[0] == 0)}
-    assert wrong == {"left upper arm", "right upper arm", "left lower arm", "right lower arm", "head"}
+    assert wrong == {
+        "left upper arm",
+        "right upper arm",
+        "left lower arm",
+        "right lower arm",
+        "head",
+    }
     assert score.pcp[0] == pytest.approx(50.0)
     # 6 arm joints 40 cm, 6 leg joints 18 cm, HeadTop 25 cm, Neck and MidHip none.
     assert score.mpjpe_mm == pytest.approx((6 * 400 + 6 * 180 + 250) / 15)
@@ -140,7 +162,9 @@ def test_left_and_right_swapped_by_hand():
 
 
 def test_a_missing_joint_makes_its_limbs_wrong():
-    """Without the right elbow both limbs of the arm are wrong; the joint is not recalled and not in MPJPE."""
+    """Without the right elbow both limbs of the arm are wrong; the joint is not recalled and not in
+    MPJPE.
+    """
     predicted = upright(*HERE)
     predicted[0, BODY_25.index("RElbow")] = np.nan
     score = evaluate_shelf(people(predicted), annotated(upright(*HERE)))
@@ -152,11 +176,15 @@ def test_a_missing_joint_makes_its_limbs_wrong():
 
 
 def test_a_missing_joint_counts_half_a_metre_in_the_choice():
-    """One elbow missing costs 0.5 / 15 = 33.3 mm in the mean: a complete one 33 mm off wins, 34 mm off loses."""
+    """One elbow missing costs 0.5 / 15 = 33.3 mm in the mean: a complete one 33 mm off wins, 34 mm
+    off loses.
+    """
     holey = upright(*HERE)
     holey[0, BODY_25.index("RElbow")] = np.nan
     truth = annotated(upright(*HERE))
-    assert evaluate_shelf(people(holey, upright(0, 0, 0.033)), truth).mpjpe_mm == pytest.approx(33.0)
+    assert evaluate_shelf(people(holey, upright(0, 0, 0.033)), truth).mpjpe_mm == pytest.approx(
+        33.0
+    )
     assert evaluate_shelf(people(holey, upright(0, 0, 0.034)), truth).mpjpe_mm == 0.0
 
 
@@ -168,7 +196,9 @@ def test_sharing_is_allowed_and_extra_people_cost_nothing():
 
 
 def test_nobody_there():
-    """One of two people is predicted, the other takes the far prediction: no limb, no joint, not found."""
+    """One of two people is predicted, the other takes the far prediction: no limb, no joint, not
+    found.
+    """
     score = evaluate_shelf(people(upright(*HERE)), annotated(upright(*HERE), upright(*THERE)))
     assert score.pcp[:2].tolist() == [100.0, 0.0]
     assert score.pcp_average == score.pcp_pooled == 50.0
@@ -185,7 +215,11 @@ def test_nobody_there():
 def test_average_is_over_actors_and_pooled_over_limbs():
     """Actor 1 in three frames, all right; actor 3 in one, all wrong."""
     truth = annotated(
-        *[upright(*HERE)] * 3, upright(*THERE), upright(5, 0, 0), actor=[0, 0, 0, 2, 3], frame=[0, 1, 2, 2, 2]
+        *[upright(*HERE)] * 3,
+        upright(*THERE),
+        upright(5, 0, 0),
+        actor=[0, 0, 0, 2, 3],
+        frame=[0, 1, 2, 2, 2],
     )
     score = evaluate_shelf(people(*[upright(*HERE)] * 3, frame=[0, 1, 2]), truth)
     assert score.pcp[[0, 2]].tolist() == [100.0, 0.0]
@@ -205,7 +239,9 @@ def test_only_reconstructed_frames_are_scored_if_the_run_says_which():
     score = evaluate_shelf(part, truth)
     assert (score.frames, score.frames_annotated, score.pcp[0]) == (1, 3, 100.0)
     assert evaluate_shelf(part, truth, frames=range(10)).pcp[0] == pytest.approx(100 / 3)
-    assert evaluate_shelf(people(upright(*HERE), frame=[3], run={}), truth).pcp[0] == pytest.approx(100 / 3)
+    assert evaluate_shelf(people(upright(*HERE), frame=[3], run={}), truth).pcp[0] == pytest.approx(
+        100 / 3
+    )
     with pytest.raises(InputError, match="2-3, 7"):
         evaluate_shelf(part, truth, frames=[5])
     with pytest.raises(InputError, match=r"run\.json"):
@@ -223,7 +259,11 @@ def test_figures_for_json_and_for_a_terminal():
     predicted[0, BODY_25.index("RWrist"), 1] += 0.26
     score = evaluate_shelf(people(predicted), annotated(upright(*HERE)))
     figures = score.as_dict()
-    assert figures["pcp_actor"] == {"actor 1": pytest.approx(90.0), "actor 2": None, "actor 3": None}
+    assert figures["pcp_actor"] == {
+        "actor 1": pytest.approx(90.0),
+        "actor 2": None,
+        "actor 3": None,
+    }
     assert figures["pcp_limb"]["actor 1"]["right lower arm"] == 0.0
     assert (figures["limbs_right"], figures["limbs"]) == (9, 10)
     console = Console(width=100)
@@ -275,7 +315,10 @@ LINES = FILE.splitlines()
         (LINES[:5], "ends after line 5, before 15 values of z in frame 0"),
         (LINES[:8], "ends after line 8, before the number of people in frame 2"),
         ([*LINES[:2], "two", *LINES[3:]], "line 3 must hold a person's id in frame 0, got 'two'"),
-        ([*LINES[:3], LINES[3] + " 1", *LINES[4:]], "line 4 must hold 15 values of x in frame 0, got 16"),
+        (
+            [*LINES[:3], LINES[3] + " 1", *LINES[4:]],
+            "line 4 must hold 15 values of x in frame 0, got 16",
+        ),
         ([*LINES[:3], LINES[3].replace("0.3", "nan"), *LINES[4:]], "line 4 .* finite"),
         ([*LINES[:3], LINES[3].replace("0.3", "0,3"), *LINES[4:]], "line 4 .* finite"),
         ([*LINES[:1], "-1", *LINES[2:]], "line 2 must be the number of people in frame 0, got -1"),
@@ -303,7 +346,10 @@ def test_no_file_and_no_text(tmp_path):
 
 
 def test_limbs_join_the_joints_that_their_names_say():
-    named = {name: {SHELF_JOINTS[a], SHELF_JOINTS[b]} for name, (a, b) in zip(LIMB_NAMES, LIMBS, strict=True)}
+    named = {
+        name: {SHELF_JOINTS[a], SHELF_JOINTS[b]}
+        for name, (a, b) in zip(LIMB_NAMES, LIMBS, strict=True)
+    }
     assert named["left upper arm"] == {"LShoulder", "LElbow"}
     assert named["right upper arm"] == {"RShoulder", "RElbow"}
     assert named["left lower arm"] == {"LElbow", "LWrist"}
@@ -332,7 +378,9 @@ def test_the_real_annotation(shelf):
 
 
 def test_the_real_annotation_against_itself(shelf):
-    """Ears put where they give the annotated Neck: all limbs but heads are exact, heads depend on the mapping."""
+    """Ears put where they give the annotated Neck: all limbs but heads are exact, heads depend on
+    the mapping.
+    """
     body25 = np.full((len(shelf.frame), 25, 3), np.nan)
     for i, name in enumerate(SHELF_JOINTS[:12]):
         body25[:, BODY_25.index(name)] = shelf.joints[:, i]
@@ -346,6 +394,7 @@ def test_the_real_annotation_against_itself(shelf):
     assert score.limbs_all.sum(axis=1).tolist() == [1310, 190, 930]
     no_head = np.array(LIMB_NAMES) != "head"
     np.testing.assert_array_equal(score.limbs_right[:, no_head], score.limbs_all[:, no_head])
-    # Annotated head tops are 2 to 16 cm from the fixed mapping; 98 % of the heads are right all the same.
+    # Annotated head tops are 2 to 16 cm from the fixed mapping; 98 % of the heads are right all the
+    # same.
     assert score.limbs_right[:, ~no_head].sum() > 0.95 * score.people
     assert score.recall == 1.0

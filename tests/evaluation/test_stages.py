@@ -15,7 +15,9 @@ from shapepose_fg.simulation import DetectorConfig, built_in_scene, simulate
 
 @pytest.mark.slow
 def test_stage_two_helps_whom_the_views_see_badly():
-    """What the project promises; misses are frequent here, so that few frames hold enough doubtful joints."""
+    """What the project promises; misses are frequent here, so that few frames hold enough doubtful
+    joints.
+    """
     scene = built_in_scene(1000, frames=10)
     detections = simulate(scene, DetectorConfig(misses=3.0), seed=1000)
     config = replace(PipelineConfig(), temporal=False)

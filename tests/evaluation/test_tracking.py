@@ -23,7 +23,9 @@ J = 25
 
 
 def standing(places_m, frames):
-    """(T, P, 25, 3) people who stand still, each a stack of joints 2 cm apart above its place on the x axis."""
+    """(T, P, 25, 3) people who stand still, each a stack of joints 2 cm apart above its place on
+    the x axis.
+    """
     person = np.stack([np.zeros(J), np.zeros(J), 0.02 * np.arange(J)], axis=1)
     at = np.stack([places_m, np.zeros(len(places_m)), np.zeros(len(places_m))], axis=1)
     return np.broadcast_to(at[:, None] + person, (frames, len(places_m), J, 3)).copy()
@@ -66,7 +68,11 @@ def noisy(truth, sigma_m=0.02, seed=0):
     """The truth with independent noise along each axis, and covariances that say so."""
     rng = np.random.default_rng(seed)
     covariance = np.broadcast_to(sigma_m**2 * np.eye(3), truth.covariance.shape)
-    return replace(truth, joints=truth.joints + rng.normal(0, sigma_m, truth.joints.shape), covariance=covariance)
+    return replace(
+        truth,
+        joints=truth.joints + rng.normal(0, sigma_m, truth.joints.shape),
+        covariance=covariance,
+    )
 
 
 def test_perfect_identities():
@@ -77,17 +83,25 @@ def test_perfect_identities():
 
 
 def test_a_swap_after_six_of_ten_frames():
-    """Each identity is its person in 6 of 10 frames: IDTP 12 of 20 rows and 20 people, two switches."""
+    """Each identity is its person in 6 of 10 frames: IDTP 12 of 20 rows and 20 people, two
+    switches.
+    """
     truth = standing([0.0, 2.0], 10)
-    found = identities(truth, [(t, p if t < 6 else 1 - p, truth[t, p]) for t in range(10) for p in range(2)])
+    found = identities(
+        truth, [(t, p if t < 6 else 1 - p, truth[t, p]) for t in range(10) for p in range(2)]
+    )
     assert found.idf1 == pytest.approx(0.6)
     assert found.switches == 2
 
 
 def test_a_gap_and_a_new_identity_after_it():
-    """Frames 0-3 as identity 1, 4-5 nobody, 6-9 as identity 2: IDTP 4 (one identity only), rows 8, truth 10."""
+    """Frames 0-3 as identity 1, 4-5 nobody, 6-9 as identity 2: IDTP 4 (one identity only), rows 8,
+    truth 10.
+    """
     truth = standing([0.0], 10)
-    found = identities(truth, [(t, 1 if t < 4 else 2, truth[t, 0]) for t in (0, 1, 2, 3, 6, 7, 8, 9)])
+    found = identities(
+        truth, [(t, 1 if t < 4 else 2, truth[t, 0]) for t in (0, 1, 2, 3, 6, 7, 8, 9)]
+    )
     assert found.idf1 == pytest.approx(2 * 4 / 18)
     assert (found.switches, found.tracks) == (1, 2)
 
@@ -101,7 +115,9 @@ def test_a_gap_in_the_truth_costs_nothing():
 
 
 def test_the_assignment_of_identities_is_global():
-    """Identity 0 is person A in 3 frames and B in 2, identity 1 is A in 2 frames: A-1 and B-0 (4) beat A-0 (3)."""
+    """Identity 0 is person A in 3 frames and B in 2, identity 1 is A in 2 frames: A-1 and B-0 (4)
+    beat A-0 (3).
+    """
     truth = standing([0.0, 2.0], 5)
     rows = [(t, 0, truth[t, 0]) for t in range(3)] + [(t, 0, truth[t, 1]) for t in (3, 4)]
     rows += [(t, 1, truth[t, 0]) for t in (3, 4)]
@@ -110,7 +126,9 @@ def test_the_assignment_of_identities_is_global():
 
 def test_a_phantom_is_a_false_track():
     truth = standing([0.0], 5)
-    rows = [(t, 0, truth[t, 0]) for t in range(5)] + [(t, 9, truth[t, 0] + [5.0, 0, 0]) for t in range(2)]
+    rows = [(t, 0, truth[t, 0]) for t in range(5)] + [
+        (t, 9, truth[t, 0] + [5.0, 0, 0]) for t in range(2)
+    ]
     found = identities(truth, rows)
     assert found.idf1 == pytest.approx(10 / 12)
     assert (found.tracks, found.false_tracks) == (2, 1)
@@ -131,7 +149,9 @@ def test_a_person_who_jumps_by_3_cm_in_one_frame():
     errors = acceleration_errors(found, truth, together, FPS)
     np.testing.assert_allclose(errors[:, 0, 0], [27, 54, 27])
     together[3] = False  # frames 2 and 3 are not the same track
-    np.testing.assert_allclose(acceleration_errors(found, truth, together, FPS)[:, 0, 0], [27, np.nan, np.nan])
+    np.testing.assert_allclose(
+        acceleration_errors(found, truth, together, FPS)[:, 0, 0], [27, np.nan, np.nan]
+    )
 
 
 def test_the_acceleration_of_the_truth_is_no_error():
@@ -144,7 +164,9 @@ def test_the_acceleration_of_the_truth_is_no_error():
 
 
 def test_fast_joints():
-    """A wrist at 2 m/s is fast, one at 1 m/s not; a smoother that leaves the fast one 5 cm behind is seen."""
+    """A wrist at 2 m/s is fast, one at 1 m/s not; a smoother that leaves the fast one 5 cm behind
+    is seen.
+    """
     truth = standing([0.0], 6)
     truth[:, 0, 4, 1] = 2.0 * np.arange(6) / FPS
     truth[:, 0, 7, 1] = 1.0 * np.arange(6) / FPS
@@ -164,15 +186,27 @@ def test_frames_unseen():
     mixed = frames_unseen(seen[order], frame[order], np.zeros(7, int))[:, 0]
     assert mixed.tolist() == [[0, 1, 2, 0, 1, 1, 2][i] for i in order]
     # Another identity is another person.
-    assert frames_unseen(seen, frame, np.array([0, 0, 1, 1, 1, 1, 1]))[:, 0].tolist() == [0, 1, 1, 0, 1, 1, 2]
+    assert frames_unseen(seen, frame, np.array([0, 0, 1, 1, 1, 1, 1]))[:, 0].tolist() == [
+        0,
+        1,
+        1,
+        0,
+        1,
+        1,
+        2,
+    ]
 
 
 def test_a_noisy_result_by_its_statistics(truth, scene):
-    """20 mm along each axis: mean distance 20 sqrt(8 / pi) = 31.9 mm; second differences have sqrt(6) of that."""
+    """20 mm along each axis: mean distance 20 sqrt(8 / pi) = 31.9 mm; second differences have
+    sqrt(6) of that.
+    """
     score = score_tracks(noisy(truth), truth, scene.fps)
     # 1,500 joints: standard error of the mean 0.35 mm; accelerations are correlated over time, 5 %.
     assert score.joints.mpjpe_mm == pytest.approx(31.9, abs=1.4)
-    assert score.motion.acceleration_error == pytest.approx(0.0319 * np.sqrt(6) * scene.fps**2, rel=0.05)
+    assert score.motion.acceleration_error == pytest.approx(
+        0.0319 * np.sqrt(6) * scene.fps**2, rel=0.05
+    )
     assert score.identities.idf1 == 1.0
     assert score.joints.false_positives == 0
     assert score.calibration["seen"].coverage[0.5] == pytest.approx(0.5, abs=0.05)
@@ -193,12 +227,16 @@ def test_without_identities_the_truth_says_who_is_who(truth, scene):
 
 
 def test_joints_long_unseen_are_judged_apart(truth, scene):
-    """Nobody sees the left wrist in frames 5 to 19: from frame 14 on it is long unseen; its sigma is 10 cm."""
+    """Nobody sees the left wrist in frames 5 to 19: from frame 14 on it is long unseen; its sigma
+    is 10 cm.
+    """
     people = noisy(truth)
     hidden = people.frame >= 5
     confidence, covariance = people.confidence.copy(), people.covariance.copy()
     confidence[hidden, 7], covariance[hidden, 7] = 0.0, 0.01 * np.eye(3)
-    score = score_tracks(replace(people, confidence=confidence, covariance=covariance), truth, scene.fps)
+    score = score_tracks(
+        replace(people, confidence=confidence, covariance=covariance), truth, scene.fps
+    )
     assert len(score.calibration["unseen"].nees) == 3 * 6  # frames 14 to 19
     assert (
         len(score.calibration["seen"].nees) == 3 * (20 * 25 - 15)
@@ -219,11 +257,15 @@ def test_duplicates_phantoms_and_missed(truth, scene):
 
 
 def test_velocities_and_their_covariances(truth, scene):
-    """The difference over two frames is exact here; 0.1 m/s of noise along each axis is found as that."""
+    """The difference over two frames is exact here; 0.1 m/s of noise along each axis is found as
+    that.
+    """
     rng = np.random.default_rng(0)
     true = np.gradient(scene.keypoints, axis=0).reshape(-1, J, 3) * scene.fps
     covariance = np.broadcast_to(0.01 * np.eye(3), truth.covariance.shape)
-    moving = replace(noisy(truth), velocity=true + rng.normal(0, 0.1, true.shape), velocity_covariance=covariance)
+    moving = replace(
+        noisy(truth), velocity=true + rng.normal(0, 0.1, true.shape), velocity_covariance=covariance
+    )
     score = score_tracks(moving, truth, scene.fps)
     # 3 people x 18 frames x 25 joints: standard errors of 0.0012 m/s and 0.6 %.
     assert score.velocity_error == pytest.approx(0.1 * np.sqrt(8 / np.pi), abs=0.005)

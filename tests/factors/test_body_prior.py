@@ -25,12 +25,16 @@ def _at(point, key=1):
 def test_zero_at_truth_and_joint_minus_mean_elsewhere():
     factor = body_prior_factor(1, MEAN, COVARIANCE)
     assert_zero_at_truth(factor, _at(MEAN))
-    np.testing.assert_allclose(factor.unwhitenedError(_at(MEAN + np.array([0.1, 0.2, 0.3]))), [0.1, 0.2, 0.3])
+    np.testing.assert_allclose(
+        factor.unwhitenedError(_at(MEAN + np.array([0.1, 0.2, 0.3]))), [0.1, 0.2, 0.3]
+    )
 
 
 @pytest.mark.parametrize("kernel", [None, "huber", "cauchy"])
 def test_the_jacobian_is_the_numeric_one(kernel):
-    assert_jacobian(body_prior_factor(1, MEAN, COVARIANCE, kernel=robust_kernel(kernel)), _at(MEAN + 0.02))
+    assert_jacobian(
+        body_prior_factor(1, MEAN, COVARIANCE, kernel=robust_kernel(kernel)), _at(MEAN + 0.02)
+    )
 
 
 def test_the_cost_is_half_the_mahalanobis_distance():
@@ -54,7 +58,9 @@ def test_two_priors_meet_at_their_weighted_mean():
     graph.add(body_prior_factor(1, other, sigma_m=0.01))
     solution = gtsam.LevenbergMarquardtOptimizer(graph, _at(MEAN)).optimize()
     A, B = np.linalg.inv(COVARIANCE), np.eye(3) / 0.01**2
-    np.testing.assert_allclose(solution.atPoint3(1), np.linalg.solve(A + B, A @ MEAN + B @ other), atol=1e-7)
+    np.testing.assert_allclose(
+        solution.atPoint3(1), np.linalg.solve(A + B, A @ MEAN + B @ other), atol=1e-7
+    )
     covariance = gtsam.Marginals(graph, solution).marginalCovariance(1)
     np.testing.assert_allclose(covariance, np.linalg.inv(A + B), rtol=1e-9)
 

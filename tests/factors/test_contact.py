@@ -30,7 +30,11 @@ def test_residual_is_the_step():
 def test_variance_grows_as_that_of_a_walk():
     q = np.array([1e-4, 1e-3, 1e-2])
     graph = gtsam.NonlinearFactorGraph()
-    graph.push_back(gtsam.PriorFactorPoint3(int(KEYS[0]), np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, 0.01)))
+    graph.push_back(
+        gtsam.PriorFactorPoint3(
+            int(KEYS[0]), np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, 0.01)
+        )
+    )
     for factor in standing_factors(KEYS[:-1], KEYS[1:], DT, q):
         graph.push_back(factor)
     found = gtsam.Marginals(graph, values(np.zeros((4, 3)))).marginalCovariance(int(KEYS[3]))

@@ -1,4 +1,6 @@
-"""Graphs as files: what is read back errs and pulls as what was written; other files are refused in a sentence."""
+"""Graphs as files: what is read back errs and pulls as what was written; other files are refused in
+a sentence.
+"""
 
 import json
 import shutil
@@ -40,7 +42,9 @@ X = [gtsam.symbol("x", n) for n in range(2)]
 def every_kind(seed: int = 0) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
     """A factor of each kind and kernel, and values before all cameras."""
     rng = np.random.default_rng(seed)
-    x, v, o = ([make(0, joint) for joint in range(4)] for make in (joint_key, velocity_key, offset_key))
+    x, v, o = (
+        [make(0, joint) for joint in range(4)] for make in (joint_key, velocity_key, offset_key)
+    )
     values = gtsam.Values()
     for key in (*x, *v, *o):
         values.insert(key, np.array([0, 0, 4.0 if key in x else 0.0]) + rng.normal(0, 0.3, 3))
@@ -53,14 +57,22 @@ def every_kind(seed: int = 0) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]
         lens, sensor = make_calibration(K), gtsam.Pose3(WTC)
         made.append(posed_projection_factor(lens, uv[0], 30.0, X[0], x[0], kernel, sensor))
         made.append(posed_projection_factor(lens, uv[0], 30.0, X[1], x[0], kernel))
-    made.append(body_prior_factor(x[1], [0, 0, 4], np.array([[2, 0.1, 0], [0.1, 1, 0], [0, 0, 3.0]])))
+    made.append(
+        body_prior_factor(x[1], [0, 0, 4], np.array([[2, 0.1, 0], [0.1, 1, 0], [0, 0, 3.0]]))
+    )
     made += motion_factors(x[:2], v[:2], [0.3, 0.34], 2.0)
-    made += CONSTANT_ACCELERATION.factors([[x[0], v[0], o[0]], [x[1], v[1], o[1]]], [0.0, 0.04], 3.0)
+    made += CONSTANT_ACCELERATION.factors(
+        [[x[0], v[0], o[0]], [x[1], v[1], o[1]]], [0.0, 0.04], 3.0
+    )
     made.append(gtsam.RangeFactor3(x[0], x[1], 0.3, isotropic(1, 0.01)))
     made.append(gtsam.PriorFactorPose3(X[0], gtsam.Pose3(WTC), diagonal(np.arange(1, 7) * 0.1)))
-    made += odometry_factors(X, np.array([values.atPose3(key).matrix() for key in X]), np.eye(6)[None] * 0.01)
+    made += odometry_factors(
+        X, np.array([values.atPose3(key).matrix() for key in X]), np.eye(6)[None] * 0.01
+    )
     made += standing_factors([x[0]], [x[1]], [0.04], [0.1])
-    made += lasting_prior_factors(x, o, rng.normal(size=(4, 3)), np.tile(np.eye(3) * 20, (4, 1, 1)), 0.3)
+    made += lasting_prior_factors(
+        x, o, rng.normal(size=(4, 3)), np.tile(np.eye(3) * 20, (4, 1, 1)), 0.3
+    )
     made += offset_factors([o[0], o[2]], [0.0, 0.1], 2.0)
     graph = gtsam.NonlinearFactorGraph()
     for factor in made:
@@ -86,9 +98,13 @@ def test_what_is_read_back_errs_and_pulls_the_same(tmp_path):
                 np.testing.assert_allclose(theirs, mine, rtol=1e-9, atol=1e-9)
     # As it is written once more it is the same to the byte but for the camera, which is found anew.
     save_graph(tmp_path / "again.json", again, there)
-    first, second = (json.loads((tmp_path / name).read_text()) for name in ("graph.json", "again.json"))
+    first, second = (
+        json.loads((tmp_path / name).read_text()) for name in ("graph.json", "again.json")
+    )
     assert first["values"] == second["values"]
-    assert [each["keys"] for each in first["factors"]] == [each["keys"] for each in second["factors"]]
+    assert [each["keys"] for each in first["factors"]] == [
+        each["keys"] for each in second["factors"]
+    ]
 
 
 def _random_step(values: gtsam.Values, rng: np.random.Generator) -> gtsam.VectorValues:
@@ -108,7 +124,9 @@ def test_what_would_not_come_back_is_refused_by_name(tmp_path):
         save_graph(tmp_path / "graph.json", graph, values)
 
     custom = gtsam.CustomFactor(isotropic(3, 1.0), [one], lambda this, at, H: np.zeros(3))
-    with pytest.raises(ValueError, match="factor 0, CustomFactor: is of a class that cannot be saved"):
+    with pytest.raises(
+        ValueError, match="factor 0, CustomFactor: is of a class that cannot be saved"
+    ):
         saved(custom)
     held = gtsam.PriorFactorPoint3(one, np.zeros(3), noiseModel.Constrained.All(3))
     with pytest.raises(ValueError, match="a constraint has no noise"):
@@ -140,8 +158,13 @@ def test_a_file_of_somebody_is_read_or_refused_in_one_sentence(tmp_path):
             load_graph(file)
         except ValueError as error:
             refused += 1
-            assert str(error).startswith(f"{file}: ") and "\n" not in str(error) and len(str(error)) < 400
-    # Most places are digits of some number, and another digit is another number: some files of each are there.
+            assert (
+                str(error).startswith(f"{file}: ")
+                and "\n" not in str(error)
+                and len(str(error)) < 400
+            )
+    # Most places are digits of some number, and another digit is another number: some files of each
+    # are there.
     assert 20 < refused < 380
     record = {"kind": "prior point", "keys": [1], "data": [[0, 0, 1]], "noise": np.eye(3).tolist()}
     for change, said in (
@@ -168,4 +191,6 @@ def test_a_drawing_has_each_variable_factor_and_link(tmp_path):
     assert '"velocity(person 0, joint 3, frame 0)"' not in text  # no factor is on it
     assert '"velocity(person 0, joint 1, frame 0)"' in text and '"posed projection"' in text
     if shutil.which("dot") is not None:
-        subprocess.run(["dot", "-Tsvg"], input=text, text=True, check=True, capture_output=True, timeout=60)
+        subprocess.run(
+            ["dot", "-Tsvg"], input=text, text=True, check=True, capture_output=True, timeout=60
+        )

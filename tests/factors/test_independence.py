@@ -3,7 +3,9 @@ import sys
 
 
 def test_the_library_needs_gtsam_and_numpy_only():
-    """`factors` is usable by someone who never heard of people: nothing else is imported with it."""
+    """`factors` is usable by someone who never heard of people: nothing else is imported with
+    it.
+    """
     code = (
         "import sys, factors\n"
         "heavy = {'torch', 'cv2', 'scipy', 'pydantic', 'rich', 'shapepose_fg'} & set(sys.modules)\n"

@@ -1,4 +1,6 @@
-"""Two people in the SLAM graph of a robot, by ISAM2 and by a fixed-lag smoother; the truth is known."""
+"""Two people in the SLAM graph of a robot, by ISAM2 and by a fixed-lag smoother; the truth is
+known.
+"""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -39,7 +41,9 @@ def facing(angle: float, distance: float) -> gtsam.Pose3:
 
 @dataclass
 class World:
-    """A robot with one camera before two people, two cameras on the walls, and what each of them measured."""
+    """A robot with one camera before two people, two cameras on the walls, and what each of them
+    measured.
+    """
 
     true: list[gtsam.Pose3]
     odometry: np.ndarray
@@ -65,7 +69,8 @@ def world(seed: int) -> World:
     apart = np.array([0.6, 0.1, 0])
     joints = np.stack([body + apart + walk[:, None], body - apart - walk[:, None]], axis=1)
     walls = [
-        facing(angle, 3.5).compose(gtsam.Pose3(gtsam.Rot3(AHEAD), np.array([0, 0, 2.0]))) for angle in (0.3, 1.7)
+        facing(angle, 3.5).compose(gtsam.Pose3(gtsam.Rot3(AHEAD), np.array([0, 0, 2.0])))
+        for angle in (0.3, 1.7)
     ]
     xy = np.empty((T, 2, 12, 3, 2))
     for frame in range(T):
@@ -81,7 +86,16 @@ def sightings(made: World, frame: int, robot) -> list[Sighting]:
     cameras = [*(make_camera(K, pose.matrix()) for pose in made.walls), robot]
     sigmas, density = np.full((12, 3), NOISE_PX), np.full(12, 0.3)
     return [
-        Sighting(who, frame, frame * STEP_S, made.guess[frame, who], made.xy[frame, who], sigmas, density, cameras)
+        Sighting(
+            who,
+            frame,
+            frame * STEP_S,
+            made.guess[frame, who],
+            made.xy[frame, who],
+            sigmas,
+            density,
+            cameras,
+        )
         for who in range(2)
     ]
 
@@ -102,7 +116,9 @@ def run(made: World, solver, *, slam: bool = True, people: bool = True, poses=No
                 graph.addPriorPose3(X(0), at, START)
             else:
                 graph.push_back(steps[frame - 1])
-                at = solver.calculateEstimatePose3(X(frame - 1)).compose(steps[frame - 1].measured())
+                at = solver.calculateEstimatePose3(X(frame - 1)).compose(
+                    steps[frame - 1].measured()
+                )
             values.insert(X(frame), at)
             stamps[X(frame)] = frame * STEP_S
         if people:
@@ -130,13 +146,21 @@ def update(solver, graph, values, times_s) -> None:
 
 def camera_errors(made: World, values: gtsam.Values) -> np.ndarray:
     """(T, 2) metres and radians."""
-    off = [gtsam.Pose3.Logmap(made.true[n].between(values.atPose3(X(n)))) for n in range(T) if values.exists(X(n))]
+    off = [
+        gtsam.Pose3.Logmap(made.true[n].between(values.atPose3(X(n))))
+        for n in range(T)
+        if values.exists(X(n))
+    ]
     return np.array([(np.linalg.norm(each[3:]), np.linalg.norm(each[:3])) for each in off])
 
 
 def joint_errors(made: World, values: gtsam.Values) -> np.ndarray:
     """Metres, of all joints that are there."""
-    keys = [(n, who, SPACE.positions(who, np.arange(12), n).tolist()) for n in range(T) for who in range(2)]
+    keys = [
+        (n, who, SPACE.positions(who, np.arange(12), n).tolist())
+        for n in range(T)
+        for who in range(2)
+    ]
     return np.array(
         [
             np.linalg.norm(values.atPoint3(key) - made.joints[n, who, joint])
@@ -194,7 +218,9 @@ def test_one_camera_and_holes_leave_no_system_singular():
     errors = camera_errors(made, values)
     assert np.isfinite(errors).all() and errors[:, 0].max() < 0.3
     assert not values.exists(int(SPACE.positions(1, 0, 10)))
-    assert not values.exists(int(SPACE.positions(1, 5, 3))) and values.exists(int(SPACE.positions(1, 5, 4)))
+    assert not values.exists(int(SPACE.positions(1, 5, 3))) and values.exists(
+        int(SPACE.positions(1, 5, 4))
+    )
 
 
 def test_a_reported_joint_goes_with_a_pose_and_tells_nothing_of_it():
@@ -232,7 +258,9 @@ def test_what_is_given_wrongly_is_refused():
     joined, made = PeopleInGraph(SPACE), world(6880)
     robot = PosedCamera(LENS, X(0), SENSOR)
     joined.add(sightings(made, 1, robot))
-    with pytest.raises(ValueError, match=r"person 0: frames must be in order of time, but 0.0 s is not"):
+    with pytest.raises(
+        ValueError, match=r"person 0: frames must be in order of time, but 0.0 s is not"
+    ):
         joined.add(sightings(made, 0, robot))
     with pytest.raises(ValueError, match=r"joints must be \(J, 3\)"):
         one = sightings(made, 2, robot)[0]

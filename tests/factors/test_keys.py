@@ -17,18 +17,34 @@ from factors import (
 )
 from factors.keys import MAX_FRAME, MAX_JOINT, MAX_PERSON, MAX_VIEW
 
-CORNERS = [(0, 0, 0), (3, 24, 17), (MAX_PERSON, MAX_JOINT, MAX_FRAME), (0, MAX_JOINT, 0), (0, 0, MAX_FRAME)]
+CORNERS = [
+    (0, 0, 0),
+    (3, 24, 17),
+    (MAX_PERSON, MAX_JOINT, MAX_FRAME),
+    (0, MAX_JOINT, 0),
+    (0, 0, MAX_FRAME),
+]
 
 
 @pytest.mark.parametrize(("person", "joint", "frame"), CORNERS)
 def test_a_key_says_again_what_it_was_made_of(person, joint, frame):
-    for make in (joint_key, velocity_key, offset_key, lambda *numbers: int(reported_keys(*numbers))):
+    for make in (
+        joint_key,
+        velocity_key,
+        offset_key,
+        lambda *numbers: int(reported_keys(*numbers)),
+    ):
         assert split_key(make(person, joint, frame)) == (person, joint, frame)
     assert split_camera_key(camera_key(person, frame)) == (person, frame)
 
 
 def test_every_key_is_its_own():
-    many = [(p, j, f) for p in (0, 1, 99, 100, MAX_PERSON) for j in (0, 1, 999) for f in (0, 1, 100, MAX_FRAME)]
+    many = [
+        (p, j, f)
+        for p in (0, 1, 99, 100, MAX_PERSON)
+        for j in (0, 1, 999)
+        for f in (0, 1, 100, MAX_FRAME)
+    ]
     keys = {make(*each) for make in (joint_key, velocity_key) for each in many}
     keys |= {offset_key(*each, source) for source in range(3) for each in many}
     keys |= {camera_key(p, f) for p, _, f in many}
@@ -46,7 +62,9 @@ def test_keys_sort_by_kind_person_joint_and_frame():
 
 @pytest.mark.parametrize("person", [0, 3, 41])
 def test_gtsam_s_own_messages_tell_variables_apart(person, capfd):
-    """Messages, printed values and drawings name every person, joint and frame differently, and in full."""
+    """Messages, printed values and drawings name every person, joint and frame differently, and in
+    full.
+    """
     keys = [joint_key(person, joint, frame) for joint in (4, 7) for frame in (12, 12345)]
     values = gtsam.Values()
     with pytest.raises(RuntimeError, match=f"1{person:05d}00400000012"):
@@ -65,12 +83,19 @@ def test_gtsam_s_own_messages_tell_variables_apart(person, capfd):
 
 def test_keys_stay_clear_of_the_usual_symbols_of_robotics():
     ours = {joint_key(0, 0, 0), velocity_key(0, 0, 0), joint_key(MAX_PERSON, MAX_JOINT, MAX_FRAME)}
-    assert not ours & {gtsam.symbol(name, 0) for name in "abcdefghijklmnopqrstuvwxyzJVC"} | set(range(10)) & ours
+    assert (
+        not ours & {gtsam.symbol(name, 0) for name in "abcdefghijklmnopqrstuvwxyzJVC"}
+        | set(range(10)) & ours
+    )
 
 
 def test_arrays_give_the_same_keys():
     joints, frames = np.array([4, 0, 24]), np.array([[9], [10]])
-    for one, many in ((joint_key, joint_keys), (velocity_key, velocity_keys), (offset_key, offset_keys)):
+    for one, many in (
+        (joint_key, joint_keys),
+        (velocity_key, velocity_keys),
+        (offset_key, offset_keys),
+    ):
         expected = [[one(3, int(j), int(f)) for j in joints] for f in frames[:, 0]]
         assert many(3, joints, frames).tolist() == expected
     assert joint_keys(3, np.array([], dtype=int)).tolist() == []
@@ -121,7 +146,9 @@ def test_keys_are_printed_readably_also_by_gtsam(capfd):
     assert format_key(camera_key(2)) == "camera(view 2, frame 0)"
     assert format_key(gtsam.symbol("x", 5)) == "x5"
     graph = gtsam.NonlinearFactorGraph()
-    graph.add(gtsam.PriorFactorPoint3(joint_key(1, 4, 30), np.zeros(3), gtsam.noiseModel.Unit.Create(3)))
+    graph.add(
+        gtsam.PriorFactorPoint3(joint_key(1, 4, 30), np.zeros(3), gtsam.noiseModel.Unit.Create(3))
+    )
     graph.print("", format_key)
     assert "position(person 1, joint 4, frame 30)" in capfd.readouterr().out
 

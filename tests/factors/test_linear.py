@@ -18,7 +18,11 @@ def values_of(points) -> gtsam.Values:
 @pytest.mark.parametrize("rows", [1, 2, 3, 6])
 def test_residual_and_jacobian_are_those_of_the_formula(count, rows):
     rng = np.random.default_rng(10 * count + rows)
-    A, z, sigma = rng.normal(size=(count, rows, 3)), rng.normal(size=rows), rng.uniform(0.5, 2.0, rows)
+    A, z, sigma = (
+        rng.normal(size=(count, rows, 3)),
+        rng.normal(size=rows),
+        rng.uniform(0.5, 2.0, rows),
+    )
     x = rng.normal(size=(count, 3))
     factor = linear_factor(range(count), A, z, sigma)
     residual = (np.einsum("kmi,ki->m", A, x) - z) / sigma
@@ -28,7 +32,9 @@ def test_residual_and_jacobian_are_those_of_the_formula(count, rows):
 
 
 def test_constant_acceleration_over_four_frames():
-    """The third difference is zero for a parabola, and a solver finds it through points that are none."""
+    """The third difference is zero for a parabola, and a solver finds it through points that are
+    none.
+    """
     t = np.arange(4.0)[:, None]
     parabola = t**2 * [1.0, 0.0, -2.0] + t * [0.3, 1.0, 0.0] + [0.0, 0.0, 1.0]
     smooth = linear_factor(range(4), (-1, 3, -3, 1), sigma=0.01)
@@ -37,7 +43,9 @@ def test_constant_acceleration_over_four_frames():
     noisy = parabola + np.random.default_rng(0).normal(0, 0.05, (4, 3))
     graph = gtsam.NonlinearFactorGraph()
     for key, point in enumerate(noisy):
-        graph.push_back(gtsam.PriorFactorPoint3(key, point, gtsam.noiseModel.Isotropic.Sigma(3, 0.05)))
+        graph.push_back(
+            gtsam.PriorFactorPoint3(key, point, gtsam.noiseModel.Isotropic.Sigma(3, 0.05))
+        )
     graph.push_back(smooth)
     found = gtsam.LevenbergMarquardtOptimizer(graph, values_of(noisy)).optimize()
     D = np.array([-1.0, 3.0, -3.0, 1.0])

@@ -1,4 +1,6 @@
-"""Motion and lasting offsets: against a Kalman smoother written out in NumPy, numeric Jacobians, and the truth."""
+"""Motion and lasting offsets: against a Kalman smoother written out in NumPy, numeric Jacobians,
+and the truth.
+"""
 
 import gtsam
 import numpy as np
@@ -22,13 +24,17 @@ from factors import (
 TIMES = np.array([0.0, 0.04, 0.08, 0.2, 0.24, 0.9, 0.94, 1.0])
 """Steps of 0.04 s, a gap and what follows."""
 T = len(TIMES)
-KEYS, SPEEDS, OFFSETS = (make(2, 4, np.arange(T)) for make in (joint_keys, velocity_keys, offset_keys))
+KEYS, SPEEDS, OFFSETS = (
+    make(2, 4, np.arange(T)) for make in (joint_keys, velocity_keys, offset_keys)
+)
 
 
 def values_of(x, v=None, b=None) -> gtsam.Values:
     values = gtsam.Values()
     for keys, points in ((KEYS, x), (SPEEDS, v), (OFFSETS, b)):
-        for key, point in zip(keys.tolist(), () if points is None else points, strict=points is not None):
+        for key, point in zip(
+            keys.tolist(), () if points is None else points, strict=points is not None
+        ):
             values.insert(key, np.asarray(point, dtype=float))
     return values
 
@@ -41,11 +47,11 @@ def solved(factors, values) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
 
 
 def smoothed(transition, process, prior, observations):
-    """Means and covariances (T, n), (T, n, n) of a linear Gaussian chain: Kalman filter and RTS smoother, in
-    NumPy.
+    """Means and covariances (T, n), (T, n, n) of a linear Gaussian chain: Kalman filter and RTS
+    smoother, in NumPy.
 
-    `transition(i)`, `process(i)` lead from state i to i + 1; `prior` is the first state's (mean, covariance);
-    `observations[i]` is (H, R, z), or None.
+    `transition(i)`, `process(i)` lead from state i to i + 1; `prior` is the first state's (mean,
+    covariance); `observations[i]` is (H, R, z), or None.
     """
     mean, cov = prior
     filtered, predicted = [], []
@@ -82,7 +88,9 @@ def test_the_jacobian_is_the_numeric_one():
 
 
 def test_the_noise_is_that_of_white_acceleration():
-    """Whitened, the factor's residual is that of the covariance written out, for steps of any length."""
+    """Whitened, the factor's residual is that of the covariance written out, for steps of any
+    length.
+    """
     rng = np.random.default_rng(1)
     x, v = rng.normal(size=(T, 3)), rng.normal(size=(T, 3))
     values = values_of(x, v)
@@ -101,7 +109,11 @@ def test_smoothing_is_the_kalman_smoother_s():
     factors = motion_factors(KEYS, SPEEDS, TIMES, q)
     noise = gtsam.noiseModel.Isotropic.Sigma(3, sigma)
     factors += [gtsam.PriorFactorPoint3(int(KEYS[i]), z[i], noise) for i in np.flatnonzero(seen)]
-    factors.append(gtsam.PriorFactorPoint3(int(SPEEDS[0]), np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, 2.0)))
+    factors.append(
+        gtsam.PriorFactorPoint3(
+            int(SPEEDS[0]), np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, 2.0)
+        )
+    )
     graph, solution = solved(factors, values_of(np.zeros((T, 3)), np.zeros((T, 3))))
 
     def transition(i):
@@ -136,7 +148,8 @@ def test_an_offset_is_zero_where_the_message_is_right():
 
 
 def test_errors_that_last_are_filtered_as_such():
-    """A joint that stands still, a message with a lasting error: state (x, offset), against the smoother in NumPy.
+    """A joint that stands still, a message with a lasting error: state (x, offset), against the
+    smoother in NumPy.
 
     The last two messages are missing, and the joint itself is seen at the first three times only.
     """
@@ -155,7 +168,9 @@ def test_errors_that_last_are_filtered_as_such():
     ]
     seen = gtsam.noiseModel.Isotropic.Sigma(3, sigma)
     factors += [gtsam.PriorFactorPoint3(int(KEYS[i]), np.zeros(3), seen) for i in range(3)]
-    factors.append(gtsam.PriorFactorPoint3(int(KEYS[0]), np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, 1.0)))
+    factors.append(
+        gtsam.PriorFactorPoint3(int(KEYS[0]), np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, 1.0))
+    )
     graph, solution = solved(factors, values_of(np.zeros((T, 3)), b=np.zeros((T, 3))))
     kept = np.exp(-np.diff(TIMES) / tau)
     eye, zero = np.eye(3), np.zeros((3, 3))
@@ -163,7 +178,9 @@ def test_errors_that_last_are_filtered_as_such():
     def observation(i):
         # r = R (x - m) - sqrt(1 - w) b ~ N(0, w): R m seen through [R, -sqrt(1 - w)].
         rows = (
-            [(np.hstack([roots[i], -np.sqrt(1 - share) * eye]), share * eye, roots[i] @ m[i])] if i < told else []
+            [(np.hstack([roots[i], -np.sqrt(1 - share) * eye]), share * eye, roots[i] @ m[i])]
+            if i < told
+            else []
         )
         rows += [(np.hstack([eye, zero]), sigma**2 * eye, np.zeros(3))] if i < 3 else []
         if len(rows) == 0:
@@ -190,7 +207,9 @@ def test_errors_that_last_are_filtered_as_such():
 
 
 def test_a_message_told_often_is_no_surer_than_told_once():
-    """A hundred times in a hundred milliseconds, with an error that lasts for seconds: about the lasting share."""
+    """A hundred times in a hundred milliseconds, with an error that lasts for seconds: about the
+    lasting share.
+    """
     times = np.linspace(0, 0.1, 100)
     keys, offsets = joint_keys(0, 0, np.arange(100)), offset_keys(0, 0, np.arange(100))
     roots = np.tile(np.eye(3) / 0.1, (100, 1, 1))
@@ -220,7 +239,9 @@ def test_two_messages_about_one_joint_both_count():
     graph, solution = solved(factors, values)
     np.testing.assert_allclose(solution.atPoint3(int(KEYS[0])), [0.8, 0.8, 0.8], atol=1e-9)
     np.testing.assert_allclose(
-        gtsam.Marginals(graph, solution).marginalCovariance(int(KEYS[0])), 0.1**2 / 5 * np.eye(3), atol=1e-12
+        gtsam.Marginals(graph, solution).marginalCovariance(int(KEYS[0])),
+        0.1**2 / 5 * np.eye(3),
+        atol=1e-12,
     )
 
 
@@ -229,7 +250,11 @@ def test_a_ray_leaves_its_direction_open():
     roots = np.diag([100.0, 100.0, 0.0])[None]
     factors = lasting_prior_factors(KEYS[:1], OFFSETS[:1], [[1.0, 2.0, 3.0]], roots, 0.5)
     factors += offset_factors(OFFSETS[:1], TIMES[:1], 1.0)
-    factors.append(gtsam.PriorFactorPoint3(int(KEYS[0]), np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, 10.0)))
+    factors.append(
+        gtsam.PriorFactorPoint3(
+            int(KEYS[0]), np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, 10.0)
+        )
+    )
     values = gtsam.Values()
     values.insert(int(KEYS[0]), np.zeros(3))
     values.insert(int(OFFSETS[0]), np.zeros(3))
@@ -239,8 +264,8 @@ def test_a_ray_leaves_its_direction_open():
 
 
 def covariance_beside_rays(rays: int, direction) -> np.ndarray:
-    """(3, 3) covariance of a joint that one full message of 20 mm is of, `rays` frames with rays along `direction`
-    after it; each ray's own joint is anywhere within 10 m.
+    """(3, 3) covariance of a joint that one full message of 20 mm is of, `rays` frames with rays
+    along `direction` after it; each ray's own joint is anywhere within 10 m.
     """
     frames = np.arange(rays + 1)
     keys, offsets = joint_keys(0, 0, frames), offset_keys(0, 0, frames)
@@ -261,13 +286,20 @@ def covariance_beside_rays(rays: int, direction) -> np.ndarray:
 @pytest.mark.parametrize("direction", [(0, 0, 1), (1, 2, 3)])
 @pytest.mark.parametrize("rays", [1, 5, 20])
 def test_a_ray_tells_nothing_of_the_offset_along_itself(rays, direction):
-    """One message of 20 mm stays one of 20 mm, however many rays follow; an offset said to be 0 made it 13 mm."""
-    # Across the ray the joints of the other frames are known to 10 m: two millionths of the variance.
-    np.testing.assert_allclose(covariance_beside_rays(rays, direction), 0.02**2 * np.eye(3), rtol=1e-4, atol=1e-8)
+    """One message of 20 mm stays one of 20 mm, however many rays follow; an offset said to be 0
+    made it 13 mm.
+    """
+    # Across the ray the joints of the other frames are known to 10 m: two millionths of the
+    # variance.
+    np.testing.assert_allclose(
+        covariance_beside_rays(rays, direction), 0.02**2 * np.eye(3), rtol=1e-4, atol=1e-8
+    )
 
 
 def test_a_message_of_full_rank_is_split_as_it_is_written():
-    """The factor's error at any point is half the square of (R (x - m) - sqrt(1 - w) b) / sqrt(w)."""
+    """The factor's error at any point is half the square of (R (x - m) - sqrt(1 - w) b) /
+    sqrt(w).
+    """
     rng = np.random.default_rng(5)
     root = rng.normal(size=(3, 3))
     root = root @ root.T + 1e-3 * np.eye(3)
@@ -284,7 +316,10 @@ def test_a_message_of_full_rank_is_split_as_it_is_written():
     ("make", "message"),
     [
         (lambda: motion_factors(KEYS, SPEEDS, TIMES[::-1], 1.0), "must be finite and rise"),
-        (lambda: motion_factors(KEYS[:2], SPEEDS[:2], [0.0, np.inf], 1.0), "must be finite and rise"),
+        (
+            lambda: motion_factors(KEYS[:2], SPEEDS[:2], [0.0, np.inf], 1.0),
+            "must be finite and rise",
+        ),
         (lambda: motion_factors(KEYS[:1], SPEEDS[:1], [np.nan], 1.0), "must be finite and rise"),
         (lambda: motion_factors(KEYS, SPEEDS, TIMES, 0.0), "psd must be positive"),
         (lambda: motion_factors(KEYS[:2], SPEEDS, TIMES, 1.0), r"must be \(T,\)"),
@@ -292,11 +327,19 @@ def test_a_message_of_full_rank_is_split_as_it_is_written():
         (lambda: offset_factors(OFFSETS, TIMES[::-1], 1.0), "times finite and rising"),
         (lambda: offset_factors(OFFSETS[:2], [0.0, np.inf], 1.0), "times finite and rising"),
         (
-            lambda: lasting_prior_factors(KEYS[:1], OFFSETS[:1], [[0, 0, np.nan]], np.eye(3)[None], 0.5),
+            lambda: lasting_prior_factors(
+                KEYS[:1], OFFSETS[:1], [[0, 0, np.nan]], np.eye(3)[None], 0.5
+            ),
             "not finite",
         ),
-        (lambda: lasting_prior_factors(KEYS[:1], OFFSETS[:1], [[0, 0, 0]], np.eye(3)[None], 1.0), "white_share"),
-        (lambda: lasting_prior_factors(KEYS[:1], OFFSETS[:1], [[0, 0]], np.eye(3)[None], 0.5), r"means \(D, 3\)"),
+        (
+            lambda: lasting_prior_factors(KEYS[:1], OFFSETS[:1], [[0, 0, 0]], np.eye(3)[None], 1.0),
+            "white_share",
+        ),
+        (
+            lambda: lasting_prior_factors(KEYS[:1], OFFSETS[:1], [[0, 0]], np.eye(3)[None], 0.5),
+            r"means \(D, 3\)",
+        ),
     ],
 )
 def test_refuses_what_makes_no_sense(make, message):
@@ -305,7 +348,9 @@ def test_refuses_what_makes_no_sense(make, message):
 
 
 def test_a_difference_whose_error_lasts_is_in_the_marginals_with_all_of_it():
-    """y = x + d + e, with e of covariance D_t that lasts: Var(y) = Var(x) + D, and so on over time."""
+    """y = x + d + e, with e of covariance D_t that lasts: Var(y) = Var(x) + D, and so on over
+    time.
+    """
     rng, times, T, w, tau = np.random.default_rng(3), np.array([0.0, 0.1, 0.15, 0.4]), 4, 0.3, 0.5
     keys, of, offsets = (
         reported_keys(2, 7, np.arange(T)),
@@ -326,11 +371,17 @@ def test_a_difference_whose_error_lasts_is_in_the_marginals_with_all_of_it():
     assert graph.error(values) == pytest.approx(0.0, abs=1e-18)
     found = gtsam.Marginals(graph, values)
     for n in range(T):
-        np.testing.assert_allclose(found.marginalCovariance(int(keys[n])), 0.05**2 * np.eye(3) + D[n], rtol=1e-9)
-    both = found.jointMarginalCovariance(gtsam.KeyVector(keys[:2].tolist())).at(int(keys[0]), int(keys[1]))
+        np.testing.assert_allclose(
+            found.marginalCovariance(int(keys[n])), 0.05**2 * np.eye(3) + D[n], rtol=1e-9
+        )
+    both = found.jointMarginalCovariance(gtsam.KeyVector(keys[:2].tolist())).at(
+        int(keys[0]), int(keys[1])
+    )
     values_0, vectors_0 = np.linalg.eigh(D[0])
     values_1, vectors_1 = np.linalg.eigh(D[1])
-    root_0, root_1 = (v * np.sqrt(e) @ v.T for e, v in ((values_0, vectors_0), (values_1, vectors_1)))
+    root_0, root_1 = (
+        v * np.sqrt(e) @ v.T for e, v in ((values_0, vectors_0), (values_1, vectors_1))
+    )
     np.testing.assert_allclose(both, (1 - w) * np.exp(-0.1 / tau) * root_0 @ root_1, atol=1e-9)
 
 

@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from factors import CONSTANT_ACCELERATION, CONSTANT_VELOCITY, MOTIONS, Motion, assert_zero_at_truth, state_keys
+from factors import (
+    CONSTANT_ACCELERATION,
+    CONSTANT_VELOCITY,
+    MOTIONS,
+    Motion,
+    assert_zero_at_truth,
+    state_keys,
+)
 from factors.motion import matrices
 
 TIMES = np.array([0.0, 0.04, 0.08, 0.2, 0.24, 0.9, 0.94, 1.0])
@@ -26,11 +33,18 @@ class Damped(Motion):
         h, q = np.asarray(dt_s), TAU_S * np.asarray(density)
         gone, twice = TAU_S * (1 - np.exp(-h / TAU_S)), TAU_S * (1 - np.exp(-2 * h / TAU_S)) / 2
         return matrices(
-            [[TAU_S * q * (h - 2 * gone + twice), q * (gone - twice)], [q * (gone - twice), q * twice / TAU_S]]
+            [
+                [TAU_S * q * (h - 2 * gone + twice), q * (gone - twice)],
+                [q * (gone - twice), q * twice / TAU_S],
+            ]
         )
 
 
-LAWS = {"constant velocity": CONSTANT_VELOCITY, "constant acceleration": CONSTANT_ACCELERATION, "damped": Damped()}
+LAWS = {
+    "constant velocity": CONSTANT_VELOCITY,
+    "constant acceleration": CONSTANT_ACCELERATION,
+    "damped": Damped(),
+}
 RATES = {
     "constant velocity": [[0, 1], [0, 0]],
     "constant acceleration": [[0, 1, 0], [0, 0, 1], [0, 0, 0]],
@@ -55,7 +69,9 @@ def test_transition_and_noise_are_the_integrals_of_the_differential_equation(nam
     np.testing.assert_allclose(law.transition(h), expm(h * A), rtol=1e-12, atol=1e-14)
     nodes, weights = np.polynomial.legendre.leggauss(24)
     steps = [expm(h * (1 + node) / 2 * A) @ L for node in nodes]
-    expected = h / 2 * sum(weight * step @ step.T for weight, step in zip(weights, steps, strict=True))
+    expected = (
+        h / 2 * sum(weight * step @ step.T for weight, step in zip(weights, steps, strict=True))
+    )
     np.testing.assert_allclose(law.noise(h, 3.0), 3.0 * expected, rtol=1e-9, atol=1e-18)
     two = law.noise([h, 2 * h], [3.0, 1.0])
     np.testing.assert_allclose(two, [law.noise(h, 3.0), law.noise(2 * h)], rtol=1e-12)
@@ -73,7 +89,9 @@ def test_two_steps_are_one(name):
 
 
 def test_factors_are_the_gaussian_of_the_step(name):
-    """Zero where the motion goes on by itself; elsewhere r' (q Q)^-1 r / 2, and its derivatives are constant."""
+    """Zero where the motion goes on by itself; elsewhere r' (q Q)^-1 r / 2, and its derivatives are
+    constant.
+    """
     law, keys = LAWS[name], keys_of(LAWS[name])
     rng, q = np.random.default_rng(0), np.linspace(1, 4, T - 1)
     straight, any_states = [rng.normal(size=(law.order, 3))], rng.normal(size=(T, law.order, 3))
@@ -92,33 +110,45 @@ def test_factors_are_the_gaussian_of_the_step(name):
                 assert_zero_at_truth(factor, values)
             A, b = factor.linearize(values).jacobian()
             assert 0.5 * b @ b == pytest.approx(expected, rel=1e-8, abs=1e-12)
-            root = np.linalg.solve(law.noise(dt, q[i]), np.hstack([-law.transition(dt), np.eye(law.order)]))
+            root = np.linalg.solve(
+                law.noise(dt, q[i]), np.hstack([-law.transition(dt), np.eye(law.order)])
+            )
             J = np.hstack([-law.transition(dt), np.eye(law.order)])
             order = [list(factor.keys()).index(key) for key in keys[i : i + 2].ravel().tolist()]
             blocks = (A.T @ A).reshape(2 * law.order, 3, 2 * law.order, 3)[order][:, :, order]
-            np.testing.assert_allclose(blocks[:, 0, :, 0], J.T @ root, rtol=1e-6, atol=1e-6 * np.abs(blocks).max())
+            np.testing.assert_allclose(
+                blocks[:, 0, :, 0], J.T @ root, rtol=1e-6, atol=1e-6 * np.abs(blocks).max()
+            )
 
 
 @pytest.mark.slow
 def test_covariances_hold_on_motion_that_follows_the_model(name):
-    """200 walks drawn from the model, seen with 1 cm of noise: 95 % of truths inside, derivatives too."""
+    """200 walks drawn from the model, seen with 1 cm of noise: 95 % of truths inside, derivatives
+    too.
+    """
     law, keys, rng, q, sigma = LAWS[name], keys_of(LAWS[name]), np.random.default_rng(1), 2.0, 0.01
     start = np.array([1.0, *law.start])
     graph = gtsam.NonlinearFactorGraph()
     for factor in law.factors(keys, TIMES, q):
         graph.push_back(factor)
     for key, wide in zip(keys[0].tolist(), start, strict=True):
-        graph.push_back(gtsam.PriorFactorPoint3(key, np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, wide)))
+        graph.push_back(
+            gtsam.PriorFactorPoint3(key, np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, wide))
+        )
     squared = []
     for _ in range(200):
         states = [start[:, None] * rng.normal(size=(law.order, 3))]
         for before, after in pairwise(TIMES):
             root = np.linalg.cholesky(law.noise(after - before, q))
-            states.append(law.transition(after - before) @ states[-1] + root @ rng.normal(size=(law.order, 3)))
+            states.append(
+                law.transition(after - before) @ states[-1] + root @ rng.normal(size=(law.order, 3))
+            )
         seen, values = gtsam.NonlinearFactorGraph(graph), gtsam.Values()
         for key, state in zip(keys[:, 0].tolist(), states, strict=True):
             noise = gtsam.noiseModel.Isotropic.Sigma(3, sigma)
-            seen.push_back(gtsam.PriorFactorPoint3(key, state[0] + sigma * rng.normal(size=3), noise))
+            seen.push_back(
+                gtsam.PriorFactorPoint3(key, state[0] + sigma * rng.normal(size=3), noise)
+            )
         for key in keys.ravel().tolist():
             values.insert(key, np.zeros(3))
         found = gtsam.LevenbergMarquardtOptimizer(seen, values).optimize()

@@ -26,11 +26,16 @@ def test_confidence_multiplies_the_squared_error():
     full, quarter = sigma_px(np.array([1.0, 0.25]), 3.0, 400.0)
     assert quarter == pytest.approx(2 * full)
     r = np.array([3.0, 4.0])
-    costs = [gtsam.PriorFactorPoint2(1, np.zeros(2), isotropic(2, s)).error(_at(r)) for s in (full, quarter)]
+    costs = [
+        gtsam.PriorFactorPoint2(1, np.zeros(2), isotropic(2, s)).error(_at(r))
+        for s in (full, quarter)
+    ]
     assert costs[1] == pytest.approx(0.25 * costs[0])
 
 
-@pytest.mark.parametrize("bad", [(0.0, 3, 400), (0.5, 0, 400), (0.5, -1, 400), (np.nan, 3, 400), (0.5, 3, 0)])
+@pytest.mark.parametrize(
+    "bad", [(0.0, 3, 400), (0.5, 0, 400), (0.5, -1, 400), (np.nan, 3, 400), (0.5, 3, 0)]
+)
 def test_what_has_no_weight_is_refused(bad):
     with pytest.raises(ValueError, match="positive and finite"):
         sigma_px(*bad)
@@ -82,7 +87,9 @@ def test_a_kernel_lets_an_outlier_go(name):
     start.insert(1, np.array([0.3, 0.2, 0.1]))
     x = gtsam.LevenbergMarquardtOptimizer(graph, start).optimize().atPoint3(1)
     # Huber's outlier pulls with its width: 1.5 sigma against nine springs of one.
-    assert np.linalg.norm(x) < (DEFAULT_WIDTH_SIGMA["huber"] / 9 + 1e-3 if name == "huber" else 0.01)
+    assert np.linalg.norm(x) < (
+        DEFAULT_WIDTH_SIGMA["huber"] / 9 + 1e-3 if name == "huber" else 0.01
+    )
 
 
 def test_none_is_plain_least_squares():
@@ -143,5 +150,7 @@ def test_kernel_weights_for_arrays_are_those_of_gtsam(name):
     for width in (None, 0.8):
         kernel = robust_kernel(name, width)
         expected = [kernel.weight(norm) for norm in norms]
-        np.testing.assert_allclose(kernel_weight(name, norms, width), expected, rtol=1e-12, atol=1e-15)
+        np.testing.assert_allclose(
+            kernel_weight(name, norms, width), expected, rtol=1e-12, atol=1e-15
+        )
     assert kernel_weight(None, norms).tolist() == [1.0] * 60

@@ -50,12 +50,19 @@ def test_refuses_shapes_and_covariances_that_are_none():
 def test_many_carried_cameras_are_as_one_by_one():
     K = np.array([[900.0, 0, 640], [0, 910, 360], [0, 0, 1]])
     lens, sensor = make_calibration(K), gtsam.Pose3.Expmap(np.array([0.1, 0.0, 0.2, 0.1, 0, 0]))
-    keys, xy = [joint_key(0, j, 5) for j in range(3)], np.array([[600.0, 300], [700, 400], [650, 350]])
+    keys, xy = (
+        [joint_key(0, j, 5) for j in range(3)],
+        np.array([[600.0, 300], [700, 400], [650, 350]]),
+    )
     poses = [camera_key(2, 5)] * 3
-    many = posed_projection_factors([lens], [0, 0, 0], poses, [sensor] * 3, keys, xy, [2.0, 3.0, 4.0])
+    many = posed_projection_factors(
+        [lens], [0, 0, 0], poses, [sensor] * 3, keys, xy, [2.0, 3.0, 4.0]
+    )
     values = values_at(POSES)
     for n, (factor, key) in enumerate(zip(many, keys, strict=True)):
-        values.insert(key, (gtsam.Pose3(POSES[0]) * sensor).transformFrom(np.array([0.1 * n, -0.1, 4.0 + n])))
+        values.insert(
+            key, (gtsam.Pose3(POSES[0]) * sensor).transformFrom(np.array([0.1 * n, -0.1, 4.0 + n]))
+        )
         one = posed_projection_factor(lens, xy[n], 2.0 + n, poses[0], key, body_T_sensor=sensor)
         assert factor.equals(one, 1e-12)
         assert_jacobian(factor, values)

@@ -28,7 +28,9 @@ def test_zero_at_truth_for_every_view(scene):
     values.insert(KEY, point)
     for view, camera in enumerate(scene.cameras):
         # 1e-9 px: rounding of numbers of a thousand pixels.
-        assert_zero_at_truth(projection_factor(camera, scene.project(view, point), 2.0, KEY), values)
+        assert_zero_at_truth(
+            projection_factor(camera, scene.project(view, point), 2.0, KEY), values
+        )
 
 
 def test_the_residual_is_projection_minus_measurement(scene):
@@ -45,7 +47,9 @@ def test_the_jacobian_is_the_numeric_one(scene, kernel):
     values = gtsam.Values()
     values.insert(KEY, scene.points[0])
     uv = scene.project(2, scene.points[0]) + np.array([3.0, -5.0])
-    assert_jacobian(projection_factor(scene.cameras[2], uv, 2.0, KEY, robust_kernel(kernel)), values)
+    assert_jacobian(
+        projection_factor(scene.cameras[2], uv, 2.0, KEY, robust_kernel(kernel)), values
+    )
 
 
 def test_a_batch_is_the_single_factor_many_times(scene):
@@ -58,7 +62,9 @@ def test_a_batch_is_the_single_factor_many_times(scene):
     batch = projection_factors(scene.cameras, view, keys[joint], xy, sigmas, kernel)
     values = scene.values(keys)
     for d, factor in enumerate(batch):
-        single = projection_factor(scene.cameras[view[d]], xy[d], sigmas[d], int(keys[joint[d]]), kernel)
+        single = projection_factor(
+            scene.cameras[view[d]], xy[d], sigmas[d], int(keys[joint[d]]), kernel
+        )
         assert factor.equals(single, 1e-12)
         assert factor.error(values) == single.error(values)
     assert projection_factors(scene.cameras, [], [], np.zeros((0, 2)), []) == []
@@ -72,9 +78,17 @@ def test_a_posed_camera_agrees_with_a_fixed_one(scene):
     values.insert(camera_key(0), gtsam.Pose3(scene.wTc[0]))
     factor = posed_projection_factor(make_calibration(scene.K[0]), uv, 2.0, camera_key(0), KEY)
     fixed = projection_factor(scene.cameras[0], uv, 2.0, KEY)
-    np.testing.assert_allclose(factor.unwhitenedError(values), fixed.unwhitenedError(values), atol=1e-9)
+    np.testing.assert_allclose(
+        factor.unwhitenedError(values), fixed.unwhitenedError(values), atol=1e-9
+    )
     assert_jacobian(factor, values)
-    by_key = dict(zip(factor.keys(), np.split(factor.linearize(values).jacobian()[0], [6], axis=1), strict=True))
+    by_key = dict(
+        zip(
+            factor.keys(),
+            np.split(factor.linearize(values).jacobian()[0], [6], axis=1),
+            strict=True,
+        )
+    )
     np.testing.assert_allclose(by_key[KEY], fixed.linearize(values).jacobian()[0], rtol=1e-9)
 
 
@@ -95,7 +109,9 @@ def test_a_camera_on_a_robot(scene):
 
 
 def test_triangulation_finds_the_truth_and_the_closed_form_covariance(scene):
-    """A joint that V cameras see to 2 px: covariance (J^T W J)^-1, with J by differences of the pinhole."""
+    """A joint that V cameras see to 2 px: covariance (J^T W J)^-1, with J by differences of the
+    pinhole.
+    """
     point = scene.points[0]
     sigmas = np.array([2.0, 3.0, 1.5])
     xy = np.array([scene.project(v, point) for v in range(3)])
@@ -105,7 +121,8 @@ def test_triangulation_finds_the_truth_and_the_closed_form_covariance(scene):
     start = gtsam.Values()
     start.insert(KEY, point + np.array([0.1, -0.2, 0.15]))
     solution = gtsam.LevenbergMarquardtOptimizer(graph, start).optimize()
-    # Micrometres: LM stops at a relative decrease of 1e-5 of a cost that is already next to nothing.
+    # Micrometres: LM stops at a relative decrease of 1e-5 of a cost that is already next to
+    # nothing.
     np.testing.assert_allclose(solution.atPoint3(KEY), point, atol=1e-5)
 
     step = 1e-5 * np.eye(3)
@@ -143,7 +160,9 @@ def test_graphs_of_two_people_and_two_frames_compose(scene):
     for person, frame in groups:
         for key in joint_keys(person, np.arange(4), frame).tolist():
             # Both stop by LM's relative tolerance of 1e-5, at costs of different size.
-            np.testing.assert_allclose(together.atPoint3(key), alone[person, frame].atPoint3(key), atol=1e-4)
+            np.testing.assert_allclose(
+                together.atPoint3(key), alone[person, frame].atPoint3(key), atol=1e-4
+            )
 
 
 def test_behind_the_camera_the_factor_is_silent_and_the_gate_is_not(scene):
@@ -156,7 +175,9 @@ def test_behind_the_camera_the_factor_is_silent_and_the_gate_is_not(scene):
 
 
 def test_the_gate_of_equation_2():
-    np.testing.assert_array_equal(inlier_gate([0.0, 9.99, 10.0, np.nan, np.inf], 10.0), [1, 1, 0, 0, 0])
+    np.testing.assert_array_equal(
+        inlier_gate([0.0, 9.99, 10.0, np.nan, np.inf], 10.0), [1, 1, 0, 0, 0]
+    )
     with pytest.raises(ValueError, match="rho_2d_px"):
         inlier_gate([1.0], 0.0)
 

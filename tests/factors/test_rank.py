@@ -19,13 +19,17 @@ def test_the_information_is_that_of_the_graph(scene):
     marginals = gtsam.Marginals(graph, scene.values(range(4)))
     information = _information(scene, joint, view)
     for j in range(4):
-        np.testing.assert_allclose(information[j], marginals.marginalInformation(j), rtol=1e-9, atol=1e-6)
+        np.testing.assert_allclose(
+            information[j], marginals.marginalInformation(j), rtol=1e-9, atol=1e-6
+        )
 
 
 def test_two_views_determine_a_joint_and_one_does_not(scene):
     #           joint 0: two views, 1: one view, 2: the same view twice, 3: none
     joint, view = np.array([0, 0, 1, 2, 2]), np.array([0, 1, 0, 2, 2])
-    np.testing.assert_array_equal(determined(_information(scene, joint, view)), [True, False, False, False])
+    np.testing.assert_array_equal(
+        determined(_information(scene, joint, view)), [True, False, False, False]
+    )
 
 
 def test_a_prior_determines_what_views_do_not(scene):
@@ -78,7 +82,9 @@ def test_the_bounds_are_those_of_the_weakest_direction():
 
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_marginals_agree_with_the_check(scene, count):
-    """What the check refuses is what GTSAM refuses to give a covariance for, after LM said nothing."""
+    """What the check refuses is what GTSAM refuses to give a covariance for, after LM said
+    nothing.
+    """
     view = np.arange(count)
     xy = np.array([scene.project(v, scene.points[0]) for v in view])
     graph = gtsam.NonlinearFactorGraph()

@@ -44,7 +44,9 @@ def test_the_native_bone_length_agrees_with_the_users(values):
     native = gtsam.RangeFactor3(1, 2, 0.3, isotropic(1, 0.02))
     own = _bone(0.3, isotropic(1, 0.02))
     assert_jacobian(native, values)
-    for a, b in zip(native.linearize(values).jacobian(), own.linearize(values).jacobian(), strict=True):
+    for a, b in zip(
+        native.linearize(values).jacobian(), own.linearize(values).jacobian(), strict=True
+    ):
         np.testing.assert_allclose(a, b, rtol=1e-12)
 
 
@@ -68,6 +70,8 @@ def test_zero_at_truth(values):
 
 
 def test_a_residual_without_weight_says_so(values):
-    factor = gtsam.PriorFactorPoint3(1, np.full(3, 50.0), isotropic(3, 0.01, robust_kernel("tukey")))
+    factor = gtsam.PriorFactorPoint3(
+        1, np.full(3, 50.0), isotropic(3, 0.01, robust_kernel("tukey"))
+    )
     with pytest.raises(AssertionError, match="no weight"):
         assert_jacobian(factor, values)

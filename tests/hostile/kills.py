@@ -1,4 +1,6 @@
-"""`shapepose-fg reconstruct`, or a worker of it, killed at random moments; a bit turned or not; then --resume."""
+"""`shapepose-fg reconstruct`, or a worker of it, killed at random moments; a bit turned or not;
+then --resume.
+"""
 
 import os
 import random
@@ -25,7 +27,8 @@ frames = 6
 """
 PROGRAM = "from shapepose_fg.tracking import identities; following.BLOCK_S = 0.3\n"
 PROGRAM += "from shapepose_fg.__main__ import main; main()"
-"""The command, which decides after blocks so short that a run of a second stops in the middle of them, too."""
+"""The command, which decides after blocks so short that a run of a second stops in the middle of
+them, too."""
 _LONGEST_S = 300
 
 
@@ -42,11 +45,19 @@ class Killing:
 
     @classmethod
     def of(cls, folder: Path, seed: int = 0) -> "Killing":
-        """Two people before three cameras for 0.8 s, written into `folder` and reconstructed there."""
+        """Two people before three cameras for 0.8 s, written into `folder` and reconstructed
+        there.
+        """
         scene = built_in_scene(seed=seed, people=2, cameras=3, frames=24)
         files = write_simulated(scene, simulate(scene, seed=seed), folder / "recording", "openpose")
         (folder / "settings.toml").write_text(SETTINGS)
-        command = ["reconstruct", "--calibration", str(files["cameras"]), "--detections", str(files["detections"])]
+        command = [
+            "reconstruct",
+            "--calibration",
+            str(files["cameras"]),
+            "--detections",
+            str(files["detections"]),
+        ]
         command += ["--config", str(folder / "settings.toml"), "--fps", "30", "--workers", "2"]
         command += ["--no-report", "--no-check"]
         process = _begun([*command, "--output", str(folder / "whole")])
@@ -56,7 +67,9 @@ class Killing:
         return cls(command, (folder / "whole" / "people.npz").read_bytes(), kept)
 
     def once(self, number: int, out: Path) -> str:
-        """Kill a run into `out` and go on with it: what came of it. AssertionError for what may not."""
+        """Kill a run into `out` and go on with it: what came of it. AssertionError for what may
+        not.
+        """
         rng = random.Random(number)
         process = _begun([*self.command, "--output", str(out)])
         least = rng.randint(-1, self.kept)
@@ -74,7 +87,9 @@ class Killing:
         done = (out / "people.npz").exists() and not (out / "parts").exists()
         flipped = "nothing"
         if number % 2 == 1 and not done:
-            files = sorted(file for file in out.rglob("*") if file.is_file() and file.stat().st_size > 0)
+            files = sorted(
+                file for file in out.rglob("*") if file.is_file() and file.stat().st_size > 0
+            )
             if len(files) > 0:
                 file = rng.choice(files)
                 content = bytearray(file.read_bytes())
@@ -87,13 +102,17 @@ class Killing:
                 raise AssertionError(f"kill {number}: it did not go on: {second}")
         elif (out / "people.npz").read_bytes() != self.people:
             raise AssertionError(f"kill {number}, {flipped} flipped: other bytes than without it")
-        killed = f"{'a worker' if len(victims) > 0 else 'all'} killed behind {least} of {self.kept} sets"
+        killed = (
+            f"{'a worker' if len(victims) > 0 else 'all'} killed behind {least} of {self.kept} sets"
+        )
         left = "a finished result" if done else first or "nothing said"
         return f"{killed}: {left}; flipped {flipped}; {second or 'the same bytes'}"
 
 
 def _kept_so_far(process: subprocess.Popen[str], out: Path) -> Iterator[int]:
-    """How many windows and bodies a run has kept, again and again until it ends; -1 before its first file."""
+    """How many windows and bodies a run has kept, again and again until it ends; -1 before its
+    first file.
+    """
     while process.poll() is None:
         names = {file.name for file in (out / "parts").glob("*")}
         yield sum(name.startswith(("part-", "bodies-")) for name in names) if names else -1
@@ -107,7 +126,9 @@ def _begun(words: list[str]) -> subprocess.Popen[str]:
 
 
 def _ended(process: subprocess.Popen[str]) -> str:
-    """The one sentence with which it ended; nothing where it did its work, or was killed. AssertionError else."""
+    """The one sentence with which it ended; nothing where it did its work, or was killed.
+    AssertionError else.
+    """
     _, said = process.communicate(timeout=_LONGEST_S)
     errors = [line for line in said.splitlines() if line.startswith("error:")]
     if process.returncode in (0, -signal.SIGKILL) and "Traceback" not in said:
@@ -122,7 +143,10 @@ def _descendants(pid: int) -> list[int]:
     parents = dict[int, int]()
     for place in Path("/proc").glob("[0-9]*/stat"):
         try:
-            words, said = place.read_text().rpartition(")")[2].split(), (place.parent / "cmdline").read_bytes()
+            words, said = (
+                place.read_text().rpartition(")")[2].split(),
+                (place.parent / "cmdline").read_bytes(),
+            )
         except OSError:  # it has ended
             continue
         if b"resource_tracker" not in said:

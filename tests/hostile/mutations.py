@@ -32,8 +32,39 @@ WORDS = [
     "!!python/object:os.system",
     "<!DOCTYPE a>",
 ]
-VALUES = [0, 1, -1, 3, 0.5, -0.5, 1e-320, 1e9, 1e200, -1e308, 2**31, 2**62, 10**19, float("nan"), float("inf")]
-VALUES += ["", "a", "../../x", "a\0b", "\ud800", "\x1b[31m", "=1+1", True, False, None, [], {}, [[]], {"a": 1}]
+VALUES = [
+    0,
+    1,
+    -1,
+    3,
+    0.5,
+    -0.5,
+    1e-320,
+    1e9,
+    1e200,
+    -1e308,
+    2**31,
+    2**62,
+    10**19,
+    float("nan"),
+    float("inf"),
+]
+VALUES += [
+    "",
+    "a",
+    "../../x",
+    "a\0b",
+    "\ud800",
+    "\x1b[31m",
+    "=1+1",
+    True,
+    False,
+    None,
+    [],
+    {},
+    [[]],
+    {"a": 1},
+]
 _LARGEST = 2**18
 """Bytes of what comes out: readers are to be tried, not the disk."""
 _TEXT = re.compile(rb"[\t\n\r -~]{64}")
@@ -66,7 +97,11 @@ def _text(text: str, rng: random.Random) -> str:
         case 0:
             return text[:place]
         case 1:
-            return text[:place] + rng.choice("0123456789-.eE[]{}\":,=<>/ \nax\x00&*%!\\'") + text[place + 1 :]
+            return (
+                text[:place]
+                + rng.choice("0123456789-.eE[]{}\":,=<>/ \nax\x00&*%!\\'")
+                + text[place + 1 :]
+            )
         case 2:
             return text[:place] + text[place + rng.randrange(1, 40) :]
         case 3:
@@ -139,7 +174,9 @@ def _archive(content: bytes, rng: random.Random) -> bytes:
     else:
         members[name] = _bytes(members[name], rng)
     stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w", rng.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED))) as archive:
+    with zipfile.ZipFile(
+        stream, "w", rng.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED))
+    ) as archive:
         for key, value in members.items():
             archive.writestr(key, value)
     return stream.getvalue()
@@ -209,7 +246,9 @@ def _tensors(content: bytes, rng: random.Random) -> bytes:
 
 
 def _array(array: np.ndarray, rng: random.Random) -> np.ndarray:
-    """An array cut, doubled, of another type, or with other values; half of them such that only values tell."""
+    """An array cut, doubled, of another type, or with other values; half of them such that only
+    values tell.
+    """
     if rng.random() < 0.5 and array.size > 0 and array.ndim > 0 and array.dtype.kind in "fiub":
         return _values(array, rng)
     match rng.randrange(6):
@@ -221,7 +260,23 @@ def _array(array: np.ndarray, rng: random.Random) -> np.ndarray:
             return array.astype(rng.choice(("<f8", "<i8", "<f4", "u1", "?")))
         case _ if array.size > 0:
             array = array.copy()
-            numbers = (0, 1, -1, 3, 255, 2**40, 2**62, 1e-300, 0.5, 1e3, 1e9, 1e200, np.nan, np.inf, -np.inf)
+            numbers = (
+                0,
+                1,
+                -1,
+                3,
+                255,
+                2**40,
+                2**62,
+                1e-300,
+                0.5,
+                1e3,
+                1e9,
+                1e200,
+                np.nan,
+                np.inf,
+                -np.inf,
+            )
             where = slice(None) if rng.random() < 0.3 else rng.randrange(array.size)
             if array.dtype.kind == "U":
                 array.reshape(-1)[where] = rng.choice(WORDS)
@@ -233,7 +288,9 @@ def _array(array: np.ndarray, rng: random.Random) -> np.ndarray:
 
 
 def _values(array: np.ndarray, rng: random.Random) -> np.ndarray:
-    """An array of the same shape and type with values that could be meant: little else, exchanged, repeated."""
+    """An array of the same shape and type with values that could be meant: little else, exchanged,
+    repeated.
+    """
     rows, places = rng.sample(range(len(array)), len(array)), np.arange(len(array))
     one, other = rng.choice(rows), rng.choice(rows)
     match rng.randrange(7):
@@ -246,8 +303,12 @@ def _values(array: np.ndarray, rng: random.Random) -> np.ndarray:
             return np.repeat(array[one : one + 1], len(array), axis=0)
         case 3 if array.ndim > 1:
             return np.flip(array, axis=rng.randrange(1, array.ndim)).copy()
-        case 4 if array.dtype.kind == "f" and array.shape[-1] == (array.shape[-2] if array.ndim > 1 else 0):
-            scale = rng.choice((1e-300, 1e-9, 1e-3, 10.0, 1e9, 1e150))  # a matrix that stays one of a Gaussian
+        case 4 if array.dtype.kind == "f" and array.shape[-1] == (
+            array.shape[-2] if array.ndim > 1 else 0
+        ):
+            scale = rng.choice(
+                (1e-300, 1e-9, 1e-3, 10.0, 1e9, 1e150)
+            )  # a matrix that stays one of a Gaussian
             return (array * scale).astype(array.dtype)
         case 5 if array.dtype.kind == "f":
             noise = np.random.default_rng(rng.randrange(2**32)).normal(size=array.shape)
@@ -271,7 +332,11 @@ def _bytes(content: bytes, rng: random.Random) -> bytes:
         case 0:
             return content[:place]
         case 1:
-            return content[:place] + bytes([content[place] ^ 1 << rng.randrange(8)]) + content[place + 1 :]
+            return (
+                content[:place]
+                + bytes([content[place] ^ 1 << rng.randrange(8)])
+                + content[place + 1 :]
+            )
         case 2:
             return content[:place] + rng.randbytes(length) + content[place + length :]
         case 3:
@@ -282,12 +347,19 @@ def _bytes(content: bytes, rng: random.Random) -> bytes:
             return content[:place] + b"\xff" * length + content[place + length :]
 
 
-_ELSEWHERE = b"j\x12\x0a\x08location\x12\x06canary", b"p\x01", b"j\x12\x12\x06canary\x0a\x08location", b"j\x00"
+_ELSEWHERE = (
+    b"j\x12\x0a\x08location\x12\x06canary",
+    b"p\x01",
+    b"j\x12\x12\x06canary\x0a\x08location",
+    b"j\x00",
+)
 """What a tensor of ONNX says whose numbers are in the file "canary"."""
 
 
 def _fields(content: bytes, rng: random.Random) -> bytes:
-    """A message of protobuf with one of its fields, or of a message in it, changed; lengths right again."""
+    """A message of protobuf with one of its fields, or of a message in it, changed; lengths right
+    again.
+    """
     fields, at = list[tuple[bytes, bytes | None, bytes]](), 0
     while at < len(content):  # tag, value of a number, content
         try:
@@ -299,7 +371,10 @@ def _fields(content: bytes, rng: random.Random) -> bytes:
                 fields.append((head, None, content[at : at + length]))
                 at += length
             else:
-                start, at = at, _number(content, at)[1] if tag & 7 == 0 else at + (8 if tag & 7 == 1 else 4)
+                start, at = (
+                    at,
+                    _number(content, at)[1] if tag & 7 == 0 else at + (8 if tag & 7 == 1 else 4),
+                )
                 fields.append((head, content[start:at], b""))
         except IndexError:
             return _bytes(content, rng)
@@ -315,7 +390,11 @@ def _fields(content: bytes, rng: random.Random) -> bytes:
         case 2:
             fields[n] = fields[rng.randrange(len(fields))]
         case 3:
-            fields[n] = rng.choice((b"\xba\x00", b"\x3b", b"\x3c", bytes([rng.randrange(128)]))), value, inner
+            fields[n] = (
+                rng.choice((b"\xba\x00", b"\x3b", b"\x3c", bytes([rng.randrange(128)]))),
+                value,
+                inner,
+            )
         case 4:
             fields[n] = _wide(head, rng), value, inner
         case 5 if value is None:
@@ -323,7 +402,11 @@ def _fields(content: bytes, rng: random.Random) -> bytes:
         case 6 if value is None:
             fields[n] = head, None, inner * 2
         case _ if value is None:
-            fields[n] = head, None, _fields(inner, rng) if rng.random() < 0.8 else _bytes(inner, rng)
+            fields[n] = (
+                head,
+                None,
+                _fields(inner, rng) if rng.random() < 0.8 else _bytes(inner, rng),
+            )
         case _:
             fields[n] = (
                 head,
@@ -331,7 +414,8 @@ def _fields(content: bytes, rng: random.Random) -> bytes:
                 b"",
             )
     return b"".join(
-        head + (value if value is not None else _length(len(inner), rng) + inner) for head, value, inner in fields
+        head + (value if value is not None else _length(len(inner), rng) + inner)
+        for head, value, inner in fields
     )
 
 

@@ -1,4 +1,6 @@
-"""Every reader of files from others, with valid files to be changed: for property tests and fuzz.py."""
+"""Every reader of files from others, with valid files to be changed: for property tests and
+fuzz.py.
+"""
 
 import json
 import pickle
@@ -111,7 +113,10 @@ def _text(folder: Path, seed: int) -> Read:
         lines = ["4 3"]
         for count in ({8: 2, 1: 3, 4: 1}, {}, {0: 1, 9: 2, 10: 2}):
             for joint in range(25):
-                lines += [str(count.get(joint, 0)), *(_row(rng, count.get(joint, 0)) for _ in range(3))]
+                lines += [
+                    str(count.get(joint, 0)),
+                    *(_row(rng, count.get(joint, 0)) for _ in range(3)),
+                ]
             lines += [_row(rng, count.get(a, 0) * count.get(b, 0)) for a, b in BODY_25.limbs]
         (folder / f"{name}.txt").write_text("\n".join(lines))
     rig = people.two_cameras("left", "right")
@@ -149,7 +154,11 @@ def _trajectory(folder: Path, seed: int) -> Read:
     rng, count = np.random.default_rng(seed), 9
     turn = rng.normal(size=(count, 4))
     pose = np.column_stack(
-        [np.arange(count) / 25, rng.normal(size=(count, 3)), turn / np.linalg.norm(turn, axis=1)[:, None]]
+        [
+            np.arange(count) / 25,
+            rng.normal(size=(count, 3)),
+            turn / np.linalg.norm(turn, axis=1)[:, None],
+        ]
     )
     names = [*POSE, *(f"{each}_{each}" for each in ("rx", "ry", "rz", "x", "y", "z"))]
     lines = [" ".join(names), *(" ".join(map(repr, [*row, *[0.01] * 6])) for row in pose.tolist())]
@@ -163,8 +172,13 @@ def _project(folder: Path, seed: int) -> Read:
     write_rig(rig, folder / "calibration" / "rig.json")
     for name in rig.names:
         (folder / "pose" / f"{name}_json").mkdir(parents=True)
-        (folder / "pose" / f"{name}_json" / f"{name}_000003.json").write_text('{"version": 1.3, "people": []}')
-    text = "[project]\nmulti_person = false\nframe_rate = 50\nframe_range = [3, 4]\n[pose]\npose_model = 'Body'\n"
+        (folder / "pose" / f"{name}_json" / f"{name}_000003.json").write_text(
+            '{"version": 1.3, "people": []}'
+        )
+    text = (
+        "[project]\nmulti_person = false\nframe_rate = 50\nframe_range = [3, "
+        "4]\n[pose]\npose_model = 'Body'\n"
+    )
     (folder / "Config.toml").write_text(text)
     return lambda: read_pose2sim_project(folder)
 
@@ -179,7 +193,9 @@ def _recordings(folder: Path, seed: int) -> Read:
 
 def _batch(folder: Path, seed: int) -> Read:
     status = BatchStatus(
-        folder / "batch.json", "recordings.toml", {"walk": RecordingStatus({"fps": 25.0, "cuts": [3]})}
+        folder / "batch.json",
+        "recordings.toml",
+        {"walk": RecordingStatus({"fps": 25.0, "cuts": [3]})},
     )
     status.set("dance", RecordingStatus({}).failed("no", 1.5, 1))
     return lambda: read_status(folder / "batch.json")
@@ -187,14 +203,29 @@ def _batch(folder: Path, seed: int) -> Read:
 
 def _network(folder: Path, seed: int) -> Read:
     """A network's TOML file; of the ONNX files that it names nothing is read yet."""
-    lines = ['network = "pose.onnx"', 'skeleton = "COCO_17"', 'decoding = "heat map"', "size = [192, 256]"]
-    lines += ['joints = ["Nose", "", "LHip"]', "mean = [0.0, 1, 2]", "std = [58.4, 57.1, 57.4]", "[boxes]"]
-    (folder / "n.toml").write_text("\n".join([*lines, 'network = "boxes.onnx"', "min_score = 0.5", ""]))
+    lines = [
+        'network = "pose.onnx"',
+        'skeleton = "COCO_17"',
+        'decoding = "heat map"',
+        "size = [192, 256]",
+    ]
+    lines += [
+        'joints = ["Nose", "", "LHip"]',
+        "mean = [0.0, 1, 2]",
+        "std = [58.4, 57.1, 57.4]",
+        "[boxes]",
+    ]
+    (folder / "n.toml").write_text(
+        "\n".join([*lines, 'network = "boxes.onnx"', "min_score = 0.5", ""])
+    )
     return lambda: read_form(folder / "n.toml")
 
 
 def _corrections(folder: Path, seed: int) -> Read:
-    edits = [{"action": "split", "person": 1, "other": 7, "frame": 4}, {"action": "drop", "person": 2}]
+    edits = [
+        {"action": "split", "person": 1, "other": 7, "frame": 4},
+        {"action": "drop", "person": 2},
+    ]
     content = {"format": "shapepose-fg corrections 1", "people": "0" * 64, "edits": edits}
     (folder / "corrections.json").write_text(json.dumps(content))
     (folder / "people.npz").write_bytes(b"others")
@@ -217,7 +248,9 @@ def _offsets(folder: Path, seed: int) -> Read:
 def _motion(folder: Path, seed: int) -> Read:
     from importlib.resources import files
 
-    (folder / "motion.json").write_text((files("shapepose_fg.estimation") / "data" / "motion.json").read_text())
+    (folder / "motion.json").write_text(
+        (files("shapepose_fg.estimation") / "data" / "motion.json").read_text()
+    )
     config = MotionConfig(model=str(folder / "motion.json"))
     return lambda: MotionModel.load(BODY_25.joints, config)
 
@@ -285,7 +318,9 @@ def _body(pickled: bool) -> Prepare:
 
 
 def tiny_body(seed: int) -> dict[str, np.ndarray]:
-    """A body in SMPL's format with two vertices at each joint and keypoint of the shipped one, and no more."""
+    """A body in SMPL's format with two vertices at each joint and keypoint of the shipped one, and
+    no more.
+    """
     from tests.conftest import read_body
 
     body, rng = read_body(), np.random.default_rng(seed)
@@ -310,9 +345,13 @@ def _weights(folder: Path, seed: int) -> Read:
     from shapepose_fg.body.fitting.weights import FitterWeights
 
     config = NetworkConfig(width=2, blocks=1)
-    network = UpdateNetwork(config, {name: np.zeros(shape) for name, shape in layer_shapes(config).items()})
+    network = UpdateNetwork(
+        config, {name: np.zeros(shape) for name, shape in layer_shapes(config).items()}
+    )
     shipped = FitterWeights.default()
-    FitterWeights(network, shipped.frame, "body", shipped.spread, {}).save(folder / "weights.safetensors")
+    FitterWeights(network, shipped.frame, "body", shipped.spread, {}).save(
+        folder / "weights.safetensors"
+    )
     return lambda: FitterWeights.load(folder / "weights.safetensors")
 
 
@@ -378,7 +417,9 @@ READERS: dict[str, Prepare] = {
     "result for corrections": runs.finished(_merged),
     "result and its settings": runs.finished(_settings_of),
     **{
-        f"{what}, {'with digests' if sealed else 'as they are'}": runs.parts_of(writes, sealed=sealed, **options)
+        f"{what}, {'with digests' if sealed else 'as they are'}": runs.parts_of(
+            writes, sealed=sealed, **options
+        )
         for what, (writes, options) in PARTS.items()
         for sealed in (False, True)
     },

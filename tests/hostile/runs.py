@@ -103,7 +103,9 @@ def task(seed: int = 1, frames: int = 24, people: int = 2, *, bodies: bool = Tru
 
 
 @cache
-def _files(seed: int, writes: int, chunk_frames: int | None, *, bodies: bool) -> tuple[Task, dict[str, bytes]]:
+def _files(
+    seed: int, writes: int, chunk_frames: int | None, *, bodies: bool
+) -> tuple[Task, dict[str, bytes]]:
     """A run, and its parts when it had written so many times."""
     made = task(seed, 12 if bodies else 24, 1 if bodies else 2, bodies=bodies)
     with tempfile.TemporaryDirectory() as name, short_blocks():
@@ -119,7 +121,8 @@ def _files(seed: int, writes: int, chunk_frames: int | None, *, bodies: bool) ->
 def unfinished(writes: int, *, bodies: bool = False, chunk_frames: int | None = None) -> Prepare:
     """A run that was stopped behind so many writes and goes on, for a window or to its end.
 
-    The digests of a changed file are made right before that, as by somebody who knows how: the result can be read.
+    The digests of a changed file are made right before that, as by somebody who knows how: the
+    result can be read.
     """
 
     def prepare(folder: Path, seed: int) -> Callable[[], object]:
@@ -143,8 +146,12 @@ def unfinished(writes: int, *, bodies: bool = False, chunk_frames: int | None = 
     return prepare
 
 
-def parts_of(writes: int, *, sealed: bool, bodies: bool = False, chunk_frames: int | None = None) -> Prepare:
-    """What `reconstruct` reads of such a run before it goes on; as it was written, but where it is `sealed`."""
+def parts_of(
+    writes: int, *, sealed: bool, bodies: bool = False, chunk_frames: int | None = None
+) -> Prepare:
+    """What `reconstruct` reads of such a run before it goes on; as it was written, but where it is
+    `sealed`.
+    """
 
     def prepare(folder: Path, seed: int) -> Callable[[], object]:
         own, valid = _files(1 + seed % 2, writes, chunk_frames, bodies=bodies)
@@ -172,7 +179,9 @@ def parts_of(writes: int, *, sealed: bool, bodies: bool = False, chunk_frames: i
             if "bodies-0.safetensors" in valid:
                 known = SubjectShapes.empty("body")
                 kept_offsets(kept, setup, detections, times, Notebook())
-                made = replace(made, bodies=fit_everybody(made.rows_of, made.person, list, kept, known))
+                made = replace(
+                    made, bodies=fit_everybody(made.rows_of, made.person, list, kept, known)
+                )
             return made.reconstruction()
 
         expected = result()
@@ -181,7 +190,9 @@ def parts_of(writes: int, *, sealed: bool, bodies: bool = False, chunk_frames: i
             found = result()
             check_result(found)
             for name in () if sealed else ("joints", "transl"):
-                if not np.array_equal(getattr(found, name), getattr(expected, name), equal_nan=True):
+                if not np.array_equal(
+                    getattr(found, name), getattr(expected, name), equal_nan=True
+                ):
                     raise AssertionError(f"{name} are others than were written")
 
         return read
@@ -196,7 +207,9 @@ def check_result(people: Reconstruction) -> None:
 
 
 def seal(kept: InFolder, valid: dict[str, bytes]) -> None:
-    """Give changed sets, if they can be read, the digests that they would have, had the run written them."""
+    """Give changed sets, if they can be read, the digests that they would have, had the run written
+    them.
+    """
     for name, content in valid.items():
         file = kept.folder / name
         if file.suffix != ".safetensors" or file.read_bytes() == content:
@@ -228,8 +241,14 @@ def known_people(folder: Path, seed: int) -> Callable[[], object]:
             # As by somebody who knows how: with the digests of what is there now.
             seal(again, valid)
             if isinstance(about := again.about("known-people"), dict):
-                arrays = {name: again.array("known-people", name) for name in again.keys("known-people")}
-                again.keep("known-people", arrays, about | {"sha256": sha256(file.read_bytes()).hexdigest()})
+                arrays = {
+                    name: again.array("known-people", name) for name in again.keys("known-people")
+                }
+                again.keep(
+                    "known-people",
+                    arrays,
+                    about | {"sha256": sha256(file.read_bytes()).hexdigest()},
+                )
             known = manifest.people_at_start(again, file, lambda: SubjectShapes.load(file, "body"))
             before = SubjectShapes.load(file, "body")
             with naming(again.folder, ANEW):  # as the command does where a run goes on
@@ -243,7 +262,9 @@ def known_people(folder: Path, seed: int) -> Callable[[], object]:
 
 
 def corrected(folder: Path, seed: int) -> Callable[[], object]:
-    """A result that was corrected twice; changed, its corrections are those of what is there now."""
+    """A result that was corrected twice; changed, its corrections are those of what is there
+    now.
+    """
     people = results.people([0, 0, 1, 1, 2, 3], seed)
     replace(people, person=np.array([0, 1, 0, 1, 0, 1])).save(folder)
     correct(folder, Edit(Action.SPLIT, 1, 7, frame=3))
@@ -255,7 +276,9 @@ def corrected(folder: Path, seed: int) -> Callable[[], object]:
         with in_a_copy(folder) as out:
             file = out / CORRECTIONS
             digest = sha256((out / "people.npz").read_bytes()).hexdigest()
-            file.write_bytes(re.sub(rb'"[0-9a-f]{64}"', b'"%s"' % digest.encode(), file.read_bytes()))
+            file.write_bytes(
+                re.sub(rb'"[0-9a-f]{64}"', b'"%s"' % digest.encode(), file.read_bytes())
+            )
             for _ in read_corrections(out):
                 take_back(out)
             correct(out, Edit(Action.DROP, 0))
@@ -265,7 +288,10 @@ def corrected(folder: Path, seed: int) -> Callable[[], object]:
 
 def shapes(seed: int) -> SubjectShapes:
     """Two people's."""
-    betas, information = np.random.default_rng(seed).normal(size=(2, 10)), np.tile(np.eye(10), (2, 1, 1))
+    betas, information = (
+        np.random.default_rng(seed).normal(size=(2, 10)),
+        np.tile(np.eye(10), (2, 1, 1)),
+    )
     return SubjectShapes(np.array(["a", "b"]), betas, information, "body")
 
 
@@ -330,11 +356,16 @@ def check_numbers(file: Path) -> None:
             found = any(word in file.read_bytes().lower() for word in (b"nan", b"inf"))
         case ".npz":
             with np.load(file) as archive:
-                found = any(each.dtype.kind == "f" and not np.isfinite(each).all() for each in archive.values())
+                found = any(
+                    each.dtype.kind == "f" and not np.isfinite(each).all()
+                    for each in archive.values()
+                )
         case ".c3d":
             content = file.read_bytes()
             first = 512 * (int.from_bytes(content[16:18], "little") - 1)
-            found = not np.isfinite(np.frombuffer(content[first : len(content) // 4 * 4], "<f4")).all()
+            found = not np.isfinite(
+                np.frombuffer(content[first : len(content) // 4 * 4], "<f4")
+            ).all()
         case ".glb":
             content = file.read_bytes()
             length = int.from_bytes(content[12:16], "little")
@@ -343,7 +374,9 @@ def check_numbers(file: Path) -> None:
             for each in (each for each in said["accessors"] if each["componentType"] == 5126):
                 view = said["bufferViews"][each["bufferView"]]
                 start = view.get("byteOffset", 0)
-                found |= not np.isfinite(np.frombuffer(data[start : start + view["byteLength"]], "<f4")).all()
+                found |= not np.isfinite(
+                    np.frombuffer(data[start : start + view["byteLength"]], "<f4")
+                ).all()
         case _:
             return
     if found:
@@ -352,7 +385,9 @@ def check_numbers(file: Path) -> None:
 
 @contextmanager
 def in_a_copy(folder: Path, name: str = "") -> Iterator[Path]:
-    """A folder into which that one is copied (as `name`), and beside which nothing may be written."""
+    """A folder into which that one is copied (as `name`), and beside which nothing may be
+    written.
+    """
     with tempfile.TemporaryDirectory() as beside:
         out = Path(beside) / "out"
         shutil.copytree(folder, out / name)

@@ -1,4 +1,6 @@
-"""Networks, photos, MCAP, and lines and states of `live`, whose content is to be changed (`readers.py`)."""
+"""Networks, photos, MCAP, and lines and states of `live`, whose content is to be changed
+(`readers.py`).
+"""
 
 import json
 import os
@@ -35,10 +37,14 @@ def network_file(folder: Path, seed: int) -> Read:
 
 
 def network(folder: Path, seed: int) -> Read:
-    """A convolution, whose weights are in the file, run by OpenCV; beside it the file "canary", not to be read."""
+    """A convolution, whose weights are in the file, run by OpenCV; beside it the file "canary", not
+    to be read.
+    """
     from tests.detection2d.conftest import onnx_file
 
-    onnx_file(folder / "n.onnx", np.random.default_rng(seed).normal(size=(3, 3, 2, 2)).astype(np.float32))
+    onnx_file(
+        folder / "n.onnx", np.random.default_rng(seed).normal(size=(3, 3, 2, 2)).astype(np.float32)
+    )
     if Path("files").is_dir() and not Path("canary").exists():  # the folder of fuzz.py
         os.mkfifo("canary")  # who opens it waits for ever
 
@@ -113,10 +119,15 @@ def mcap(kind: str) -> Prepare:
             messages.append(("/tf", time_s, ros.transform("odom", "base", time_s, turn)))
             messages.append(("/odom", time_s, ros.odometry(time_s, turn, np.eye(6) * 1e-4)))
             way, about = ros.parts(turn)
-            alone = {"header": ros.header("map", time_s), "pose": {"position": way, "orientation": about}}
+            alone = {
+                "header": ros.header("map", time_s),
+                "pose": {"position": way, "orientation": about},
+            }
             messages.append(("/slam", time_s, alone))
         for name in made.rig.names:
-            messages.append(("/tf_static", 0.0, ros.transform("base", f"{name}_optical", 0.0, pose)))
+            messages.append(
+                ("/tf_static", 0.0, ros.transform("base", f"{name}_optical", 0.0, pose))
+            )
         for each in lines(seed):
             head = ros.header(f"{each['camera']}_optical", each["time_s"])
             messages.append(("/detections", each["time_s"], {"header": head} | each))
@@ -155,10 +166,16 @@ def _without_chunks(file: Path) -> bytes:
         for schema, channel, message in make_reader(source).iter_messages():
             assert schema is not None
             if schema.id not in schemas:
-                schemas[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
+                schemas[schema.id] = writer.register_schema(
+                    schema.name, schema.encoding, schema.data
+                )
             if channel.id not in channels:
-                channels[channel.id] = writer.register_channel(channel.topic, "cdr", schemas[schema.id])
-            writer.add_message(channels[channel.id], message.log_time, message.data, message.log_time)
+                channels[channel.id] = writer.register_channel(
+                    channel.topic, "cdr", schemas[schema.id]
+                )
+            writer.add_message(
+                channels[channel.id], message.log_time, message.data, message.log_time
+            )
     writer.finish()
     return stream.getvalue()
 
@@ -202,7 +219,9 @@ def live_state(folder: Path, seed: int) -> Read:
     unpack(folder / "state.npz")
 
     def read() -> None:
-        other = OnlineReconstructor.load(folder / "state.npz", made.rig, workers=1, fitter=NobodyFitter())
+        other = OnlineReconstructor.load(
+            folder / "state.npz", made.rig, workers=1, fitter=NobodyFitter()
+        )
         with other:
             _told(other.people(), "now")
             _push(other, given[-4:])

@@ -1,4 +1,6 @@
-"""Files of every kind, changed: they are read, or refused in one sentence, at once; nothing else."""
+"""Files of every kind, changed: they are read, or refused in one sentence, at once; nothing
+else.
+"""
 
 import random
 import re
@@ -16,7 +18,8 @@ from tests.hostile.trying import Trial
 from tests.marks import slow
 
 FOUND = Path(__file__).parent / "data" / "fuzz"
-"""What `tests/hostile/fuzz.py` found once: folders called after the reader, with the files as they were."""
+"""What `tests/hostile/fuzz.py` found once: folders called after the reader, with the files as they
+were."""
 MOST_S = 5.0
 """No small file may take longer to read; most take a millisecond."""
 

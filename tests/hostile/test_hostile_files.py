@@ -92,7 +92,9 @@ def test_a_file_has_bounds(tmp_path):
         ("digits.toml", "a = 0x" + "f" * 5000),
         ("deep.yml", "a: " + "[" * 100_000),
         ("deep.yml", "a: " + "[" * 500 + "]" * 500),
-        ("lists.yml", "a: &a [1, 1]\n" + "".join(f"{b}: &{b} [*{a}, *{a}]\n" for a, b in pairwise("abcdefghijk"))),
+        ("lists.yml",
+         "a: &a [1, 1]\n" + "".join(f"{b}: &{b} [*{a}, *{a}]\n" for a,
+                                    b in pairwise("abcdefghijk"))),
         ("sixty.yml", "a: " + "1:" * 200_000 + "1"),
         ("twice.yml", "a: 1\na: 2"),
         ("deep.xml", "<a>" * 5000 + "</a>" * 5000),
@@ -123,20 +125,30 @@ def test_a_name_twice_among_many_is_found_at_once(tmp_path):
 
 def test_a_number_too_long_is_named(tmp_path):
     (tmp_path / "a.json").write_text('{"people": [{"x": 1}, {"x": [2, ' + "9" * 30 + "]}]}")
-    assert "people[1].x[1] is a whole number of over 18 digits" in refused(read_json, tmp_path / "a.json")
+    assert "people[1].x[1] is a whole number of over 18 digits" in refused(
+        read_json, tmp_path / "a.json"
+    )
 
 
 def zipped(**changes: object) -> bytes:
-    """An archive with the array `a`; changes of the zip's entry are written into its central directory."""
+    """An archive with the array `a`; changes of the zip's entry are written into its central
+    directory.
+    """
     stream = io.BytesIO()
     np.savez(stream, a=np.arange(9.0))
     content = bytearray(stream.getvalue())
     at = content.rindex(b"PK\x01\x02")
-    for field, (offset, form) in {"flags": (8, "<H"), "method": (10, "<H"), "size": (24, "<I")}.items():
+    for field, (offset, form) in {
+        "flags": (8, "<H"),
+        "method": (10, "<H"),
+        "size": (24, "<I"),
+    }.items():
         if field in changes:
             struct.pack_into(form, content, at + offset, changes[field])
             if field != "size":
-                struct.pack_into(form, content, content.index(b"PK\x03\x04") + offset - 2, changes[field])
+                struct.pack_into(
+                    form, content, content.index(b"PK\x03\x04") + offset - 2, changes[field]
+                )
     return bytes(content)
 
 
@@ -184,7 +196,10 @@ def test_what_nobody_asked_for_takes_no_memory(tmp_path):
                 for start in range(0, count, 2**20):
                     stream.write(bytes(8 * min(2**20, count - start)))
     assert (tmp_path / "a.npz").stat().st_size < 2**20
-    assert in_little_memory("read_npz(Path(sys.argv[1]), ('asked',), 'cure')", tmp_path / "a.npz") == "read\n"
+    assert (
+        in_little_memory("read_npz(Path(sys.argv[1]), ('asked',), 'cure')", tmp_path / "a.npz")
+        == "read\n"
+    )
     said = in_little_memory("read_npz(Path(sys.argv[1]), ('other',), 'cure')", tmp_path / "a.npz")
     assert "512 MiB large" in said
 
@@ -198,7 +213,9 @@ PICKLES = {
     "a long number": b"\x80\x02\x8b\xff\xff\xff\x7f.",
     "another's memory": b"\x80\x02h\x05.",
     "a class that is changed": b"\x80\x02cnumpy\nndarray\n}X\x05\x00\x00\x00stateK\x01sb.",
-    "an object of the system": b"\x80\x02}X\x01\x00\x00\x00acos\nsystem\nX\x02\x00\x00\x00ls\x85Rs.",
+    "an object of the system": (
+        b"\x80\x02}X\x01\x00\x00\x00acos\nsystem\nX\x02\x00\x00\x00ls\x85Rs."
+    ),
     "an instance": b"(ios\nsystem\n.",
     "a name by number": b"\x80\x02\x82\x01.",
     "a name of its own": b"\x80\x02Pabc\n.",
@@ -211,7 +228,9 @@ PICKLES = {
 def test_pickles_take_no_memory(tmp_path):
     for number, content in enumerate(PICKLES.values()):
         (tmp_path / f"{number}.pkl").write_bytes(content)
-    code = "[told for told in map(tell, sorted(Path(sys.argv[1]).iterdir())) if print(told) is None]"
+    code = (
+        "[told for told in map(tell, sorted(Path(sys.argv[1]).iterdir())) if print(told) is None]"
+    )
     tell = (
         "def tell(path):\n    try:\n        read_smpl_file(path)\n"
         "    except InputError as error:\n        return error\n"
@@ -226,7 +245,9 @@ def test_pickles_that_do_harm(tmp_path, name):
     refused(read_smpl_file, tmp_path / "body.pkl")
     # And the next one is read as if there had been none.
     (tmp_path / "good.pkl").write_bytes(pickle.dumps(tiny_body(0), protocol=2))
-    np.testing.assert_array_equal(read_smpl_file(tmp_path / "good.pkl").template, tiny_body(0)["v_template"])
+    np.testing.assert_array_equal(
+        read_smpl_file(tmp_path / "good.pkl").template, tiny_body(0)["v_template"]
+    )
 
 
 @pytest.mark.parametrize(
@@ -234,14 +255,23 @@ def test_pickles_that_do_harm(tmp_path, name):
     [
         (lambda body: {"v_template": 1000 * body["v_template"]}, "high along y: give it in metres"),
         (lambda body: {"v_template": body["v_template"][:, [0, 2, 1]]}, "high along y"),
-        (lambda body: {"J_regressor": 0 * body["J_regressor"]}, "J_regressor has rows that do not sum to 1"),
-        (lambda body: {"keypoint_regressor": 0 * body["keypoint_regressor"]}, "keypoint_regressor has rows"),
+        (
+            lambda body: {"J_regressor": 0 * body["J_regressor"]},
+            "J_regressor has rows that do not sum to 1",
+        ),
+        (
+            lambda body: {"keypoint_regressor": 0 * body["keypoint_regressor"]},
+            "keypoint_regressor has rows",
+        ),
         (
             lambda body: {"J_regressor": body["J_regressor"][[0, 2, 1, *range(3, 24)]]},
             "puts left_hip to the right",
         ),
         (lambda body: {"J_regressor": body["J_regressor"][::-1]}, "J_regressor puts"),
-        (lambda body: {"keypoint_regressor": body["keypoint_regressor"][::-1]}, "keypoint_regressor puts"),
+        (
+            lambda body: {"keypoint_regressor": body["keypoint_regressor"][::-1]},
+            "keypoint_regressor puts",
+        ),
         (lambda body: {"v_template": body["v_template"] * (-1, 1, 1)}, "the body's left is"),
         (lambda body: {"f": np.array([[0, 1, -1]])}, "outside 0"),
     ],
@@ -259,7 +289,10 @@ def test_weights_that_lie(tmp_path):
     path = tmp_path / "weights.safetensors"
     length = struct.unpack("<Q", path.read_bytes()[:8])[0]
     content = path.read_bytes()
-    for old, new in ((b'\\"blocks\\": 1', b'\\"blocks\\":%d' % 9), (b'\\"width\\": 2', b'\\"width\\":%d' % 9)):
+    for old, new in (
+        (b'\\"blocks\\": 1', b'\\"blocks\\":%d' % 9),
+        (b'\\"width\\": 2', b'\\"width\\":%d' % 9),
+    ):
         assert old in content[: length + 8]
         path.write_bytes(content.replace(old, new))
         assert "train" in refused(FitterWeights.load, path)
@@ -283,7 +316,9 @@ def test_weights_that_lie(tmp_path):
 def test_settings_have_bounds(tmp_path, text):
     (tmp_path / "settings.toml").write_text(text)
     said = refused(lambda: read_config(tmp_path / "settings.toml", PipelineConfig))
-    assert ("must be at most" in said or "must be at least 1" in said) and "shapepose-fg config" in said
+    assert (
+        "must be at most" in said or "must be at least 1" in said
+    ) and "shapepose-fg config" in said
 
 
 @pytest.mark.parametrize(
@@ -364,13 +399,17 @@ def test_numbers_by_which_rows_are_chosen_are_numbers(tmp_path, column):
         assert sentence in refused(Reconstruction.open, tmp_path)
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux's device that is always full")
+@pytest.mark.skipif(
+    not Path("/dev/full").exists(), reason="needs Linux's device that is always full"
+)
 @pytest.mark.parametrize(
     ("streams", "code"), [(">/dev/full", 2), *slow((">&-", 0), (">&- 2>&-", 0), ("| true", 1))]
 )
 def test_any_stdout(streams, code):
     command = f"set -o pipefail; {sys.executable} -m shapepose_fg.cli.main --help {streams}"
-    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(
+        ["bash", "-c", command], capture_output=True, text=True, timeout=60, check=False
+    )
     # Whether `true` ends before anything is written is chance.
     assert done.returncode in {code, 0 if streams == "| true" else code}
     assert "Traceback" not in done.stderr and done.stderr.count("\n") <= 1
@@ -390,7 +429,11 @@ def test_a_path_that_the_terminal_cannot_write(tmp_path):
     ]
     command += ["--detections", tmp_path]
     done = subprocess.run(command, capture_output=True, timeout=60, check=False, env=environment)
-    assert done.returncode == 2 and b"there is no such file" in done.stderr and b"Traceback" not in done.stderr
+    assert (
+        done.returncode == 2
+        and b"there is no such file" in done.stderr
+        and b"Traceback" not in done.stderr
+    )
 
 
 @pytest.mark.parametrize("number", ["1e999", "-1e999", "NaN", "Infinity"])
@@ -399,5 +442,9 @@ def test_numbers_in_run_json_that_could_not_be_written_again(tmp_path, number):
     READERS["result"](tmp_path, 0)
     file = tmp_path / "run.json"
     content = json.loads(file.read_text())
-    file.write_text(json.dumps(content | {"more": {"said": [1.0, "ENDLESS"]}}).replace('"ENDLESS"', number))
-    assert 'run.json: "more.said.1" must be a finite number, got' in refused(Reconstruction.open, tmp_path)
+    file.write_text(
+        json.dumps(content | {"more": {"said": [1.0, "ENDLESS"]}}).replace('"ENDLESS"', number)
+    )
+    assert 'run.json: "more.said.1" must be a finite number, got' in refused(
+        Reconstruction.open, tmp_path
+    )

@@ -1,4 +1,6 @@
-"""Runs that are killed from outside, and whose files are spoilt then: the same bytes, or one sentence."""
+"""Runs that are killed from outside, and whose files are spoilt then: the same bytes, or one
+sentence.
+"""
 
 import sys
 
@@ -10,7 +12,9 @@ from tests.hostile.kills import Killing
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="looks for worker processes in /proc")
 def test_killed_and_spoilt_runs_go_on_or_say_why(tmp_path):
-    """A worker and the whole, and the whole with a bit turned; `tests/hostile/fuzz.py --kills 50` does more."""
+    """A worker and the whole, and the whole with a bit turned; `tests/hostile/fuzz.py --kills 50`
+    does more.
+    """
     killing = Killing.of(tmp_path)
     told = [killing.once(number, tmp_path / str(number)) for number in (0, 2, 3)]
     assert [each.endswith("the same bytes") for each in told[:2]] == [True, True]

@@ -49,20 +49,29 @@ def test_a_large_picture_in_a_small_file_is_not_unpacked(tmp_path):
     (tmp_path / "a.png").write_bytes(bomb(13_000))
     (tmp_path / "b.png").write_bytes(bomb(13_000, exif(28)))
     code = (
-        "import sys, resource, PIL.Image\nfrom pathlib import Path\nfrom shapepose_fg.io.lenses import lenses_of\n"
-        "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
-        "for name in ('a.png', 'b.png'):\n"
-        "    try: print(lenses_of(Path('detections'), [name], (16, 12)).cameras[0].K[0, 0])\n"
-        "    except ValueError as error: print(error)\n"
+        "import sys, resource, PIL.Image\nfrom pathlib import Path\nfrom shapepose_fg.io.lenses "
+        "import lenses_of\nbefore = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\nfor name "
+        "in ('a.png', 'b.png'):\n    try: print(lenses_of(Path('detections'), [name], (16, "
+        "12)).cameras[0].K[0, 0])\n    except ValueError as error: print(error)\n"
         "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)\n"
     )
     (tmp_path / "detections" / "a").mkdir(parents=True)
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=60
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=60,
     )
     first, second, kib = done.stdout.splitlines()
-    assert "its EXIF data have no" in first and float(second) > 0 and int(kib) < 100_000 and done.stderr == ""
+    assert (
+        "its EXIF data have no" in first
+        and float(second) > 0
+        and int(kib) < 100_000
+        and done.stderr == ""
+    )
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs a system with pipes in folders")
@@ -85,7 +94,9 @@ def test_pipes_are_not_waited_for(tmp_path):
 def test_damaged_photos_are_refused_or_read(tmp_path, kind):
     name = {"JPEG": "a.jpg", "PNG": "a.png", "TIFF": "a.tif"}[kind]
     Image.new("RGB", (64, 48)).save(tmp_path / name, kind, exif=exif(28))
-    assert degrees(tmp_path, name) == pytest.approx(63.4, abs=0.1)  # 43.27 / 28 of the diagonal, of 4 : 3
+    assert degrees(tmp_path, name) == pytest.approx(
+        63.4, abs=0.1
+    )  # 43.27 / 28 of the diagonal, of 4 : 3
     content, rng, refused = (tmp_path / name).read_bytes(), np.random.default_rng(0), 0
     for _ in range(300):
         changed = bytearray(content[: rng.integers(4, len(content) + 1)])

@@ -1,4 +1,6 @@
-"""Runs that somebody, or the disk, has changed: one sentence, or the same bytes; what was there before stays."""
+"""Runs that somebody, or the disk, has changed: one sentence, or the same bytes; what was there
+before stays.
+"""
 
 import json
 import os
@@ -34,7 +36,9 @@ def task(dance) -> Iterator[Task]:
 
 @pytest.fixture(scope="module")
 def stopped(task, tmp_path_factory) -> Path:
-    """The parts of a run that was stopped when following stood between two windows, in the middle of a stretch."""
+    """The parts of a run that was stopped when following stood between two windows, in the middle
+    of a stretch.
+    """
     folder = tmp_path_factory.mktemp("stopped")
     with pytest.raises(runs.Ended):
         reconstruct_parts(runs.Stopping(folder), task)
@@ -73,7 +77,9 @@ def refused(parts: Path, task: Task) -> str:
 
 
 def test_a_part_that_is_not_as_it_was_written_is_named(parts, task):
-    """As somebody who has safetensors would change it: NaN, a metre aside, another frame to go on from."""
+    """As somebody who has safetensors would change it: NaN, a metre aside, another frame to go on
+    from.
+    """
     for kind, name, change in (
         ("part", "joints", lambda joints: np.full_like(joints, np.nan)),
         ("part", "joints", lambda joints: joints + 1.0),
@@ -122,18 +128,30 @@ def test_parts_that_changed_places_or_are_of_another_run_are_refused(parts, task
         ("followed", "at", lambda at: at.astype(float), "at must hold int64"),
         ("followed", "state.mean", lambda mean: mean[..., :4], "must be"),
         ("followed", "state.mean", lambda mean: mean * np.nan, "must be finite"),
-        ("followed", "state.covariance", lambda covariance: covariance * 1e200, "covariance must be at most"),
+        (
+            "followed",
+            "state.covariance",
+            lambda covariance: covariance * 1e200,
+            "covariance must be at most",
+        ),
         ("followed", "state.ids", lambda ids: ids * 0, "different numbers"),
         ("followed", "state.ids", lambda _: None, "state.ids"),
         ("followed", "state.numbers", lambda numbers: numbers - 10, "must not be negative"),
-        ("followed", "state.rows", lambda rows: rows[1:], "it goes on at frame|rows are not of its frames"),
+        (
+            "followed",
+            "state.rows",
+            lambda rows: rows[1:],
+            "it goes on at frame|rows are not of its frames",
+        ),
         ("followed", "rows.candidate", lambda candidate: candidate + 10**6, "of other detections"),
         ("followed", "rows.candidate", lambda candidate: candidate[:, ::-1], "of other detections"),
         ("followed", "rows.track", lambda _: None, "rows.track"),
         ("keypoint", "xyz_m", lambda xyz: xyz + 10, "none longer than"),
     ],
 )
-def test_what_has_the_right_digests_and_makes_no_sense_is_refused(parts, task, kind, name, change, sentence):
+def test_what_has_the_right_digests_and_makes_no_sense_is_refused(
+    parts, task, kind, name, change, sentence
+):
     file, kept = first(parts, kind), InFolder(parts)
     arrays, said = contents(file)
     about = json.loads(said["about"])
@@ -209,10 +227,14 @@ def test_a_result_that_could_not_be_read_again_replaces_nothing(dance, tmp_path)
     joints[np.flatnonzero(people.status == Status.OK)[0]] = np.nan
     for column, value in (("joints", joints), ("transl", people.transl + 1e7)):
         changed = Reconstruction(**{**vars(people), column: value})
-        with pytest.raises(InputError, match=rf"people\.npz: {column} must be .*the previous files are unchanged"):
+        with pytest.raises(
+            InputError, match=rf"people\.npz: {column} must be .*the previous files are unchanged"
+        ):
             changed.save(tmp_path)
         assert before == {file.name: file.read_bytes() for file in tmp_path.iterdir()}
-        np.savez(tmp_path / "x.npz", **{name: each.array() for name, each in changed.columns().items()})
+        np.savez(
+            tmp_path / "x.npz", **{name: each.array() for name, each in changed.columns().items()}
+        )
         with pytest.raises(InputError, match=f"{column} must be"):
             Reconstruction.load(tmp_path / "x.npz")
         (tmp_path / "x.npz").unlink()

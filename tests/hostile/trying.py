@@ -32,11 +32,15 @@ _CHANGES = {
     "os.mkdir": ((0, 2),),
     "os.rmdir": ((0, 1),),
 }
-"""What Python tells of files that are changed: which arguments are paths, and the folders that these are in."""
+"""What Python tells of files that are changed: which arguments are paths, and the folders that
+these are in."""
 _KERNELS = os.path.realpath(os.environ.get("NUMBA_CACHE_DIR") or user_cache("kernels"))
 """Where compiled functions are kept, which are part of the program."""
 _READABLE = (
-    *{os.path.realpath(each) for each in (sys.prefix, sys.base_prefix, Path(__file__).parents[2], _KERNELS)},
+    *{
+        os.path.realpath(each)
+        for each in (sys.prefix, sys.base_prefix, Path(__file__).parents[2], _KERNELS)
+    },
     *("/proc", "/sys", "/dev"),
 )
 """Where files may be read besides: this project and what it is made of."""
@@ -63,7 +67,8 @@ class Trial:
     def run(self, number: int, content: bytes) -> bool:
         """Whether the files are refused, in one sentence, when a file has this content.
 
-        AssertionError where more is said, or something is written elsewhere; whatever else the reader raises.
+        AssertionError where more is said, or something is written elsewhere; whatever else the
+        reader raises.
         """
         file = self.files[number]
         file.write_bytes(content)
@@ -84,8 +89,8 @@ class Trial:
 
 @contextmanager
 def only_in(*folders: str | Path) -> Iterator[None]:
-    """What Python itself changes outside of these folders during the block, or reads outside of them and of the
-    program, is an AssertionError.
+    """What Python itself changes outside of these folders during the block, or reads outside of
+    them and of the program, is an AssertionError.
     """
     if len(_allowed) == 0 and not _watching:
         sys.addaudithook(_watch)
@@ -101,7 +106,9 @@ _watching: list[bool] = []
 
 
 def _watch(event: str, told: tuple[Any, ...]) -> None:
-    """What Python calls before files are opened or changed; it cannot be taken back, only sent to sleep."""
+    """What Python calls before files are opened or changed; it cannot be taken back, only sent to
+    sleep.
+    """
     if len(_allowed) == 0:
         return
     paths: list[tuple[Any, Any]] = []
@@ -145,8 +152,8 @@ class Tally:
 def tried(trial: Trial, seed: str, numbers: range) -> Tally:
     """What comes of changed files, each by its number.
 
-    What breaks the reader, one of each place in the code, is left in the working folder. A case that hangs ends
-    this process, and one that takes over `CASE_MB` is a fault.
+    What breaks the reader, one of each place in the code, is left in the working folder. A case
+    that hangs ends this process, and one that takes over `CASE_MB` is a fault.
     """
     tally, names = Tally(), [str(file.relative_to(trial.folder)) for file in trial.files]
     trial.run(0, trial.valid[0])  # what is loaded once is loaded now
@@ -185,7 +192,9 @@ def reader(name: str) -> Prepare:
 
 
 def guided(name: str, seed: int, seconds: int) -> None:
-    """Try files changed for a reader, guided by which lines they reach, until one breaks or the time is up."""
+    """Try files changed for a reader, guided by which lines they reach, until one breaks or the
+    time is up.
+    """
     try:
         atheris: Any = importlib.import_module("atheris")
     except ImportError:
@@ -212,7 +221,12 @@ def guided(name: str, seed: int, seconds: int) -> None:
         return (bytes([index]) + mutated(content, rng))[:most]
 
     case(bytes([0]) + trial.valid[0])  # what is loaded once is loaded now
-    options = [f"-max_total_time={seconds}", f"-timeout={CASE_S}", f"-seed={seed + 1}", "-print_final_stats=1"]
+    options = [
+        f"-max_total_time={seconds}",
+        f"-timeout={CASE_S}",
+        f"-seed={seed + 1}",
+        "-print_final_stats=1",
+    ]
     options += [f"-rss_limit_mb={_used_mb() + CASE_MB}", f"-malloc_limit_mb={CASE_MB}"]
     options += [f"-max_len={max(map(len, trial.valid)) + 20_000}", str(corpus)]
     atheris.Setup([sys.argv[0], *options], case, custom_mutator=change)

@@ -28,7 +28,8 @@ class TextRecording:
     def __init__(self, seed: int, counts: list[dict[int, int]]) -> None:
         rng = np.random.default_rng(seed)
         self.joints = [
-            [rng.uniform(0.1, 0.9, size=(3, count.get(joint, 0))) for joint in range(25)] for count in counts
+            [rng.uniform(0.1, 0.9, size=(3, count.get(joint, 0))) for joint in range(25)]
+            for count in counts
         ]
         self.affinities = []
         for frame in self.joints:
@@ -49,7 +50,8 @@ class TextRecording:
         return "\n".join(lines) + "\n"
 
 
-# Frame 0: two hips, three necks, a wrist. Frame 1: nobody. Frame 2: one nose and two right hips and knees.
+# Frame 0: two hips, three necks, a wrist. Frame 1: nobody. Frame 2: one nose and two right hips and
+# knees.
 COUNTS = [{8: 2, 1: 3, 4: 1}, {}, {0: 1, 9: 2, 10: 2}]
 
 
@@ -84,8 +86,15 @@ def openpose_folder(tmp_path: Path) -> Path:
     for name in ("left", "right"):
         folder = tmp_path / "openpose" / name
         folder.mkdir(parents=True)
-        frames = [[keypoints(0, [0, 1, 8, 9]), keypoints(1, [1, 8, 12, 13])], [], [keypoints(2, list(range(25)))]]
+        frames = [
+            [keypoints(0, [0, 1, 8, 9]), keypoints(1, [1, 8, 12, 13])],
+            [],
+            [keypoints(2, list(range(25)))],
+        ]
         for number, people in enumerate(frames, 7):
-            content = {"version": 1.3, "people": [{"person_id": [-1], "pose_keypoints_2d": p} for p in people]}
+            content = {
+                "version": 1.3,
+                "people": [{"person_id": [-1], "pose_keypoints_2d": p} for p in people],
+            }
             (folder / f"video_{number:012d}_keypoints.json").write_text(json.dumps(content))
     return tmp_path / "openpose"

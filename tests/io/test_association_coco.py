@@ -1,4 +1,6 @@
-"""4D Association's text with COCO's 18 joints: middle hips are made of candidates that nobody has grouped."""
+"""4D Association's text with COCO's 18 joints: middle hips are made of candidates that nobody has
+grouped.
+"""
 
 import numpy as np
 import pytest
@@ -21,7 +23,12 @@ def text(rig, frames: list[tuple[list, list]]) -> str:
         table = np.array(candidates, dtype=float).reshape(-1, 4)
         pairs = np.array(links, dtype=float).reshape(-1, 3)
         lines += association_lines(
-            KIND, table[:, 0].astype(int), table[:, 1:3] / size, table[:, 3], pairs[:, :2].astype(int), pairs[:, 2]
+            KIND,
+            table[:, 0].astype(int),
+            table[:, 1:3] / size,
+            table[:, 3],
+            pairs[:, :2].astype(int),
+            pairs[:, 2],
         )
     return "\n".join(lines) + "\n"
 
@@ -37,7 +44,9 @@ def read(five_cameras, tmp_path):
 
 
 def test_hips_that_one_neck_links_have_a_middle(read):
-    """Two people side by side; the right hip of the first is linked weakly to the other's neck too."""
+    """Two people side by side; the right hip of the first is linked weakly to the other's neck
+    too.
+    """
     candidates = [
         (NECK, 100, 50, 0.9), (NECK, 200, 50, 0.8), (RHIP, 90, 150, 0.7), (RHIP, 190, 150, 0.6),
         (LHIP, 110, 150, 0.5), (LHIP, 210, 150, 0.9), (COCO_18.index("Nose"), 100, 20, 0.9),
@@ -51,7 +60,8 @@ def test_hips_that_one_neck_links_have_a_middle(read):
     np.testing.assert_allclose(first.xy[middles], [[100, 150], [200, 150]], atol=1e-3)
     np.testing.assert_allclose(first.confidence[middles], [0.5, 0.6], atol=1e-6)
     ends = [
-        (COCO_18.joints[joint], round(x)) for joint, x in zip(first.joint.tolist(), first.xy[:, 0], strict=True)
+        (COCO_18.joints[joint], round(x))
+        for joint, x in zip(first.joint.tolist(), first.xy[:, 0], strict=True)
     ]
     pairs = zip(first.pairs.tolist(), first.affinity.tolist(), strict=True)
     links = {(*ends[one], *ends[other]): affinity for (one, other), affinity in pairs}
@@ -66,7 +76,9 @@ def test_hips_that_one_neck_links_have_a_middle(read):
 
 
 def test_random_candidates_come_back_in_order(read, five_cameras):
-    """Every pair that a limb of the skeleton joins is kept, of many frames; order as `Detections` has it."""
+    """Every pair that a limb of the skeleton joins is kept, of many frames; order as `Detections`
+    has it.
+    """
     rng = np.random.default_rng(0)
     frames = []
     for _ in range(60):
@@ -94,8 +106,12 @@ def test_random_candidates_come_back_in_order(read, five_cameras):
         ends = [tuple(pair) for pair in found.joint[found.pairs].tolist()]
         assert set(ends) <= limbs
         whole = given[found.pairs].all(axis=1) if len(found.pairs) else np.zeros(0, bool)
-        kept = [link for link in links if tuple(int(candidates[end][0]) for end in link[:2]) in limbs]
-        np.testing.assert_allclose(np.sort(found.affinity[whole]), np.sort([link[2] for link in kept]), atol=1e-5)
+        kept = [
+            link for link in links if tuple(int(candidates[end][0]) for end in link[:2]) in limbs
+        ]
+        np.testing.assert_allclose(
+            np.sort(found.affinity[whole]), np.sort([link[2] for link in kept]), atol=1e-5
+        )
         middles = np.flatnonzero(~given)
         made += len(middles)
         for end in (RHIP, LHIP):  # each hip makes one middle at most
@@ -107,7 +123,9 @@ def test_random_candidates_come_back_in_order(read, five_cameras):
 def test_cameras_of_two_skeletons_are_refused(read, five_cameras, tmp_path):
     read([([], [])])
     (tmp_path / f"{five_cameras.names[1]}.txt").write_text("4 1\n" + "0\n" * 25)
-    with pytest.raises(InputError, match=r"has the joints of BODY_25, .* those of COCO_18; give the"):
+    with pytest.raises(
+        InputError, match=r"has the joints of BODY_25, .* those of COCO_18; give the"
+    ):
         read_detections(tmp_path, five_cameras)
     for name in five_cameras.names:
         (tmp_path / f"{name}.txt").write_text("3 1\n" + "0\n" * 18)
@@ -118,5 +136,7 @@ def test_cameras_of_two_skeletons_are_refused(read, five_cameras, tmp_path):
 def test_a_file_that_ends_too_early_is_named(read, five_cameras, tmp_path):
     read([([], [])])
     (tmp_path / f"{five_cameras.names[0]}.txt").write_text("3 1\n" + "0\n" * 17)
-    with pytest.raises(InputError, match="the file ends in frame 0 of 1, where the number of candidates of LEar"):
+    with pytest.raises(
+        InputError, match="the file ends in frame 0 of 1, where the number of candidates of LEar"
+    ):
         read_detections(tmp_path, five_cameras)

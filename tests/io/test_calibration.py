@@ -1,4 +1,6 @@
-"""Calibration files: what is read is what was written, and each bad file gives the sentence promised."""
+"""Calibration files: what is read is what was written, and each bad file gives the sentence
+promised.
+"""
 
 import copy
 import json
@@ -20,7 +22,10 @@ K = [1000.0, 0, 960, 0, 1000, 540, 0, 0, 1]
 
 def association() -> dict:
     cameras = {"a": LOOKS_ALONG_Y, "b": LOOKS_ALONG_MINUS_X}
-    return {name: {"K": list(K), "RT": list(RT), "imgSize": [1920, 1080]} for name, RT in cameras.items()}
+    return {
+        name: {"K": list(K), "RT": list(RT), "imgSize": [1920, 1080]}
+        for name, RT in cameras.items()
+    }
 
 
 def own() -> dict:
@@ -136,20 +141,35 @@ BAD_ASSOCIATION = [
     (("a", "K", 4), True, 'camera "a": K[4] must be a number, got true'),
     (("a", "K", 0), -1000.0, "camera a: K must have positive focal lengths"),
     (("a", "K", 8), 2.0, "camera a: K must have positive focal lengths and a last row 0 0 1"),
-    (("a", "RT", 3), float("nan"), 'camera "a": RT[3] must be a finite number, got NaN; write the 3x4'),
+    (
+        ("a", "RT", 3),
+        float("nan"),
+        'camera "a": RT[3] must be a finite number, got NaN; write the 3x4',
+    ),
     (("a", "RT", 0), float("inf"), 'camera "a": RT[0] must be a finite number, got Infinity'),
     (
         ("a", "RT", 0),
         1.1,
-        'camera "a": the rotation of RT is not orthonormal (R Rᵀ is off by 0.21); give a pure rotation',
+        (
+            'camera "a": the rotation of RT is not orthonormal (R Rᵀ is off by 0.21); give a pure '
+            "rotation"
+        ),
     ),
     (
         ("a", "RT"),
         MIRRORED,
         'camera "a": the rotation of RT is a reflection (determinant -1); use a right-handed world',
     ),
-    (("a", "imgSize"), [1920], 'camera "a": imgSize must hold 2 numbers, got 1; write width and height'),
-    (("a", "imgSize", 0), 0, "camera a: image_size must be positive and at most 1000000, got (0, 1080)"),
+    (
+        ("a", "imgSize"),
+        [1920],
+        'camera "a": imgSize must hold 2 numbers, got 1; write width and height',
+    ),
+    (
+        ("a", "imgSize", 0),
+        0,
+        "camera a: image_size must be positive and at most 1000000, got (0, 1080)",
+    ),
     (
         ("a", "distCoeff"),
         [0.1] * 8,
@@ -165,8 +185,16 @@ def test_bad_association(tmp_path, where, value, sentence):
 
 
 BAD_OWN = [
-    (("up",), "remove", 'up is missing; write the axis that points up, such as "up": "z", or pass --up z'),
-    (("unit",), "remove", 'unit is missing; write the unit of lengths, such as "unit": "m", or pass --unit m'),
+    (
+        ("up",),
+        "remove",
+        'up is missing; write the axis that points up, such as "up": "z", or pass --up z',
+    ),
+    (
+        ("unit",),
+        "remove",
+        'unit is missing; write the unit of lengths, such as "unit": "m", or pass --unit m',
+    ),
     (("unit",), "inch", "unit must be 'm', 'cm' or 'mm', got text 'inch'"),
     (("format",), "shapepose-fg rig 2", 'format must be "shapepose-fg rig 1", got text'),
     (("cameras", 1, "name"), "a", "camera names must differ, got ['a', 'a']"),
@@ -195,8 +223,14 @@ BAD_TEXT = [
     (" \n", "the file is empty"),
     (json.dumps(association(), indent=1)[:300], "is not JSON: "),
     ('{"a": {"K": [1,\n 2,, 3]}}', "line 2 column 4 is not JSON"),
-    ('{"a": {"K": []}, "a": {"K": []}}', 'key "a" occurs twice in one object; give each its own name'),
-    ("[1, 2]", "recognised as JSON (a list of 2), but this is not a known calibration format; give one of"),
+    (
+        '{"a": {"K": []}, "a": {"K": []}}',
+        'key "a" occurs twice in one object; give each its own name',
+    ),
+    (
+        "[1, 2]",
+        "recognised as JSON (a list of 2), but this is not a known calibration format; give one of",
+    ),
     ("3", "this is not a known calibration format"),
     ("{}", "this is not a known calibration format"),
     ('{"a": {"fx": 3}}', "this is not a known calibration format"),
@@ -215,7 +249,11 @@ def test_cut_file_names_its_last_line(tmp_path):
     whole = json.dumps(association() | {"yes": True, "no": -1.5e-7, "none": None}, indent=1)
     for end in (*range(290, 310), *range(len(whole) - 50, len(whole) - 1)):
         text = whole[:end].rstrip()
-        refuses(write(tmp_path, text), f"line {len(text.splitlines())} column", "the file ends too early")
+        refuses(
+            write(tmp_path, text),
+            f"line {len(text.splitlines())} column",
+            "the file ends too early",
+        )
 
 
 def test_missing_file_folder_and_pictures(tmp_path):

@@ -1,4 +1,6 @@
-"""Files that resemble each other are told apart by their own marks, and what a file does not say is asked for."""
+"""Files that resemble each other are told apart by their own marks, and what a file does not say is
+asked for.
+"""
 
 from pathlib import Path
 
@@ -54,12 +56,24 @@ def missing(path: Path, **how) -> set[str]:
         ({}, CALISCOPE, {"up"}),  # and a newer one
         ({}, "[metadata]\n", {"unit", "up"}),  # AniPose
         ({"after": "exposure = 1\n"}, "[metadata]\nadjusted = true\nerror = 0.7\n", {"unit", "up"}),
-        ({"before": "fisheye = false\n", "name": "left-{n}"}, CALISCOPE, {"unit", "up"}),  # nobody's
+        (
+            {"before": "fisheye = false\n", "name": "left-{n}"},
+            CALISCOPE,
+            {"unit", "up"},
+        ),  # nobody's
         ({"after": "port = {n}\n"}, "", {"up"}),  # Caliscope's own
         ({}, "[metadata]\ncharuco_square_size = 58.0\n", {"unit", "up"}),  # FreeMoCap 1
         ({}, "[metadata]\ncharuco_square_size = 58.0\ngroundplane_calibration = true\n", {"unit"}),
-        ({}, "[metadata]\ngroundplane_applied = true\n[metadata.board]\nsquare_length_mm = 58.0\n", set()),
-        ({}, "[metadata]\ngroundplane_applied = false\n[metadata.board]\nsquare_length_mm = 58.0\n", {"up"}),
+        (
+            {},
+            "[metadata]\ngroundplane_applied = true\n[metadata.board]\nsquare_length_mm = 58.0\n",
+            set(),
+        ),
+        (
+            {},
+            "[metadata]\ngroundplane_applied = false\n[metadata.board]\nsquare_length_mm = 58.0\n",
+            {"up"},
+        ),
     ],
 )
 def test_whose_toml_it_is(tmp_path, parts, metadata, asked):
@@ -72,12 +86,20 @@ def test_whose_toml_it_is(tmp_path, parts, metadata, asked):
 def test_cameras_without_a_pose_are_named(tmp_path):
     file = toml(tmp_path, CALISCOPE, **POSE2SIM)
     extra = CAMERA.format(n=2, **{k: v.format(n=2) for k, v in (PLAIN | POSE2SIM).items()})
-    lines = [line for line in extra.splitlines() if not line.startswith(("rotation", "translation"))]
+    lines = [
+        line for line in extra.splitlines() if not line.startswith(("rotation", "translation"))
+    ]
     file.write_text("\n".join(lines) + "\n" + file.read_text())
     rig = read_rig(file)
-    assert rig.names == ("cam_0", "cam_1") and rig.notes == (f"{file}: camera cam_2 is left out: it has no pose",)
+    assert rig.names == ("cam_0", "cam_1") and rig.notes == (
+        f"{file}: camera cam_2 is left out: it has no pose",
+    )
     form, there = write_like(file, rig, tmp_path / "new.toml")
-    assert form == "Pose2Sim's TOML" and read_rig(there).names == rig.names and "[cam_2]" in there.read_text()
+    assert (
+        form == "Pose2Sim's TOML"
+        and read_rig(there).names == rig.names
+        and "[cam_2]" in there.read_text()
+    )
 
 
 def test_freemocap_and_caliscope_of_several_versions(shared_cases):
@@ -91,7 +113,9 @@ def test_freemocap_and_caliscope_of_several_versions(shared_cases):
 
 def test_a_list_of_cameras_that_is_not_cmu_s(tmp_path):
     """K, R and t are common names: only CMU's own keys say centimetres and y down."""
-    one = '{"name": "%s", "resolution": [1280, 720], "K": [[900, 0, 640], [0, 900, 360], [0, 0, 1]], '
+    one = (
+        '{"name": "%s", "resolution": [1280, 720], "K": [[900, 0, 640], [0, 900, 360], [0, 0, 1]], '
+    )
     pose = '"distCoef": [], '
     pose += '"R": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "t": [[0], [0], [0]]%s}'
     file = tmp_path / "cameras.json"
@@ -115,7 +139,10 @@ def test_qualisys_cases(shared_cases):
 
 def stereo(folder: Path, keys: dict[str, str], together: bool) -> Path:
     """What OpenCV's stereo_calib writes, under the names `keys` of M1, D1, M2, D2, R and T."""
-    M, D = np.array([[500.0, 0, 320], [0, 510, 240], [0, 0, 1]]), np.array([[-0.28, 0.03, 0.001, 0, 0.09]])
+    M, D = (
+        np.array([[500.0, 0, 320], [0, 510, 240], [0, 0, 1]]),
+        np.array([[-0.28, 0.03, 0.001, 0, 0.09]]),
+    )
     R, T = np.asarray(cv2.Rodrigues(np.array([0.0, 0.2, 0.0]))[0]), np.array([[-300.0], [10], [5]])
     values = {"M1": M, "D1": D, "M2": M + np.diag([5.0, 5, 0]), "D2": D, "R": R, "T": T}
     files = {"intrinsics.yml": ("M1", "D1", "M2", "D2"), "extrinsics.yml": ("R", "T")}
@@ -134,7 +161,12 @@ def stereo(folder: Path, keys: dict[str, str], together: bool) -> Path:
         {},
         {"M1": "K1", "M2": "K2"},
         {"M1": "cameraMatrix1", "D1": "distCoeffs1", "M2": "cameraMatrix2", "D2": "distCoeffs2"},
-        {"M1": "camera_matrix_left", "D1": "dist_left", "M2": "camera_matrix_right", "D2": "dist_right"},
+        {
+            "M1": "camera_matrix_left",
+            "D1": "dist_left",
+            "M2": "camera_matrix_right",
+            "D2": "dist_right",
+        },
         {"M1": "left_K", "D1": "left_D", "M2": "right_K", "D2": "right_D"},
     ],
 )
@@ -155,7 +187,9 @@ def test_opencv_s_stereo_folder(shared_cases, tmp_path):
     np.testing.assert_allclose(rig.centres[1], [3.3, 0, 0], atol=1e-12)
     for name, other in (("intrinsics.yml", "extrinsics.yml"),) * 2:
         (tmp_path / name).write_text((shared_cases / "opencv_stereo_folder" / name).read_text())
-        with pytest.raises(InputError, match=rf"only one file of OpenCV's stereo calibration; put {other}"):
+        with pytest.raises(
+            InputError, match=rf"only one file of OpenCV's stereo calibration; put {other}"
+        ):
             read_rig(tmp_path / name)
 
 
@@ -178,10 +212,16 @@ def rig_file(tmp_path) -> tuple[Rig, Path]:
 def test_some_of_the_cameras(rig_file):
     rig, file = rig_file
     first, second, *others = rig.names
-    assert read_rig(file, cameras=[second, first]).names == (first, second) == rig.only([second, first]).names
+    assert (
+        read_rig(file, cameras=[second, first]).names
+        == (first, second)
+        == rig.only([second, first]).names
+    )
     assert read_rig(file, without=[first]).names == rig.without([first]).names == (second, *others)
     for call in (lambda: read_rig(file, cameras=["nobody"]), lambda: rig.without(["nobody"])):
-        with pytest.raises(ValueError, match=rf"there is no camera 'nobody'; there are {first} {second}"):
+        with pytest.raises(
+            ValueError, match=rf"there is no camera 'nobody'; there are {first} {second}"
+        ):
             call()
     with pytest.raises(InputError, match="no camera is selected"):
         read_rig(file, without=rig.names)
@@ -197,7 +237,9 @@ def test_a_camera_that_is_not_wanted_may_be_faulty(rig_file):
 
 
 def test_a_file_is_never_written_under_another_format_s_name(tmp_path, rig_file):
-    """A part of the cameras cannot be written as QTM does: then our own format gets its own name."""
+    """A part of the cameras cannot be written as QTM does: then our own format gets its own
+    name.
+    """
     rig, file = rig_file
     with pytest.raises(InputError, match=r"new\.qca\.txt: cameras read as rig file .*FILE\.json"):
         write_like(file, rig, tmp_path / "new.qca.txt")

@@ -1,4 +1,6 @@
-"""Calibrations of other programs: real files, files written here in their way, and a malformed one of each."""
+"""Calibrations of other programs: real files, files written here in their way, and a malformed one
+of each.
+"""
 
 import json
 import pickle
@@ -18,7 +20,9 @@ NAMES = ("alpha", "beta", "gamma")
 FIVE = (-0.2, 0.05, 0.001, -0.002, 0.01)
 
 
-def camera(name: str, turn: tuple[float, float, float], distortion=FIVE, lens="perspective") -> Camera:
+def camera(
+    name: str, turn: tuple[float, float, float], distortion=FIVE, lens="perspective"
+) -> Camera:
     R, _ = cv2.Rodrigues(np.array(turn))
     K = np.array([[900.5, 0, 640.25], [0, 905.0, 360.5], [0, 0, 1]])
     return Camera.from_camera_from_world(
@@ -70,8 +74,10 @@ def rotation_vector_tables(unit: float, extra: str, metadata: str) -> str:
     text = ""
     for number, each in enumerate(TRUTH.cameras):
         text += (
-            f'[cam_{number}]\nname = "{each.name}"\nsize = [ 1280, 720,]\nmatrix = {each.K.tolist()}\n'
-            f"distortions = {list(FIVE)}\nrotation = {cv2.Rodrigues(each.cTw[:, :3])[0].ravel().tolist()}\n"
+            f'[cam_{number}]\nname = "{each.name}"\nsize = [ 1280, 720,]\n'
+            f"matrix = {each.K.tolist()}\n"
+            f"distortions = {list(FIVE)}\n"
+            f"rotation = {cv2.Rodrigues(each.cTw[:, :3])[0].ravel().tolist()}\n"
             f"translation = {(each.cTw[:, 3] / unit).tolist()}\n{extra}\n"
         )
     return text + f"[metadata]\n{metadata}\n"
@@ -83,7 +89,10 @@ def pose2sim(folder: Path) -> Path:
 
 
 def anipose(folder: Path) -> Path:
-    return written(folder / "calibration.toml", rotation_vector_tables(1e-3, "", "adjusted = false\nerror = 0.4"))
+    return written(
+        folder / "calibration.toml",
+        rotation_vector_tables(1e-3, "", "adjusted = false\nerror = 0.4"),
+    )
 
 
 def freemocap(folder: Path) -> Path:
@@ -101,11 +110,12 @@ def qualisys(folder: Path) -> Path:
         # The recorded part of the sensor begins 8 pixels from the left and 4 from the top.
         u, v = 64 * (each.K[0, 2] + 8), 64 * (each.K[1, 2] + 4)
         rows += (
-            f'<camera active="1" model="Miqus Video" serial="{each.name}">'
-            f'<fov_video left="8" top="4" right="1287" bottom="723"/><transform {turn} x="{x}" y="{y}" z="{z}"/>'
-            f'<intrinsic focalLengthU="{64 * each.K[0, 0]}" focalLengthV="{64 * each.K[1, 1]}" centerPointU="{u}"'
-            f' centerPointV="{v}" radialDistortion1="{k1}" radialDistortion2="{k2}" radialDistortion3="{k3}"'
-            f' tangentalDistortion1="{p1}" tangentalDistortion2="{p2}"/></camera>\n'
+            f'<camera active="1" model="Miqus Video" serial="{each.name}"><fov_video left="8" '
+            f'top="4" right="1287" bottom="723"/><transform {turn} x="{x}" y="{y}" z="{z}"/>'
+            f'<intrinsic focalLengthU="{64 * each.K[0, 0]}" focalLengthV="{64 * each.K[1, 1]}" '
+            f'centerPointU="{u}" centerPointV="{v}" radialDistortion1="{k1}" '
+            f'radialDistortion2="{k2}" radialDistortion3="{k3}" tangentalDistortion1="{p1}" '
+            f'tangentalDistortion2="{p2}"/></camera>\n'
         )
     rows += '<camera active="1" model="Miqus M3" serial="marker"/>'
     return written(
@@ -129,17 +139,24 @@ def vicon(folder: Path) -> Path:
         aspect = float(each.K[0, 0] / each.K[1, 1])
         rows += (
             f'<Camera DEVICEID="{each.name}" SENSOR_SIZE="1280 720" PIXEL_ASPECT_RATIO="{aspect}"'
-            f' TYPE="VideoInputDevice:Blackmagic"><KeyFrames><KeyFrame FOCAL_LENGTH="{each.K[0, 0]}"'
-            f' ORIENTATION="{" ".join(map(repr, quaternion(each.cTw[:, :3])))}" POSITION="{x} {y} {z}"'
-            f' PRINCIPAL_POINT="{each.K[0, 2]} {each.K[1, 2]}" VICON_RADIAL="0 0"'
-            f' VICON_RADIAL2="ViconRadial2 640 360 -0.2 0.05 0.01"/></KeyFrames></Camera>\n'
+            ' TYPE="VideoInputDevice:Blackmagic"><KeyFrames><KeyFrame '
+            f'FOCAL_LENGTH="{each.K[0, 0]}" '
+            f'ORIENTATION="{" ".join(map(repr, quaternion(each.cTw[:, :3])))}" POSITION="{x} {y} '
+            f'{z}" PRINCIPAL_POINT="{each.K[0, 2]} {each.K[1, 2]}" VICON_RADIAL="0 0" '
+            'VICON_RADIAL2="ViconRadial2 640 360 -0.2 0.05 0.01"/></KeyFrames></Camera>\n'
         )
     rows += '<Camera DEVICEID="marker" SENSOR_SIZE="9 9" TYPE="Vero"/>'
-    return written(folder / "take.xcp", f'<?xml version="1.0"?>\n<Cameras VERSION="1.4">{rows}</Cameras>\n')
+    return written(
+        folder / "take.xcp", f'<?xml version="1.0"?>\n<Cameras VERSION="1.4">{rows}</Cameras>\n'
+    )
 
 
 RADIAL = Rig(
-    tuple(camera(name, turn, (-0.2, 0.05, 0, 0, 0.01)) for name, turn in zip(NAMES, TURNS, strict=True)), "z"
+    tuple(
+        camera(name, turn, (-0.2, 0.05, 0, 0, 0.01))
+        for name, turn in zip(NAMES, TURNS, strict=True)
+    ),
+    "z",
 )
 
 
@@ -158,7 +175,9 @@ def panoptic(folder: Path) -> Path:
         }
         for number, each in enumerate(TRUTH.cameras)
     ]
-    return written(folder / "calibration_160422.json", json.dumps({"calibDataSource": "x", "cameras": cameras}))
+    return written(
+        folder / "calibration_160422.json", json.dumps({"calibDataSource": "x", "cameras": cameras})
+    )
 
 
 def voxelpose(folder: Path) -> Path:
@@ -167,7 +186,13 @@ def voxelpose(folder: Path) -> Path:
         each.name: {
             "R": each.cTw[:, :3].tolist(),
             "T": (1000 * each.centre[:, None]).tolist(),
-            **dict(zip(("fx", "fy", "cx", "cy"), each.K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), strict=True)),
+            **dict(
+                zip(
+                    ("fx", "fy", "cx", "cy"),
+                    each.K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(),
+                    strict=True,
+                )
+            ),
             "k": [[k1], [k2], [k3]],
             "p": [[p1], [p2]],
         }
@@ -178,7 +203,8 @@ def voxelpose(folder: Path) -> Path:
 
 def easymocap(folder: Path, *, sized: bool = True) -> Path:
     intri, extri = (
-        cv2.FileStorage(str(folder / f"{half}.yml"), cv2.FILE_STORAGE_WRITE) for half in ("intri", "extri")
+        cv2.FileStorage(str(folder / f"{half}.yml"), cv2.FILE_STORAGE_WRITE)
+        for half in ("intri", "extri")
     )
     for storage in (intri, extri):
         storage.startWriteStruct("names", cv2.FileNode_SEQ)
@@ -200,7 +226,9 @@ def easymocap(folder: Path, *, sized: bool = True) -> Path:
 
 
 def multiview(folder: Path) -> Path:
-    """As OpenCV's samples/python/multiview_calibration.py saves: one fisheye among rational lenses."""
+    """As OpenCV's samples/python/multiview_calibration.py saves: one fisheye among rational
+    lenses.
+    """
     storage = cv2.FileStorage(str(folder / "rig.yaml"), cv2.FILE_STORAGE_WRITE)
     storage.write("Rs", np.stack([each.cTw[:, :3] for each in MIXED.cameras]))
     storage.write("distortions", np.concatenate([each.distortion for each in MIXED.cameras]))
@@ -260,17 +288,17 @@ def ros(folder: Path) -> Path:
     for each in TRUTH.cameras:
         values = {"rows": 3, "cols": 3, "data": each.K.ravel().tolist()}
         info = (
-            "image_width: 1280\nimage_height: 720\ncamera_name: narrow_stereo\n"
-            f"camera_matrix: {json.dumps(values)}\n"
-            f"distortion_model: plumb_bob\ndistortion_coefficients:\n  rows: 1\n  cols: 5\n  data: {list(FIVE)}\n"
+            "image_width: 1280\nimage_height: 720\ncamera_name: narrow_stereo\ncamera_matrix: "
+            f"{json.dumps(values)}\ndistortion_model: plumb_bob\ndistortion_coefficients:\n  "
+            f"rows: 1\n  cols: 5\n  data: {list(FIVE)}\n"
         )
         (folder / f"{each.name}.yaml").write_text(info)
         x, y, z, w = quaternion(each.wTc[:3, :3])
         a, b, c = each.centre.tolist()
         stamped = (
-            f"---\nheader:\n  frame_id: world\nchild_frame_id: {each.name}_optical_frame\ntransform:\n"
-            f"  translation:\n    x: {a}\n    y: {b}\n    z: {c}\n"
-            f"  rotation: {{x: {x}, y: {y}, z: {z}, w: {w}}}\n---\n"
+            "---\nheader:\n  frame_id: world\nchild_frame_id: "
+            f"{each.name}_optical_frame\ntransform:\n  translation:\n    x: {a}\n    y: {b}\n    "
+            f"z: {c}\n  rotation: {{x: {x}, y: {y}, z: {z}, w: {w}}}\n---\n"
         )
         (folder / f"{each.name}_pose.yaml").write_text(stamped)
     return folder
@@ -331,16 +359,34 @@ def renamed(rig: Rig, names: tuple[str, ...]) -> Rig:
     def named(each: Camera, name: str) -> Camera:
         return Camera(name, each.K, each.wTc, each.image_size, each.distortion, each.lens)
 
-    return Rig(tuple(named(each, name) for each, name in zip(rig.cameras, names, strict=True)), rig.up)
+    return Rig(
+        tuple(named(each, name) for each, name in zip(rig.cameras, names, strict=True)), rig.up
+    )
 
 
 MALFORMED = {
-    "Caliscope": ("translation", "verschiebung", 'camera "0": translation is missing; calibrate the extrinsics'),
-    "Pose2Sim": ("matrix = [[", "matrix = [[1.0, ", 'camera "cam_0": matrix must hold 9 numbers, got 10; write'),
+    "Caliscope": (
+        "translation",
+        "verschiebung",
+        'camera "0": translation is missing; calibrate the extrinsics',
+    ),
+    "Pose2Sim": (
+        "matrix = [[",
+        "matrix = [[1.0, ",
+        'camera "cam_0": matrix must hold 9 numbers, got 10; write',
+    ),
     "AniPose": ("rotation = [", "rotation = [[", "cannot be read as TOML"),
-    "FreeMoCap": ("distortions = [-0.2", "distortions = [nan", "distortions[0] must be a finite number, got NaN"),
+    "FreeMoCap": (
+        "distortions = [-0.2",
+        "distortions = [nan",
+        "distortions[0] must be a finite number, got NaN",
+    ),
     "Qualisys": ('x="', 'x="one', 'camera 0 "alpha": <transform>: x must be a number, got text'),
-    "Vicon": ('POSITION="', 'POSITION="one ', 'camera 0 "alpha": POSITION must hold 3 numbers, got'),
+    "Vicon": (
+        'POSITION="',
+        'POSITION="one ',
+        'camera 0 "alpha": POSITION must hold 3 numbers, got',
+    ),
     "CMU Panoptic": ('"distCoef"', '"distCoef2"', None),
     "VoxelPose": ('"fx": 9', '"fx": -9', "camera alpha: K must have positive focal lengths"),
     "OpenCV's multi-view": ("Ts:", "Qs:", None),
@@ -348,7 +394,9 @@ MALFORMED = {
 }
 
 
-@pytest.mark.parametrize("program", [name for name, case in MALFORMED.items() if case[2] is not None])
+@pytest.mark.parametrize(
+    "program", [name for name, case in MALFORMED.items() if case[2] is not None]
+)
 def test_a_malformed_file_is_one_sentence(tmp_path, program):
     old, new, expected = MALFORMED[program]
     write, wishes, _ = WRITERS[program]
@@ -359,7 +407,9 @@ def test_a_malformed_file_is_one_sentence(tmp_path, program):
     refuses(path, expected, **wishes)
 
 
-@pytest.mark.parametrize(("program", "keys"), [("CMU Panoptic", "K R t distCoef"), ("VoxelPose", "R T k p")])
+@pytest.mark.parametrize(
+    ("program", "keys"), [("CMU Panoptic", "K R t distCoef"), ("VoxelPose", "R T k p")]
+)
 def test_columns_that_are_ragged_are_named(tmp_path, program, keys):
     """`"t": [[0], [0], 0]`: as many numbers as it takes, in no matrix."""
     write, wishes, _ = WRITERS[program]
@@ -391,7 +441,9 @@ def test_easymocap_is_known_by_either_half_and_by_the_folder(tmp_path):
     for path in (tmp_path, tmp_path / "intri.yml", tmp_path / "extri.yml"):
         assert_same(read_rig(path), TRUTH)
     (tmp_path / "extri.yml").unlink()
-    with pytest.raises(InputError, match=r"extri\.yml: this file of EasyMocap's calibration is missing"):
+    with pytest.raises(
+        InputError, match=r"extri\.yml: this file of EasyMocap's calibration is missing"
+    ):
         read_rig(tmp_path / "intri.yml")
 
 
@@ -417,7 +469,9 @@ def test_a_picture_size_that_the_file_knows_itself(tmp_path):
 
 
 def test_colmap_as_pycolmap_wrote_it():
-    """Against pycolmap's own projections of three points; its first pixel's centre is (0.5, 0.5)."""
+    """Against pycolmap's own projections of three points; its first pixel's centre is (0.5,
+    0.5).
+    """
     points = np.array([[0, 0, 1.0], [0.5, 0.2, 1.2], [-0.4, 0.3, 0.4]])
     seen = [
         [[471.5976608901799, 188.53263125152594], [435.3870275347477, 250.47532086506044],
@@ -431,15 +485,21 @@ def test_colmap_as_pycolmap_wrote_it():
         rig = read_rig(path, unit="m", up="-y")
         assert rig.names == ("cam01", "cam02", "cam03")
         for each, expected in zip(rig.cameras, seen, strict=True):
-            np.testing.assert_allclose(each.distort(each.project(points)[0]) + 0.5, expected, atol=1e-6)
+            np.testing.assert_allclose(
+                each.distort(each.project(points)[0]) + 0.5, expected, atol=1e-6
+            )
     refuses(DATA / "colmap", "unit and up are missing", "no scale until colmap model_aligner")
 
 
-@pytest.mark.parametrize("line", ["1 1 0 0 0 0 0 0 1", "1 1 0 0 0 0 0 0", "1 1 0 0 0 0 0 0 7 a.jpg"])
+@pytest.mark.parametrize(
+    "line", ["1 1 0 0 0 0 0 0 1", "1 1 0 0 0 0 0 0", "1 1 0 0 0 0 0 0 7 a.jpg"]
+)
 def test_colmap_s_pictures_have_ten_words_and_a_camera_that_is_there(tmp_path, line):
     (tmp_path / "cameras.txt").write_text("1 PINHOLE 100 80 90 90 50 40\n")
     (tmp_path / "images.txt").write_text(f"# pictures\n{line}\n\n")
-    with pytest.raises(InputError, match=r"images\.txt: line 2: must hold id, quaternion, translation, camera id"):
+    with pytest.raises(
+        InputError, match=r"images\.txt: line 2: must hold id, quaternion, translation, camera id"
+    ):
         read_rig(tmp_path, unit="m", up="z")
 
 
@@ -451,9 +511,19 @@ def test_colmap_s_pictures_are_followed_by_their_points(tmp_path):
         file.write_text("# pictures\n\n" + "".join(f"{image}\n{points}\n" for image in images))
         assert read_rig(tmp_path, unit="m", up="z").names == ("a", "b", "c")
     file.write_text("# pictures\n" + "\n".join(images))
-    refuses(tmp_path, "images.txt: line 3: must hold the points of the image in the line before", unit="m", up="z")
+    refuses(
+        tmp_path,
+        "images.txt: line 3: must hold the points of the image in the line before",
+        unit="m",
+        up="z",
+    )
     file.write_text(f"{images[0]}\n1 2\n{images[1]}\n\n")
-    refuses(tmp_path, "images.txt: line 2: must hold the points of the image in the line before", unit="m", up="z")
+    refuses(
+        tmp_path,
+        "images.txt: line 2: must hold the points of the image in the line before",
+        unit="m",
+        up="z",
+    )
 
 
 @pytest.mark.parametrize(
@@ -489,7 +559,8 @@ def test_colmap_that_cannot_be_read(tmp_path):
     (tmp_path / "cameras.txt").write_text("1 FOV 10 10 1 1 1 1 1\n")
     (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.jpg\n\n")
     with pytest.raises(
-        InputError, match=r"cameras\.txt: line 1: camera model FOV is not supported; use one of SIMPLE_PIN"
+        InputError,
+        match=r"cameras\.txt: line 1: camera model FOV is not supported; use one of SIMPLE_PIN",
     ):
         read_rig(tmp_path)
     (tmp_path / "cameras.txt").write_text("1 PINHOLE 10 10 1 1 1 1\n")
@@ -505,22 +576,35 @@ def test_ros_refuses_intrinsics_alone_and_frames_that_are_not_optical(tmp_path):
     pose = tmp_path / "beta_pose.yaml"
     good = pose.read_text()
     pose.write_text(good.replace("beta_optical_frame", "beta_link"))
-    with pytest.raises(InputError, match=r"beta_pose\.yaml: child_frame_id beta_link is not an optical frame"):
+    with pytest.raises(
+        InputError, match=r"beta_pose\.yaml: child_frame_id beta_link is not an optical frame"
+    ):
         read_rig(tmp_path)
     pose.write_text(good.replace("w: ", "q: "))
-    with pytest.raises(InputError, match=r"beta_pose\.yaml: rotation: w is missing; write <camera>_pose"):
+    with pytest.raises(
+        InputError, match=r"beta_pose\.yaml: rotation: w is missing; write <camera>_pose"
+    ):
         read_rig(tmp_path)
     pose.unlink()
-    with pytest.raises(InputError, match=r'beta_pose\.yaml: the pose of camera "beta" is missing; write'):
+    with pytest.raises(
+        InputError, match=r'beta_pose\.yaml: the pose of camera "beta" is missing; write'
+    ):
         read_rig(tmp_path)
 
 
 def test_nothing_that_runs_code(tmp_path):
     refuses(
-        written_bytes(tmp_path / "cam.pickle", b"\x80\x04\x95rest"), "this is a Python pickle (as OpenCap", "docs/"
+        written_bytes(tmp_path / "cam.pickle", b"\x80\x04\x95rest"),
+        "this is a Python pickle (as OpenCap",
+        "docs/",
     )
-    bomb = '<?xml version="1.0"?><!DOCTYPE a [<!ENTITY b "c">]><calibration><cameras/></calibration>'
-    refuses(written(tmp_path / "a.qca.txt", bomb), "XML with a document type or entities is not accepted")
+    bomb = (
+        '<?xml version="1.0"?><!DOCTYPE a [<!ENTITY b "c">]><calibration><cameras/></calibration>'
+    )
+    refuses(
+        written(tmp_path / "a.qca.txt", bomb),
+        "XML with a document type or entities is not accepted",
+    )
     code = "image_width: !!python/object/apply:os.system ['true']\n"
     refuses(written(tmp_path / "a.yaml", code), "is not YAML")
 
@@ -553,7 +637,11 @@ def test_the_way_out_of_opencap_s_pickles(tmp_path, monkeypatch):
 
 
 def test_unknown_files_are_named_by_what_they_are(tmp_path):
-    refuses(written(tmp_path / "a.toml", "[tool]\nx = 1\n"), "recognised as TOML (with tool), but", "Qualisys'")
+    refuses(
+        written(tmp_path / "a.toml", "[tool]\nx = 1\n"),
+        "recognised as TOML (with tool), but",
+        "Qualisys'",
+    )
     refuses(written(tmp_path / "a.xml", "<svg/>"), "recognised as XML (<svg>), but")
     refuses(written(tmp_path / "a.csv", "1,2,3\n"), "recognised as text, but")
     refuses(written(tmp_path / "b.yaml", "a: 1\n"), "recognised as YAML (with a), but")
@@ -566,7 +654,9 @@ def test_unknown_files_are_named_by_what_they_are(tmp_path):
 def test_qualisys_pictures_of_a_lower_resolution_are_resized(tmp_path, resolution, scale):
     file = qualisys(tmp_path)
     file.write_text(
-        file.read_text().replace('model="Miqus Video"', f'model="Miqus Video" video_resolution="{resolution}"')
+        file.read_text().replace(
+            'model="Miqus Video"', f'model="Miqus Video" video_resolution="{resolution}"'
+        )
     )
     rig = read_rig(file)
     np.testing.assert_allclose(rig.cTw, TRUTH.cTw, atol=1e-9)
@@ -580,7 +670,9 @@ def test_qualisys_pictures_of_a_lower_resolution_are_resized(tmp_path, resolutio
 def test_qualisys_resolutions_that_are_not_known_are_said(tmp_path, resolution):
     file = qualisys(tmp_path)
     file.write_text(
-        file.read_text().replace('model="Miqus Video"', f'model="Miqus Video" video_resolution="{resolution}"')
+        file.read_text().replace(
+            'model="Miqus Video"', f'model="Miqus Video" video_resolution="{resolution}"'
+        )
     )
     rig = read_rig(file)
     assert_same(rig, TRUTH)
@@ -598,12 +690,17 @@ def test_qualisys_resolutions_that_are_not_known_are_said(tmp_path, resolution):
     ],
 )
 def test_qualisys_sensors_of_more_lines(tmp_path, resolution, window, scale):
-    """Miqus Video Plus has 1440 lines; pictures are resized only where there are more lines in the window."""
+    """Miqus Video Plus has 1440 lines; pictures are resized only where there are more lines in the
+    window.
+    """
     file = qualisys(tmp_path)
     text = file.read_text().replace(
-        'left="8" top="4" right="1287" bottom="723"', f'left="0" top="0" right="{window[0]}" bottom="{window[1]}"'
+        'left="8" top="4" right="1287" bottom="723"',
+        f'left="0" top="0" right="{window[0]}" bottom="{window[1]}"',
     )
-    text = text.replace("<transform", '<fov_video_max left="0" top="0" right="1919" bottom="1439"/><transform')
+    text = text.replace(
+        "<transform", '<fov_video_max left="0" top="0" right="1919" bottom="1439"/><transform'
+    )
     plus = f'model="Miqus Video Plus" video_resolution="{resolution}"'
     file.write_text(text.replace('model="Miqus Video"', plus))
     width, height = window[0] + 1, window[1] + 1
@@ -654,16 +751,22 @@ def test_caliscope_s_own_board_keeps_its_distances(shared_data):
         lines = []
         for view, row in zip(views, seen, strict=True):
             each = rig.cameras[view]
-            (x, y), P = each.undistort(np.array([[row["img_loc_x"], row["img_loc_y"]]]))[0], each.K @ each.cTw
+            (x, y), P = (
+                each.undistort(np.array([[row["img_loc_x"], row["img_loc_y"]]]))[0],
+                each.K @ each.cTw,
+            )
             lines += [x * P[2] - P[0], y * P[2] - P[1]]
         X = np.linalg.svd(np.array(lines))[2][-1]
-        places.setdefault(time, []).append((X[:3] / X[3], (seen[0]["obj_loc_x"], seen[0]["obj_loc_y"])))
+        places.setdefault(time, []).append(
+            (X[:3] / X[3], (seen[0]["obj_loc_x"], seen[0]["obj_loc_y"]))
+        )
     ratios = []
     for board in places.values():
         xyz, flat = (np.array(each) for each in zip(*board, strict=True))
         first, second = np.triu_indices(len(xyz), 1)
         ratios += (
-            np.linalg.norm(xyz[first] - xyz[second], axis=1) / np.linalg.norm(flat[first] - flat[second], axis=1)
+            np.linalg.norm(xyz[first] - xyz[second], axis=1)
+            / np.linalg.norm(flat[first] - flat[second], axis=1)
         ).tolist()
     assert sum(len(board) for board in places.values()) > 500
     assert abs(np.median(ratios) - 1) < 0.003
@@ -673,7 +776,9 @@ def test_freemocap_ros_and_panoptic(shared_data):
     rig = read_rig(shared_data / "formats" / "freemocap_calibration.toml", unit="mm", up="-y")
     np.testing.assert_array_equal(rig.centres[0], 0)
     # The second camera stands 2.7 m from the first.
-    np.testing.assert_allclose(np.linalg.norm(rig.centres[1]), np.linalg.norm([2.512, 0.646, 0.739]), atol=1e-3)
+    np.testing.assert_allclose(
+        np.linalg.norm(rig.centres[1]), np.linalg.norm([2.512, 0.646, 0.739]), atol=1e-3
+    )
     refuses(shared_data / "formats" / "ros_ost.yaml", "the intrinsics of one camera of ROS")
     rig = read_rig(shared_data / "panoptic_pizza" / "calibration.json", image_size=(1920, 1080))
     # Five cameras 1.5 to 3.4 m high look at the middle of the room, within a few metres.
@@ -691,6 +796,8 @@ def test_voxelpose_s_rotations_are_matrices(tmp_path):
 
 def test_huge_numbers_are_refused_in_one_sentence(tmp_path):
     file = voxelpose(tmp_path)
-    file.write_text(re.sub(r'"R": \[\[[^\]]*\]', '"R": [[1e200, 1e200, 1e200]', file.read_text(), count=1))
+    file.write_text(
+        re.sub(r'"R": \[\[[^\]]*\]', '"R": [[1e200, 1e200, 1e200]', file.read_text(), count=1)
+    )
     with pytest.raises(InputError, match=r"the rotation of R is not orthonormal"):
         read_rig(file)

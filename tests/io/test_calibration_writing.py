@@ -1,4 +1,6 @@
-"""A calibration that was changed is written in the format it came in, and reads back as it was changed."""
+"""A calibration that was changed is written in the format it came in, and reads back as it was
+changed.
+"""
 
 import os
 from dataclasses import replace
@@ -72,7 +74,10 @@ def test_every_format_is_written_as_it_came_in(tmp_path, name):
     write, how, _ = WRITERS[name]
     (tmp_path / "given").mkdir()
     source = write(tmp_path / "given")
-    rig, target = read_rig(source, **how), tmp_path / ("new" if source.is_dir() else f"new{source.suffix}")
+    rig, target = (
+        read_rig(source, **how),
+        tmp_path / ("new" if source.is_dir() else f"new{source.suffix}"),
+    )
     form, there = write_like(source, changed(rig), target, how.get("unit"))
     assert there == target and form != "rig file"
     same(read_rig(target, **how), changed(rig))
@@ -91,16 +96,22 @@ def test_what_does_not_read_back_is_written_as_our_own(tmp_path, monkeypatch):
     source = write(tmp_path)
     rig = read_rig(source, **how)
     for text in ("", "<calibration><cameras><camera serial='1'/></cameras></calibration>"):
-        monkeypatch.setitem(REWRITTEN, QUALISYS.name, lambda content, *_, text=text: {content.path: text})
+        monkeypatch.setitem(
+            REWRITTEN, QUALISYS.name, lambda content, *_, text=text: {content.path: text}
+        )
         assert write_like(source, changed(rig), tmp_path / "new.json")[0] == "rig file"
         same(read_rig(tmp_path / "new.json"), changed(rig))
 
 
 def test_a_lens_that_two_pictures_share_cannot_be_written_as_two(tmp_path):
-    """COLMAP's pictures of one camera have one focal length: what was refined apart is written as our own."""
+    """COLMAP's pictures of one camera have one focal length: what was refined apart is written as
+    our own.
+    """
     folder = tmp_path / "model"
     folder.mkdir()
-    (folder / "cameras.txt").write_text("# cameras\n1 OPENCV 1280 720 900 900 640.5 360.5 0.1 0 0 0\n")
+    (folder / "cameras.txt").write_text(
+        "# cameras\n1 OPENCV 1280 720 900 900 640.5 360.5 0.1 0 0 0\n"
+    )
     turn = "0.9689124217106447 0 0.24740395925452294 0"
     poses = [f"{n} {turn} {n}.5 0.25 3 1 left/{n}.png\n{n}.0 2.0 -1\n" for n in (1, 2)]
     (folder / "images.txt").write_text("# pictures\n" + "".join(poses))

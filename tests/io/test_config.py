@@ -67,14 +67,20 @@ def test_printed_settings_read_back(tmp_path):
 def test_printed_settings_carry_their_docstrings():
     text = toml_text(Config())
     assert '# The robust kernel.\nkernel = "huber"\n' in text
-    assert "# The gate of Eq. 2.\n[gate]\n# Largest residual, pixels.\ngate_px = 20.0\nmin_views = 2\n" in text
+    assert (
+        "# The gate of Eq. 2.\n[gate]\n# Largest residual, pixels.\ngate_px = 20.0\nmin_views = 2\n"
+        in text
+    )
     assert "# seed is not set\n" in text
 
 
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("[gate]\ngate_pixels = 3", "gate.gate_pixels is not a known key; did you mean gate.gate_px?"),
+        (
+            "[gate]\ngate_pixels = 3",
+            "gate.gate_pixels is not a known key; did you mean gate.gate_px?",
+        ),
         ("kernels = 'huber'", "kernels is not a known key; did you mean kernel?"),
         ("[gates]\ngate_px = 3", "gates is not a known key; did you mean gate?"),
         (
@@ -94,7 +100,10 @@ def test_printed_settings_carry_their_docstrings():
         ("kernel = 'welsch'", "kernel must be 'huber' or 'cauchy', got text 'welsch'"),
         (
             "[gate\ngate_px = 3",
-            "cannot be read as TOML (Expected ']' at the end of a table declaration (at line 1, column 6)",
+            (
+                "cannot be read as TOML (Expected ']' at the end of a table declaration (at line "
+                "1, column 6)"
+            ),
         ),
         ("seed = 1\nseed = 2", "cannot be read as TOML (Cannot overwrite a value"),
     ],
@@ -121,11 +130,14 @@ def test_the_pipelines_own_settings(tmp_path):
     assert config.candidates.gate_m == 0.2
 
 
-@pytest.mark.parametrize("old", ["candidates", "proposals", "association", "tracking", "window_graph", "refine"])
+@pytest.mark.parametrize(
+    "old", ["candidates", "proposals", "association", "tracking", "window_graph", "refine"]
+)
 def test_what_took_the_place_of_old_settings_is_said(tmp_path, old):
     (tmp_path / "old.toml").write_text(f"[{old}]\ngate_m = 0.2\n")
     with pytest.raises(
-        InputError, match=f"{old} is not a table any more: .*; `shapepose-fg config` prints the defaults"
+        InputError,
+        match=f"{old} is not a table any more: .*; `shapepose-fg config` prints the defaults",
     ):
         read_config(tmp_path / "old.toml", PipelineConfig)
 
@@ -142,7 +154,25 @@ def test_there_are_few_settings():
 
 
 def test_values_are_described_in_a_word_or_two():
-    values = [None, True, {"a": 1}, [1, 2, 3], "x" * 21, "x" * 20, float("nan"), float("inf"), float("-inf"), 0.5]
-    words = ["null", "true", "an object", "a list of 3", f"text {'x' * 20!r}...", f"text {'x' * 20!r}"]
+    values = [
+        None,
+        True,
+        {"a": 1},
+        [1, 2, 3],
+        "x" * 21,
+        "x" * 20,
+        float("nan"),
+        float("inf"),
+        float("-inf"),
+        0.5,
+    ]
+    words = [
+        "null",
+        "true",
+        "an object",
+        "a list of 3",
+        f"text {'x' * 20!r}...",
+        f"text {'x' * 20!r}",
+    ]
     words += ["NaN", "Infinity", "-Infinity", "0.5"]
     assert [describe(value) for value in values] == words

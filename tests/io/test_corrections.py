@@ -1,4 +1,6 @@
-"""Corrections beside a result: listed, taken back to the last byte, and refused where they do not fit."""
+"""Corrections beside a result: listed, taken back to the last byte, and refused where they do not
+fit.
+"""
 
 import hashlib
 import json
@@ -20,7 +22,9 @@ from shapepose_fg.tracking.edits import Action, Edit
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """Three people in ten frames, exactly."""
-    truth_of(built_in_scene(people=3, frames=10)).with_run(people={"dropped": {"a": 1}}).save(tmp_path / "results")
+    truth_of(built_in_scene(people=3, frames=10)).with_run(people={"dropped": {"a": 1}}).save(
+        tmp_path / "results"
+    )
     return tmp_path / "results"
 
 
@@ -66,10 +70,14 @@ def test_a_correction_that_cannot_be_made_changes_nothing(folder):
 def test_a_result_that_was_corrected_is_not_written_over(folder):
     refuse_corrected(folder)
     correct(folder, Edit(Action.DROP, 2))
-    with pytest.raises(InputError, match=r"was corrected by hand \(corrections.json and uncorrected\)"):
+    with pytest.raises(
+        InputError, match=r"was corrected by hand \(corrections.json and uncorrected\)"
+    ):
         refuse_corrected(folder)
     (folder / "corrections.json").unlink()
-    with pytest.raises(InputError, match=r"by hand \(uncorrected\).* delete corrections.json and uncorrected"):
+    with pytest.raises(
+        InputError, match=r"by hand \(uncorrected\).* delete corrections.json and uncorrected"
+    ):
         refuse_corrected(folder)
 
 
@@ -78,7 +86,9 @@ def test_a_folder_of_before_that_is_gone_loses_no_result(folder):
     shutil.rmtree(folder / "uncorrected")
     before = contents(folder)
     for action in (lambda: correct(folder, Edit(Action.DROP, 1)), lambda: take_back(folder)):
-        with pytest.raises(InputError, match=r"uncorrected/people\.npz: .* or delete corrections\.json"):
+        with pytest.raises(
+            InputError, match=r"uncorrected/people\.npz: .* or delete corrections\.json"
+        ):
             action()
     assert contents(folder) == before
 
@@ -112,12 +122,21 @@ def test_a_result_without_run_json_comes_back_without_it(folder):
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        (lambda c: c | {"format": "1"}, "format must be 'shapepose-fg corrections 1', got text '1'"),
+        (
+            lambda c: c | {"format": "1"},
+            "format must be 'shapepose-fg corrections 1', got text '1'",
+        ),
         (lambda c: c | {"edits": []}, "edits must hold 1 value, got 0"),
         (lambda c: c | {"more": 1}, "more is not a known key"),
         (lambda c: c | {"people": "0"}, "people.npz is not the result of these corrections"),
-        (lambda c: c | {"edits": [{"action": "drop", "person": 2, "frame": 3}]}, "drop needs no frame"),
-        (lambda c: c | {"edits": [{"action": "hide", "person": 2}]}, "edits[0].action must be 'merge', 'split',"),
+        (
+            lambda c: c | {"edits": [{"action": "drop", "person": 2, "frame": 3}]},
+            "drop needs no frame",
+        ),
+        (
+            lambda c: c | {"edits": [{"action": "hide", "person": 2}]},
+            "edits[0].action must be 'merge', 'split',",
+        ),
         (lambda c: c | {"edits": [{"action": "drop", "person": -2}]}, "edits[0].person"),
         (lambda c: c | {"edits": [{"action": "drop"}]}, "edits[0].person is missing"),
         (lambda c: [], "the file must be"),
@@ -130,7 +149,9 @@ def test_bad_files(folder, change, sentence):
     with pytest.raises(InputError) as caught:
         read_corrections(folder)
     assert str(caught.value).startswith(f"{file}: ") and sentence in str(caught.value)
-    assert "copy the files of uncorrected back and delete uncorrected and corrections.json" in str(caught.value)
+    assert "copy the files of uncorrected back and delete uncorrected and corrections.json" in str(
+        caught.value
+    )
 
 
 def test_a_result_that_changed_since_is_noticed(folder):
@@ -190,7 +211,10 @@ def test_tracks_on_the_command_line(folder, capsys):
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["merge", 0, 1], "0 and 1 are both present in 10 frames, first in 0, so they are two people"),
+        (
+            ["merge", 0, 1],
+            "0 and 1 are both present in 10 frames, first in 0, so they are two people",
+        ),
         (["drop", 7], "there is no person 7; there are 0 1 2"),
         (["undo"], "there is no correction to undo"),
         (["split", 0, 0], "cannot be split at 0; give a frame from 1 to 9"),
@@ -213,7 +237,10 @@ def test_a_folder_without_a_result(tmp_path, capsys):
 
 def test_a_number_that_no_result_has(folder, capsys):
     assert run(folder, "rename", 0, 2**53) == 2
-    assert "9007199254740992 is not a valid number of a person; give one from 0 to" in capsys.readouterr().err
+    assert (
+        "9007199254740992 is not a valid number of a person; give one from 0 to"
+        in capsys.readouterr().err
+    )
     assert run(folder, "rename", 0, 2**53 - 1) == 0
     assert Reconstruction.load(folder).person.max() == 2**53 - 1
 

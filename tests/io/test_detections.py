@@ -1,4 +1,6 @@
-"""Detections from files: every candidate and affinity arrives, and each bad file gives the sentence promised."""
+"""Detections from files: every candidate and affinity arrives, and each bad file gives the sentence
+promised.
+"""
 
 import json
 import shutil
@@ -25,11 +27,14 @@ def test_text_gives_every_candidate_and_affinity(text_folder, recordings, rig):
         affinities = 0
         for view, (name, camera) in enumerate(zip(rig.names, rig.cameras, strict=True)):
             rows_of = [
-                np.flatnonzero((detections.view == view) & (detections.joint == joint)) for joint in range(25)
+                np.flatnonzero((detections.view == view) & (detections.joint == joint))
+                for joint in range(25)
             ]
             for joint, values in enumerate(recordings[name].joints[frame]):
                 rows = rows_of[joint]
-                pixels = camera.undistort(values[:2].T * [1000, 800])  # the format divides by size - 1
+                pixels = camera.undistort(
+                    values[:2].T * [1000, 800]
+                )  # the format divides by size - 1
                 np.testing.assert_allclose(detections.xy[rows], pixels, atol=1e-9)
                 np.testing.assert_array_equal(detections.confidence[rows], values[2])
             for (a, b), matrix in zip(LIMBS, recordings[name].affinities[frame], strict=True):
@@ -74,8 +79,17 @@ def test_scores_that_overshoot_a_little_are_one(text_folder, rig):
 
 
 def token(folder: Path, what: str) -> int:
-    """Which number of left.txt is meant. Frame 0 has 0 noses, then 3 necks: 4 3 | 0 | 3 x x x y y y s s s."""
-    return {"frames": 1, "necks": 3, "x": 4, "y": 7, "the score of the first neck": 10, "elbows": 14}[what]
+    """Which number of left.txt is meant. Frame 0 has 0 noses, then 3 necks: 4 3 | 0 | 3 x x x y y y
+    s s s.
+    """
+    return {
+        "frames": 1,
+        "necks": 3,
+        "x": 4,
+        "y": 7,
+        "the score of the first neck": 10,
+        "elbows": 14,
+    }[what]
 
 
 def edit(path: Path, index: int, word: str | None) -> None:
@@ -96,7 +110,10 @@ BAD_NUMBERS = [
     (
         "necks",
         "-1",
-        "line 6: frame 0 must give the number of candidates of Neck, got -1; there is a number too few",
+        (
+            "line 6: frame 0 must give the number of candidates of Neck, got -1; there is a number "
+            "too few"
+        ),
     ),
     ("necks", "1.5", "line 6: frame 0 must give the number of candidates of Neck, got 1.5"),
     ("x", None, " must give the number of candidates of"),
@@ -106,10 +123,26 @@ BAD_NUMBERS = [
     ("x", "512", "line 7: a candidate is at (512, 0."),
     ("x", "-0.3", "frame 0 has a joint at pixel (-300, "),
     ("y", "7.5", "divide x by width - 1 and y by height - 1"),
-    ("the score of the first neck", "1.2", "line 9: a candidate's score must lie between 0 and 1, got 1.2; write"),
-    ("the score of the first neck", "-0.1", "line 9: a candidate's score must lie between 0 and 1, got -0.1"),
-    ("frames", "4", "the file ends in frame 3 of 4, where the number of candidates of Nose should be; copy"),
-    ("frames", "1", "numbers after the last of the 1 frames; correct the number of frames in line 1"),
+    (
+        "the score of the first neck",
+        "1.2",
+        "line 9: a candidate's score must lie between 0 and 1, got 1.2; write",
+    ),
+    (
+        "the score of the first neck",
+        "-0.1",
+        "line 9: a candidate's score must lie between 0 and 1, got -0.1",
+    ),
+    (
+        "frames",
+        "4",
+        "the file ends in frame 3 of 4, where the number of candidates of Nose should be; copy",
+    ),
+    (
+        "frames",
+        "1",
+        "numbers after the last of the 1 frames; correct the number of frames in line 1",
+    ),
     ("frames", "0", "line 1: the number of frames must be 1 or more, got 0"),
     ("frames", "1e300", "the file ends in frame 3 of 1"),
     ("necks", "1e300", "the file ends in frame 0 of 3, where the candidates of Neck should be"),
@@ -125,7 +158,13 @@ def test_bad_number(text_folder, rig, what, word, sentence):
 @pytest.mark.parametrize(
     ("kind", "sentence"),
     [
-        ("2", "line 1: skeleton type 2 (SKEL15) is not supported, only 4 (BODY_25) and 3 (COCO_18); run the"),
+        (
+            "2",
+            (
+                "line 1: skeleton type 2 (SKEL15) is not supported, only 4 (BODY_25) and 3 "
+                "(COCO_18); run the"
+            ),
+        ),
         ("0", "skeleton type 0 (SKEL19) is not supported"),
         ("25", "skeleton type 25 is not supported"),
         ("4.5", "skeleton type 4.5 is not supported"),
@@ -140,9 +179,20 @@ def test_truncated_text_names_frame_and_what_is_missing(text_folder, rig):
     path = text_folder / "left.txt"
     lines = path.read_text().rstrip().splitlines()
     path.write_text("\n".join(lines[:7]) + "\n")
-    refuses(text_folder, rig, path, "the file ends in frame 0 of 3, where the candidates of Neck should be")
+    refuses(
+        text_folder,
+        rig,
+        path,
+        "the file ends in frame 0 of 3, where the candidates of Neck should be",
+    )
     path.write_text("\n".join(lines[:-1]) + "\n")
-    refuses(text_folder, rig, path, "line", "frame 2 of 3, where the affinities of RHip-RKnee should be; copy")
+    refuses(
+        text_folder,
+        rig,
+        path,
+        "line",
+        "frame 2 of 3, where the affinities of RHip-RKnee should be; copy",
+    )
     path.write_text("4")
     refuses(text_folder, rig, path, "the first line must hold skeleton type and number of frames")
     path.write_text("")
@@ -156,7 +206,8 @@ def test_frame_counts_that_differ(text_folder, recordings, rig):
     table = read_detections(text_folder, rig)
     assert len(table) == 2 and set(table[0].view.tolist()) == {0, 1}
     assert (
-        "(left.txt has 3, 0 to 2, right.txt has 2, 0 to 1); the 2 common ones, 0 to 1, are used" in table.notes[-1]
+        "(left.txt has 3, 0 to 2, right.txt has 2, 0 to 1); the 2 common ones, 0 to 1, are used"
+        in table.notes[-1]
     )
     assert len(read_detections(text_folder, rig, own_frames=True)) == 3
 
@@ -164,18 +215,34 @@ def test_frame_counts_that_differ(text_folder, recordings, rig):
 def test_missing_camera(text_folder, rig):
     (text_folder / "right.txt").unlink()
     refuses(
-        text_folder, rig, text_folder / "right.txt", 'camera "right" are missing', "contains left.txt; add them"
+        text_folder,
+        rig,
+        text_folder / "right.txt",
+        'camera "right" are missing',
+        "contains left.txt; add them",
     )
 
 
 def test_no_detections(tmp_path, text_folder, rig):
     (tmp_path / "readme.md").write_text("nothing in it")
     (tmp_path / "empty").mkdir()
-    refuses(tmp_path, rig, tmp_path, "no detections of the cameras left right, only empty readme.md recording")
-    refuses(tmp_path / "empty", rig, tmp_path / "empty", "only nothing; give the folder with <camera>.txt")
+    refuses(
+        tmp_path,
+        rig,
+        tmp_path,
+        "no detections of the cameras left right, only empty readme.md recording",
+    )
+    refuses(
+        tmp_path / "empty",
+        rig,
+        tmp_path / "empty",
+        "only nothing; give the folder with <camera>.txt",
+    )
     refuses(tmp_path / "nowhere", rig, tmp_path / "nowhere", "there is no such folder")
     left = text_folder / "left.txt"
-    refuses(left, rig, left, "this is a file; give the folder that holds the detections of all cameras")
+    refuses(
+        left, rig, left, "this is a file; give the folder that holds the detections of all cameras"
+    )
 
 
 def test_openpose_people_become_candidates(openpose_folder, rig):
@@ -187,7 +254,8 @@ def test_openpose_people_become_candidates(openpose_folder, rig):
     assert [BODY_25.joints[joint] for joint in first.joint[left]] == (
         "Nose Neck Neck MidHip MidHip RHip LHip LKnee".split()
     )
-    # Person 0 has the limbs Neck-MidHip, MidHip-RHip, Neck-Nose; person 1 Neck-MidHip, MidHip-LHip, LHip-LKnee.
+    # Person 0 has the limbs Neck-MidHip, MidHip-RHip, Neck-Nose; person 1 Neck-MidHip, MidHip-LHip,
+    # LHip-LKnee.
     pairs = {tuple(pair) for pair in first.pairs[first.view[first.pairs[:, 0]] == 0].tolist()}
     assert pairs == {(1, 3), (3, 5), (1, 0), (2, 4), (4, 6), (6, 7)}
     assert np.all(first.affinity == 1)
@@ -201,7 +269,9 @@ def test_openpose_points_are_undistorted_once(openpose_folder, rig):
     measured = np.reshape(json.loads(file.read_text())["people"][0]["pose_keypoints_2d"], (25, 3))
     detections = read_detections(openpose_folder, rig)[2]
     right = detections.view == 1
-    np.testing.assert_allclose(detections.xy[right], rig.cameras[1].undistort(measured[:, :2]), atol=1e-9)
+    np.testing.assert_allclose(
+        detections.xy[right], rig.cameras[1].undistort(measured[:, :2]), atol=1e-9
+    )
     np.testing.assert_array_equal(detections.confidence[right], measured[:, 2])
     np.testing.assert_array_equal(detections.xy[~right], measured[:, :2])
 
@@ -217,20 +287,28 @@ def test_openpose_frames_may_be_missing_in_between_and_it_is_said(openpose_folde
     assert set(whole[1].view.tolist()) == {0, 1} and set(table[1].view.tolist()) == {0}
     for frame in (0, 2):
         np.testing.assert_array_equal(table[frame].xy, whole[frame].xy)
-    assert f"{openpose_folder / 'right'}: 1 frame has no file (frame 8); no people are read there" in table.notes
+    assert (
+        f"{openpose_folder / 'right'}: 1 frame has no file (frame 8); no people are read there"
+        in table.notes
+    )
     assert not any("no file" in note for note in whole.notes)
 
 
 def test_openpose_numbers_that_are_no_frames_are_refused(openpose_folder, rig):
     last = openpose_folder / "right" / "video_000000000009_keypoints.json"
     last.rename(last.with_name("video_20261121_keypoints.json"))
-    refuses(openpose_folder, rig, openpose_folder / "right", "3 files are numbered from 7 to 20261121")
+    refuses(
+        openpose_folder, rig, openpose_folder / "right", "3 files are numbered from 7 to 20261121"
+    )
 
 
 def test_openpose_frame_counts_that_differ(openpose_folder, rig):
     (openpose_folder / "right" / "video_000000000009_keypoints.json").unlink()
     table = read_detections(openpose_folder, rig)
-    assert len(table) == 2 and "(left has 3, 7 to 9, right has 2, 7 to 8); the 2 common ones" in table.notes[-1]
+    assert (
+        len(table) == 2
+        and "(left has 3, 7 to 9, right has 2, 7 to 8); the 2 common ones" in table.notes[-1]
+    )
 
 
 def test_openpose_first_numbers_that_differ(openpose_folder, rig):
@@ -239,14 +317,25 @@ def test_openpose_first_numbers_that_differ(openpose_folder, rig):
         folder = openpose_folder / "right"
         (folder / name.format(number)).rename(folder / name.format(number + 1))
     whole = read_detections(openpose_folder, rig, own_frames=False)
-    assert len(whole) == 2 and "(left has 3, 7 to 9, right has 3, 8 to 10); the 2 common ones" in whole.notes[-1]
+    assert (
+        len(whole) == 2
+        and "(left has 3, 7 to 9, right has 3, 8 to 10); the 2 common ones" in whole.notes[-1]
+    )
     # Frame 8 is the second of the left camera and the first of the right one.
-    assert np.bincount(whole[0].view).tolist() == [0, 8] and np.bincount(whole[1].view).tolist() == [25]
+    assert np.bincount(whole[0].view).tolist() == [0, 8] and np.bincount(
+        whole[1].view
+    ).tolist() == [25]
     every = read_detections(openpose_folder, rig, own_frames=True)
     assert (
-        len(every) == 4 and "frame 0 has number 7 in the files (left has 3, 7 to 9, right has 3" in every.notes[-1]
+        len(every) == 4
+        and "frame 0 has number 7 in the files (left has 3, 7 to 9, right has 3" in every.notes[-1]
     )
-    assert [np.bincount(frame.view, minlength=2).tolist() for frame in every] == [[8, 0], [0, 8], [25, 0], [0, 25]]
+    assert [np.bincount(frame.view, minlength=2).tolist() for frame in every] == [
+        [8, 0],
+        [0, 8],
+        [25, 0],
+        [0, 25],
+    ]
 
 
 def test_openpose_numbers_without_a_frame_in_common(openpose_folder, rig):
@@ -258,23 +347,42 @@ def test_openpose_numbers_without_a_frame_in_common(openpose_folder, rig):
         openpose_folder,
         rig,
         openpose_folder,
-        "no frame exists for all cameras (left has 3, 7 to 9, right has 3, 57 to 59); give the same frames",
+        (
+            "no frame exists for all cameras (left has 3, 7 to 9, right has 3, 57 to 59); give the "
+            "same frames"
+        ),
     )
 
 
 def test_openpose_two_recordings_in_a_folder(openpose_folder, rig):
     folder = openpose_folder / "left"
-    shutil.copy(folder / "video_000000000008_keypoints.json", folder / "walk_000000000008_keypoints.json")
-    refuses(openpose_folder, rig, folder / "walk_000000000008_keypoints.json", "frame 8 is also in video_")
+    shutil.copy(
+        folder / "video_000000000008_keypoints.json", folder / "walk_000000000008_keypoints.json"
+    )
+    refuses(
+        openpose_folder,
+        rig,
+        folder / "walk_000000000008_keypoints.json",
+        "frame 8 is also in video_",
+    )
 
 
 def test_openpose_missing_or_empty_camera(openpose_folder, rig):
     shutil.rmtree(openpose_folder / "right")
     refuses(
-        openpose_folder, rig, openpose_folder / "right", 'camera "right" are missing', "contains left; add them"
+        openpose_folder,
+        rig,
+        openpose_folder / "right",
+        'camera "right" are missing',
+        "contains left; add them",
     )
     (openpose_folder / "right").mkdir()
-    refuses(openpose_folder, rig, openpose_folder / "right", "no *_keypoints.json (OpenPose) or *_000000.json")
+    refuses(
+        openpose_folder,
+        rig,
+        openpose_folder / "right",
+        "no *_keypoints.json (OpenPose) or *_000000.json",
+    )
 
 
 def person(values: object) -> str:
@@ -285,10 +393,19 @@ FULL = [500.0, 400.0, 0.5] * 25
 BAD_JSON = [
     (
         person([0.5] * 74),
-        "people[0].pose_keypoints_2d must hold x, y and score of each keypoint, got 74 numbers; run",
+        (
+            "people[0].pose_keypoints_2d must hold x, y and score of each keypoint, got 74 "
+            "numbers; run"
+        ),
     ),
-    (person([*FULL[:-1], "0.5"]), "people[0].pose_keypoints_2d[74] must be a number, got text '0.5'"),
-    (person([float("inf"), *FULL[1:]]), "people[0].pose_keypoints_2d holds Infinity; run OpenPose again"),
+    (
+        person([*FULL[:-1], "0.5"]),
+        "people[0].pose_keypoints_2d[74] must be a number, got text '0.5'",
+    ),
+    (
+        person([float("inf"), *FULL[1:]]),
+        "people[0].pose_keypoints_2d holds Infinity; run OpenPose again",
+    ),
     (json.dumps({"people": [{"pose_keypoints": FULL}]}), "people[0].pose_keypoints_2d is missing"),
     (json.dumps({"people": {}}), "people must be a list, got an object"),
     (json.dumps({}), "people is missing"),
@@ -318,12 +435,17 @@ def test_openpose_parts_of_the_picture_instead_of_pixels(openpose_folder, rig):
 
 
 def test_openpose_of_larger_pictures(openpose_folder, rig):
-    (openpose_folder / "left" / "video_000000000008_keypoints.json").write_text(person([1800.0, 900.0, 0.5] * 25))
+    (openpose_folder / "left" / "video_000000000008_keypoints.json").write_text(
+        person([1800.0, 900.0, 0.5] * 25)
+    )
     refuses(
         openpose_folder,
         rig,
         openpose_folder / "left",
-        "frame 1 has a joint at pixel (1800, 900), far outside the 1001 x 801 picture of the calibration",
+        (
+            "frame 1 has a joint at pixel (1800, 900), far outside the 1001 x 801 picture of the "
+            "calibration"
+        ),
         "give detections from pictures of the calibrated size",
     )
 
@@ -341,7 +463,9 @@ def test_shelf_against_a_plain_reading(shared_data):
             count = int(next(numbers))
             x, y, score = ([float(next(numbers)) for _ in range(count)] for _ in range(3))
             rows = np.flatnonzero((detections.view == 3) & (detections.joint == joint))
-            np.testing.assert_allclose(detections.xy[rows] / [1031, 775], np.transpose([x, y]).reshape(-1, 2))
+            np.testing.assert_allclose(
+                detections.xy[rows] / [1031, 775], np.transpose([x, y]).reshape(-1, 2)
+            )
             np.testing.assert_array_equal(detections.confidence[rows], np.minimum(score, 1))
             rows_of.append(rows)
             candidates += count
@@ -352,7 +476,11 @@ def test_shelf_against_a_plain_reading(shared_data):
                     given[i, k] = float(next(numbers))
         mine = detections.view[detections.pairs[:, 0]] == 3
         found = dict(
-            zip(map(tuple, detections.pairs[mine].tolist()), detections.affinity[mine].tolist(), strict=True)
+            zip(
+                map(tuple, detections.pairs[mine].tolist()),
+                detections.affinity[mine].tolist(),
+                strict=True,
+            )
         )
         assert found == {pair: affinity for pair, affinity in given.items() if affinity > 0}
         assert candidates == np.count_nonzero(detections.view == 3)
@@ -374,20 +502,26 @@ def test_a_corner_of_a_wide_lens_does_not_cost_the_recording(shared_cases):
     rig = read_rig(shared_cases / "lens_corner" / "calibration.toml", unit="mm", up="-y")
     table = read_detections(shared_cases / "lens_corner" / "detections", rig)
     assert len(table) == 60 and len(table[0]) == 72 and 22 not in table[0].joint
-    assert sum("cannot be inverted; 60 joints of 1500 (4.0%) left out" in note for note in table.notes) == 3
+    assert (
+        sum("cannot be inverted; 60 joints of 1500 (4.0%) left out" in note for note in table.notes)
+        == 3
+    )
 
 
 def test_a_lens_that_bends_most_joints_away_is_named(shared_cases):
     rig = read_rig(shared_cases / "lens_corner" / "calibration.toml", unit="mm", up="-y")
     wrong = [
-        replace(each, distortion=20 * each.distortion) if n == 1 else each for n, each in enumerate(rig.cameras)
+        replace(each, distortion=20 * each.distortion) if n == 1 else each
+        for n, each in enumerate(rig.cameras)
     ]
     with pytest.raises(
         InputError,
         match=r"Cam2 cannot be inverted; this holds for .* of this camera; check the"
         r" distortion",
     ):
-        read_detections(shared_cases / "lens_corner" / "detections", replace(rig, cameras=tuple(wrong)))
+        read_detections(
+            shared_cases / "lens_corner" / "detections", replace(rig, cameras=tuple(wrong))
+        )
 
 
 def test_folders_of_unequal_length(shared_cases):
@@ -402,7 +536,11 @@ def test_folders_of_unequal_length(shared_cases):
         (["23087", "23088"], ["walk_Miqus_2_23088", "walk_Miqus_1_23087"], [1, 0]),
         (["int_cam1", "int_cam2"], ["cam02", "cam01"], [1, 0]),
         (["2022-09-19_synced_Cam1", "2022-09-19_synced_Cam2"], ["view_02", "view_01"], [1, 0]),
-        (["2025-04-23_camera_0", "2025-04-23_camera_1"], ["camera_0", "camera_1", "camera_2"], [0, 1]),
+        (
+            ["2025-04-23_camera_0", "2025-04-23_camera_1"],
+            ["camera_0", "camera_1", "camera_2"],
+            [0, 1],
+        ),
         (["Left", "Right"], ["right_cam", "left_cam"], [1, 0]),
         (["a1", "a2"], ["walk_3_x", "walk_4_x"], None),
         (["left", "right"], ["front", "back"], None),

@@ -1,4 +1,6 @@
-"""Detections as MediaPipe's, DeepLabCut's, SLEAP's, YOLO's and others write them: the same people in all."""
+"""Detections as MediaPipe's, DeepLabCut's, SLEAP's, YOLO's and others write them: the same people
+in all.
+"""
 
 import json
 import os
@@ -19,8 +21,9 @@ COCO = SKELETONS["COCO_17"]
 FRAMES = 6
 NAMES: tuple[str, ...] = tuple(
     (
-        "nose left_eye right_eye left_ear right_ear left_shoulder right_shoulder left_elbow right_elbow left_wrist"
-        " right_wrist left_hip right_hip left_knee right_knee left_ankle right_ankle"
+        "nose left_eye right_eye left_ear right_ear left_shoulder right_shoulder left_elbow "
+        "right_elbow left_wrist right_wrist left_hip right_hip left_knee right_knee left_ankle "
+        "right_ankle"
     ).split()
 )
 
@@ -31,7 +34,9 @@ def rig(five_cameras) -> Rig:
 
 
 def random_people(seed: int, size: tuple[int, int]) -> np.ndarray:
-    """(V, T, 2, 17, 3) two people before each camera; nobody in frame 2, one person in frame 3, a joint unseen."""
+    """(V, T, 2, 17, 3) two people before each camera; nobody in frame 2, one person in frame 3, a
+    joint unseen.
+    """
     rng, (width, height) = np.random.default_rng(seed), size
     xy = rng.uniform([100, 100], [width - 100, height - 100], (2, FRAMES, 2, 17, 2)).round(1)
     found = np.concatenate([xy, rng.uniform(0.6, 1.0, (*xy.shape[:-1], 1)).round(2)], axis=-1)
@@ -55,7 +60,12 @@ def openpifpaf(folder: Path, name: str, people: np.ndarray, _: object) -> None:
     (folder / name).mkdir()
     for t, frame in enumerate(person_lists(people)):
         content = [
-            {"keypoints": one.ravel().tolist(), "bbox": [0, 0, 9, 9], "score": 0.9, "category_id": 1}
+            {
+                "keypoints": one.ravel().tolist(),
+                "bbox": [0, 0, 9, 9],
+                "score": 0.9,
+                "category_id": 1,
+            }
             for one in frame
         ]
         (folder / name / f"img_{t:05d}.jpg.predictions.json").write_text(json.dumps(content))
@@ -64,7 +74,10 @@ def openpifpaf(folder: Path, name: str, people: np.ndarray, _: object) -> None:
 def openpifpaf_video(folder: Path, name: str, people: np.ndarray, _: object) -> None:
     lines = [
         json.dumps(
-            {"frame": t, "predictions": [{"keypoints": one.ravel().tolist(), "score": 0.9} for one in frame]}
+            {
+                "frame": t,
+                "predictions": [{"keypoints": one.ravel().tolist(), "score": 0.9} for one in frame],
+            }
         )
         for t, frame in enumerate(person_lists(people))
     ]
@@ -93,7 +106,8 @@ def yolo(folder: Path, name: str, people: np.ndarray, size: tuple[int, int]) -> 
     for t, frame in enumerate(person_lists(people)):
         rows = [
             " ".join(
-                f"{number:g}" for number in (0, 0.5, 0.5, 0.2, 0.2, *(one / (*size, 1)).ravel().round(7), 0.9, 3)
+                f"{number:g}"
+                for number in (0, 0.5, 0.5, 0.2, 0.2, *(one / (*size, 1)).ravel().round(7), 0.9, 3)
             )
             for one in frame
         ]
@@ -101,7 +115,9 @@ def yolo(folder: Path, name: str, people: np.ndarray, size: tuple[int, int]) -> 
             (folder / name / "labels" / f"clip_{t}.txt").write_text("\n".join(rows) + "\n")
 
 
-def sleap(folder: Path, name: str, people: np.ndarray, _: object, *, standard: bool = False) -> None:
+def sleap(
+    folder: Path, name: str, people: np.ndarray, _: object, *, standard: bool = False
+) -> None:
     h5py = pytest.importorskip("h5py", reason="an extra")
     with h5py.File(folder / f"{name}.analysis.h5", "w") as file:
         xy, score = people[..., :2], people[..., 2]
@@ -109,7 +125,9 @@ def sleap(folder: Path, name: str, people: np.ndarray, _: object, *, standard: b
         tracks = file.create_dataset(
             "tracks", data=xy if standard else xy.transpose(1, 3, 2, 0), compression="gzip"
         )
-        scores = file.create_dataset("point_scores", data=score if standard else score.transpose(1, 2, 0))
+        scores = file.create_dataset(
+            "point_scores", data=score if standard else score.transpose(1, 2, 0)
+        )
         if standard:
             tracks.attrs["dims"] = json.dumps(["frame", "track", "node", "xy"])
             scores.attrs["dims"] = json.dumps(["frame", "track", "node"])
@@ -142,11 +160,22 @@ def deeplabcut(folder: Path, name: str, people: np.ndarray, _: object) -> None:
 
 
 def deeplabcut_hdf5(folder: Path, name: str, people: np.ndarray, _: object) -> None:
-    """As pandas writes a table: names of columns as a pickle, a part of the cage in a block of its own."""
+    """As pandas writes a table: names of columns as a pickle, a part of the cage in a block of its
+    own.
+    """
     h5py = pytest.importorskip("h5py", reason="an extra")
     axes = ("x", "y", "likelihood")
-    columns = [("DLC_resnet50", one, part, axis) for one in ("one", "two") for part in NAMES for axis in axes]
-    kind = [("index", "<i8"), ("values_block_0", "<f8", (len(columns),)), ("values_block_1", "<i8", (1,))]
+    columns = [
+        ("DLC_resnet50", one, part, axis)
+        for one in ("one", "two")
+        for part in NAMES
+        for axis in axes
+    ]
+    kind = [
+        ("index", "<i8"),
+        ("values_block_0", "<f8", (len(columns),)),
+        ("values_block_1", "<i8", (1,)),
+    ]
     rows = np.zeros(len(people), dtype=kind)
     rows["index"], rows["values_block_0"] = np.arange(len(people)), people.reshape(len(people), -1)
     with h5py.File(folder / f"walk_{name}DLC_resnet50_walkMay3shuffle1_100000.h5", "w") as file:
@@ -155,12 +184,23 @@ def deeplabcut_hdf5(folder: Path, name: str, people: np.ndarray, _: object) -> N
             table.attrs[f"values_block_{block}_kind"] = np.bytes_(pickle.dumps(own, 0))
 
 
-PEOPLE = [openpifpaf, openpifpaf_video, ultralytics_json, yolo, sleap, sleap_standard, deeplabcut, deeplabcut_hdf5]
+PEOPLE = [
+    openpifpaf,
+    openpifpaf_video,
+    ultralytics_json,
+    yolo,
+    sleap,
+    sleap_standard,
+    deeplabcut,
+    deeplabcut_hdf5,
+]
 """Write several people of one camera."""
 
 
 def alphapose_people(people: np.ndarray) -> np.ndarray:
-    """COCO's 17 in OpenPose's order of 18, as AlphaPose makes it: the neck in the middle of the shoulders."""
+    """COCO's 17 in OpenPose's order of 18, as AlphaPose makes it: the neck in the middle of the
+    shoulders.
+    """
     order = [0, 17, 6, 8, 10, 5, 7, 9, 12, 14, 16, 11, 13, 15, 2, 1, 4, 3]
     neck = people[..., [5, 6], :].mean(axis=-2, keepdims=True)
     return np.concatenate([people, neck], axis=-2)[..., order, :]
@@ -177,7 +217,9 @@ def test_the_same_people_come_of_every_program(write, rig, people, tmp_path):
         for view, camera in enumerate(rig.cameras):
             there = [one for one in people[view, t] if np.isfinite(one).any()]
             for joint, name in enumerate(COCO.joints[:17]):
-                own = (table[t].view == view) & (table[t].joint == table.skeleton.joints.index(name))
+                own = (table[t].view == view) & (
+                    table[t].joint == table.skeleton.joints.index(name)
+                )
                 expected = [one[joint] for one in there if np.isfinite(one[joint]).all()]
                 assert own.sum() == len(expected), (t, view, name)
                 if expected:
@@ -185,11 +227,15 @@ def test_the_same_people_come_of_every_program(write, rig, people, tmp_path):
                     gap = np.linalg.norm(table[t].xy[own][:, None] - xy[None], axis=2)
                     assert gap.min(axis=0).max() < 0.01
                     np.testing.assert_allclose(
-                        np.sort(table[t].confidence[own]), np.sort(np.array(expected)[:, 2]), atol=1e-6
+                        np.sort(table[t].confidence[own]),
+                        np.sort(np.array(expected)[:, 2]),
+                        atol=1e-6,
                     )
 
 
-def alphapose(folder: Path, rig: Rig, people: np.ndarray, key: str = "bodies", *, separate: bool = False) -> None:
+def alphapose(
+    folder: Path, rig: Rig, people: np.ndarray, key: str = "bodies", *, separate: bool = False
+) -> None:
     """By `--format open` (people) or cmu (bodies): one file, and one for each picture."""
     inner = "pose_keypoints_2d" if key == "people" else "joints"
     for name, own in zip(rig.names, people, strict=True):
@@ -235,8 +281,14 @@ def same_as_mediapipe(table, people: np.ndarray, rig: Rig) -> None:
     assert len(table) == FRAMES and table.skeleton.name == "BLAZEPOSE_33"
     for t in (0, 1, 4):
         for view, camera in enumerate(rig.cameras):
-            for name, joint in (("Nose", "nose"), ("LKnee", "left_knee"), ("RWrist", "right_wrist")):
-                own = (table[t].view == view) & (table[t].joint == table.skeleton.joints.index(name))
+            for name, joint in (
+                ("Nose", "nose"),
+                ("LKnee", "left_knee"),
+                ("RWrist", "right_wrist"),
+            ):
+                own = (table[t].view == view) & (
+                    table[t].joint == table.skeleton.joints.index(name)
+                )
                 xy = camera.undistort(people[view, t, :1, NAMES.index(joint), :2])
                 np.testing.assert_allclose(table[t].xy[own], xy, atol=0.01)
     assert len(table[2]) == 0
@@ -247,7 +299,9 @@ def test_freemocap_s_array_of_all_cameras(points, depth, rig, people, tmp_path):
     """Hands and face follow the body; a third number is MediaPipe's depth, which is no score."""
     found = mediapipe(people, points)
     if depth:
-        found = np.concatenate([found, np.random.default_rng(1).normal(0, 200, (*found.shape[:3], 1))], axis=3)
+        found = np.concatenate(
+            [found, np.random.default_rng(1).normal(0, 200, (*found.shape[:3], 1))], axis=3
+        )
     file = tmp_path / "mediapipe_2dData_numCams_numFrames_numTrackedPoints_pixelXY.npy"
     np.save(file, found)
     for place in (tmp_path, file):
@@ -259,13 +313,17 @@ def test_freemocap_s_array_of_all_cameras(points, depth, rig, people, tmp_path):
 def caliscope(folder: Path, rig: Rig, people: np.ndarray) -> None:
     """One person's body, and a point of a hand."""
     found = mediapipe(people, 33)
-    lines = ["sync_index,port,frame_index,frame_time,point_id,img_loc_x,img_loc_y,obj_loc_x,obj_loc_y"]
+    lines = [
+        "sync_index,port,frame_index,frame_time,point_id,img_loc_x,img_loc_y,obj_loc_x,obj_loc_y"
+    ]
     for view in range(2):
         for t in range(FRAMES):
             if np.isfinite(found[view, t]).any():
                 lines += [
                     f"{t},{view},{t},{100 + t / 30},{point},{x},{y},,"
-                    for point, (x, y) in enumerate(np.where(np.isnan(found[view, t]), 50, found[view, t]).tolist())
+                    for point, (x, y) in enumerate(
+                        np.where(np.isnan(found[view, t]), 50, found[view, t]).tolist()
+                    )
                 ]
                 lines.append(f"{t},{view},{t},{100 + t / 30},201,7,7,,")
     (folder / "xy_POSE.csv").write_text("\n".join(lines) + "\n")
@@ -273,7 +331,9 @@ def caliscope(folder: Path, rig: Rig, people: np.ndarray) -> None:
 
 def test_caliscope_s_points_of_all_cameras(rig, people, tmp_path):
     caliscope(tmp_path, rig, people)
-    named = Rig(tuple(replace(camera, name=f"cam_{n}") for n, camera in enumerate(rig.cameras)), "z")
+    named = Rig(
+        tuple(replace(camera, name=f"cam_{n}") for n, camera in enumerate(rig.cameras)), "z"
+    )
     same_as_mediapipe(read_detections(tmp_path, named), people, named)
 
 
@@ -307,7 +367,11 @@ REFUSED = [
     ("a.npz", b"PK\x03\x04", "a NumPy archive, which has no standard layout; convert"),
     ("a.mat", b"MATLAB 5.0", "a MATLAB file, which has no standard layout; convert"),
     ("a.pkl", b"\x80\x04", "a Python pickle, which could run code and is not opened; convert"),
-    ("a.slp", b"\x89HDF\r\n\x1a\n", r"a SLEAP project; export the analysis HDF5: sio export FILE\.slp"),
+    (
+        "a.slp",
+        b"\x89HDF\r\n\x1a\n",
+        r"a SLEAP project; export the analysis HDF5: sio export FILE\.slp",
+    ),
     ("mediapipe_body_3d_xyz.csv", b"frame,x,y,z\n", "FreeMoCap's table of 3D points.*pixelXY"),
     ("a.npy", b"\x93NUMPY", "a NumPy array, of which only FreeMoCap's"),
 ]
@@ -341,7 +405,9 @@ def test_arrays_that_could_run_code_or_read_elsewhere_are_not_opened(rig, tmp_pa
         with h5py.File(tmp_path / f"{name}.h5", "w") as damaged:
             damaged["tracks"] = h5py.ExternalLink(str(tmp_path / "secret.hdf"), "tracks")
             damaged["node_names"] = [each.encode() for each in NAMES]
-    with pytest.raises(InputError, match="only SLEAP's analysis files and DeepLabCut's tables are supported"):
+    with pytest.raises(
+        InputError, match="only SLEAP's analysis files and DeepLabCut's tables are supported"
+    ):
         read_detections(tmp_path, rig)
     for name in rig.names:
         (tmp_path / f"{name}.h5").write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(range(256)) * 8)
@@ -349,7 +415,9 @@ def test_arrays_that_could_run_code_or_read_elsewhere_are_not_opened(rig, tmp_pa
         read_detections(tmp_path, rig)
     for name in rig.names:
         with h5py.File(tmp_path / f"{name}.h5", "w") as huge:
-            huge.create_dataset("tracks", shape=(10**5, 2, 17, 10**5), dtype="f8", chunks=(1, 2, 17, 100))
+            huge.create_dataset(
+                "tracks", shape=(10**5, 2, 17, 10**5), dtype="f8", chunks=(1, 2, 17, 100)
+            )
             huge["node_names"] = [each.encode() for each in NAMES]
     with pytest.raises(InputError, match="are too large"):
         read_detections(tmp_path, rig)
@@ -360,7 +428,9 @@ class Harmful:
         return os.mkdir, ("harm",)
 
 
-def test_names_of_columns_are_read_without_carrying_out_their_pickle(rig, people, tmp_path, monkeypatch):
+def test_names_of_columns_are_read_without_carrying_out_their_pickle(
+    rig, people, tmp_path, monkeypatch
+):
     h5py = pytest.importorskip("h5py", reason="an extra")
     monkeypatch.chdir(tmp_path)
     for kind, says in (
@@ -369,7 +439,10 @@ def test_names_of_columns_are_read_without_carrying_out_their_pickle(rig, people
         (b"(lp0\nVa\n", "damaged HDF5"),
         (b"g7\n.", "damaged HDF5"),
         (b"(l(Va\nta.", "only SLEAP's analysis files and"),
-        (pickle.dumps([("s", "nose", "x"), ("s", "nose", "y")], 0), "its columns do not match their names"),
+        (
+            pickle.dumps([("s", "nose", "x"), ("s", "nose", "y")], 0),
+            "its columns do not match their names",
+        ),
     ):
         for name, own in zip(rig.names, people, strict=True):
             deeplabcut_hdf5(tmp_path, name, own, None)
@@ -385,10 +458,19 @@ def test_names_of_columns_are_read_without_carrying_out_their_pickle(rig, people
     ("text", "says"),
     [
         ("scorer,a,a\nbodyparts,nose,nose\n", "no rows bodyparts and coords"),
-        ("scorer,a,a\nbodyparts,nose,nose\ncoords,x,likelihood\n0,1,2\n", "must have the columns x and y"),
+        (
+            "scorer,a,a\nbodyparts,nose,nose\ncoords,x,likelihood\n0,1,2\n",
+            "must have the columns x and y",
+        ),
         ("scorer,a,a\nbodyparts,nose,nose\ncoords,x,y\n0,1\n", "line 4 must hold 3 fields, got 2"),
-        ("scorer,a,a\nbodyparts,nose,nose\ncoords,x,y\n0,1,b\n", "line 4 must hold numbers, got 'b'"),
-        ("scorer,a,a\nbodyparts,nose,nose\ncoords,x,y\n1,1,2\n1,1,2\n", "line 5: frame numbers must increase"),
+        (
+            "scorer,a,a\nbodyparts,nose,nose\ncoords,x,y\n0,1,b\n",
+            "line 4 must hold numbers, got 'b'",
+        ),
+        (
+            "scorer,a,a\nbodyparts,nose,nose\ncoords,x,y\n1,1,2\n1,1,2\n",
+            "line 5: frame numbers must increase",
+        ),
         ("scorer,a,a\nbodyparts,nose,nose\ncoords,x,y\n", "no frames"),
     ],
 )

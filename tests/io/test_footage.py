@@ -21,7 +21,11 @@ from shapepose_fg.io.footage.places import find_footage
 
 
 def video(
-    path: Path, frames: int = 12, size: tuple[int, int] = (96, 64), fps: float = 25, codec: str = "mp4v"
+    path: Path,
+    frames: int = 12,
+    size: tuple[int, int] = (96, 64),
+    fps: float = 25,
+    codec: str = "mp4v",
 ) -> Path:
     """A video whose frame i has the grey level 10 + 15 i."""
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), fps, size)
@@ -69,7 +73,9 @@ def test_damaged_videos_are_refused(tmp_path, capfd):
     bad = tmp_path / "bad.mp4"
     for content in (b"", b"no video", whole[: len(whole) // 2]):
         bad.write_bytes(content)
-        with pytest.raises(InputError, match=r"bad\.mp4: cannot be read as a video; give another copy"):
+        with pytest.raises(
+            InputError, match=r"bad\.mp4: cannot be read as a video; give another copy"
+        ):
             open_footage(bad)
     assert "OpenCV" not in (err := capfd.readouterr().err) and "WARN" not in err
     with pytest.raises(InputError, match="there is no such video"):
@@ -97,7 +103,9 @@ def test_pictures_are_told_by_the_last_number_in_their_names(tmp_path):
     assert read.number.tolist() == [7, 8, 9, 10] and read.time_s is None
     assert [level(read.at(place)) for place in range(4)] == [70, 80, 90, 100]
     (tmp_path / "cam" / "take2_8.png").unlink()
-    assert open_footage(tmp_path / "cam").notes == (f"{tmp_path / 'cam'}: 1 of 4 pictures are missing",)
+    assert open_footage(tmp_path / "cam").notes == (
+        f"{tmp_path / 'cam'}: 1 of 4 pictures are missing",
+    )
     picture(tmp_path / "cam" / "take2_9.png", size=(8, 8))
     assert open_footage(tmp_path / "cam").at(1) is None  # of another size
     assert open_footage(picture(tmp_path / "view_3.jpg")).number.tolist() == [0]
@@ -136,7 +144,8 @@ def touched(folder: Path, *names: str) -> Path:
     (("cam1/0.png", "cam2/0.png", "cam3/0.png"), ("cam1", "cam2")),
     (("take_cam1.avi", "take_cam2.avi"), ("take_cam1.avi", "take_cam2.avi")),
     (("video01.mp4", "video02.mp4"), ("video01.mp4", "video02.mp4")),
-    (("videos/cam1.mp4", "videos/cam2.mp4", "calibration.toml"), ("videos/cam1.mp4", "videos/cam2.mp4")),
+    (("videos/cam1.mp4", "videos/cam2.mp4", "calibration.toml"),
+     ("videos/cam1.mp4", "videos/cam2.mp4")),
     (("view_1.jpg", "view_2.jpg"), ("view_1.jpg", "view_2.jpg")),
 ])  # fmt: skip
 def test_footage_is_found_as_people_lay_it_out(tmp_path, names, found):
@@ -153,7 +162,9 @@ def test_footage_camera_by_camera(tmp_path):
 
 def test_footage_that_is_not_found_is_named(tmp_path):
     folder = str(touched(tmp_path / "some", "cam1.mp4", "other.mp4"))
-    with pytest.raises(InputError, match=r"nothing in it is named after camera cam2; it contains cam1\.mp4 other"):
+    with pytest.raises(
+        InputError, match=r"nothing in it is named after camera cam2; it contains cam1\.mp4 other"
+    ):
         find_footage([folder], CAMERAS)
     touched(tmp_path / "some", "cam2.mp4", "cam2/1.png")
     with pytest.raises(InputError, match=r"cam2 and cam2\.mp4 all match camera cam2"):
@@ -162,7 +173,10 @@ def test_footage_that_is_not_found_is_named(tmp_path):
         ([str(tmp_path / "none")], "there is no such folder"),
         ([f"{folder}/cam1.mp4"], "this is one file"),
         (["cam9=x.mp4", "cam1=y.mp4"], "no camera 'cam9'; there are cam1 cam2"),
-        ([f"cam1={folder}/cam1.mp4"], "there is no footage for camera cam2; add --videos cam2=PATH"),
+        (
+            [f"cam1={folder}/cam1.mp4"],
+            "there is no footage for camera cam2; add --videos cam2=PATH",
+        ),
         (["cam1=x.mp4", "cam1=y.mp4"], "camera cam1 is given twice"),
         (["cam1=x.mp4", "cam2=y.mp4"], "x.mp4: there is no such file or folder"),
         ([folder, "cam2=y.mp4"], "must be CAMERA=VALUE, such as --videos cam1=VALUE"),
@@ -185,8 +199,9 @@ def test_sizes_that_can_only_mean_one_thing_are_placed(picture_size, kind, note)
 
 
 @pytest.mark.parametrize("picture_size, problem", [
-    ((960, 512), "camera c: the pictures have 960 x 512 pixels, but the calibration is for 1920 x 1080; give"
-        " --image-placement"),
+    ((960, 512),
+     ("camera c: the pictures have 960 x 512 pixels, but the calibration is for 1920 x 1080; "
+        "give --image-placement")),
     ((1080, 1920), "rotated by 90 degrees"),
 ])  # fmt: skip
 def test_other_sizes_are_the_user_s_to_explain(picture_size, problem):
@@ -195,7 +210,9 @@ def test_other_sizes_are_the_user_s_to_explain(picture_size, problem):
 
 
 def test_letterboxed_pixels_are_where_the_recording_s_own_formula_puts_them():
-    """CMU Panoptic's demo: u' = s (u - 960) + 480, v' = s (v - 540) + 256, s = 512 / 1080; to half a pixel."""
+    """CMU Panoptic's demo: u' = s (u - 960) + 480, v' = s (v - 540) + 256, s = 512 / 1080; to half
+    a pixel.
+    """
     placement, _ = place("c", (960, 512), (1920, 1080), PlacementKind.LETTERBOX)
     u = np.array([[0.0, 0], [960, 540], [1919, 1079], [300, 700]])
     s = 512 / 1080
@@ -234,7 +251,8 @@ def test_what_was_used_is_read_back(tmp_path):
         (text.replace('"letterbox"', '"folded"'), r"cameras\[0\]\.placement must be"),
         (
             text.replace("960", "0"),
-            r"cameras\[0\]\.picture_size\[0\] is not valid: input should be greater than or equal to 1",
+            r"cameras\[0\]\.picture_size\[0\] is not valid: input should be greater than or equal"
+            r" to 1",
         ),
         (text[:50], "is not JSON"),
     ):
@@ -256,7 +274,8 @@ def test_rates_are_a_hundredth_to_a_hundred_thousand_frames_a_second(text):
 
 
 @pytest.mark.parametrize(
-    ("text", "seconds"), [(None, 0.0), ("0.2s", 0.2), ("-3f", -0.12), (" .5 s ", 0.5), ("12 f", 0.48)]
+    ("text", "seconds"),
+    [(None, 0.0), ("0.2s", 0.2), ("-3f", -0.12), (" .5 s ", 0.5), ("12 f", 0.48)],
 )
 def test_starts_are_seconds_or_the_camera_s_own_frames(text, seconds):
     assert typed_start(text, 0.04, True) == pytest.approx(seconds)

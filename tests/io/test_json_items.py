@@ -1,4 +1,6 @@
-"""Items of a JSON file that may be larger than memory: as `json` decodes them, mistakes told as by `read_json`."""
+"""Items of a JSON file that may be larger than memory: as `json` decodes them, mistakes told as by
+`read_json`.
+"""
 
 import json
 import re
@@ -28,7 +30,9 @@ PIECES = (1, 2, 3, 7, 50, 2**20)
 
 @pytest.fixture(params=PIECES)
 def piece(request, monkeypatch) -> int:
-    """Bytes that are read at a time: every place of the files below is a border of two pieces once."""
+    """Bytes that are read at a time: every place of the files below is a border of two pieces
+    once.
+    """
     monkeypatch.setattr(files, "PIECE", request.param)
     return request.param
 
@@ -79,10 +83,11 @@ def test_nothing_in_the_list(tmp_path, piece):
 
 
 MISTAKES = [
-    "[{]", '[1, 2', '[1,\n 2,\n x]', '[{"a": 1}\n {"a": 2}]', '["unfinished', '[tru]', "[1]]", "[1] 2",
-    '{"wanted": [1, 2]', '{"wanted": [1], "x": }', '{"wanted": [1]} }', '{"x": 1 "wanted": []}', '{"x": tru}',
-    '["\\u00e"]', '["\\x"]', '[\n\n  "a\tb"]', "",  "  \n", "[nul", "[1 2]", '{"a"', '{1: 2}', "[\n1,\n\n 2 3]",
-    '{"x": 1, "x": 2}', '{"wanted": [], "wanted": []}', '[{"a": 1, "a": 2}]', '[' + "[" * 70 + "]" * 71,
+    "[{]", '[1, 2', '[1,\n 2,\n x]', '[{"a": 1}\n {"a": 2}]', '["unfinished', '[tru]', "[1]]",
+    "[1] 2", '{"wanted": [1, 2]', '{"wanted": [1], "x": }', '{"wanted": [1]} }',
+    '{"x": 1 "wanted": []}', '{"x": tru}', '["\\u00e"]', '["\\x"]', '[\n\n  "a\tb"]', "",  "  \n",
+    "[nul", "[1 2]", '{"a"', '{1: 2}', "[\n1,\n\n 2 3]", '{"x": 1, "x": 2}',
+    '{"wanted": [], "wanted": []}', '[{"a": 1, "a": 2}]', '[' + "[" * 70 + "]" * 71,
 ]  # fmt: skip
 
 

@@ -1,4 +1,6 @@
-"""Which joints keypoints are: names in the files, a project's settings, the user's word, their number."""
+"""Which joints keypoints are: names in the files, a project's settings, the user's word, their
+number.
+"""
 
 import json
 from pathlib import Path
@@ -26,14 +28,21 @@ K = np.array([[1000.0, 0, 500], [0, 1000, 400], [0, 0, 1]])
 def rig() -> Rig:
     poses = [np.eye(4), np.eye(4)]
     poses[1][0, 3] = 1
-    return Rig(tuple(Camera(name, K, pose, (1001, 801)) for name, pose in zip("ab", poses, strict=True)), "-y")
+    return Rig(
+        tuple(Camera(name, K, pose, (1001, 801)) for name, pose in zip("ab", poses, strict=True)),
+        "-y",
+    )
 
 
 def spelt(point: str) -> str:
     """A joint as COCO and MMPose spell it."""
     if point in ("head", "Head", "spine2"):
         return {"head": "upper_neck", "Head": "head_top", "spine2": "spine"}[point]
-    return {"R": "right_", "L": "left_"}.get(point[0], "") + point[1:].lower() if point[1:2].isupper() else point
+    return (
+        {"R": "right_", "L": "left_"}.get(point[0], "") + point[1:].lower()
+        if point[1:2].isupper()
+        else point
+    )
 
 
 def person(names: list[str]) -> list[list[float]]:
@@ -63,7 +72,9 @@ def written(folder: Path, *contents: dict) -> Path:
 
 
 def places(table) -> dict[str, float]:
-    """The column of each joint of the first camera's first person, which tells its place among the keypoints."""
+    """The column of each joint of the first camera's first person, which tells its place among the
+    keypoints.
+    """
     first = table[0].only(table[0].view == 0)
     made = [joint for joint, _, _ in table.skeleton.middles]
     return {
@@ -82,7 +93,10 @@ def test_names_in_the_file_are_obeyed_in_any_order(tmp_path, rig, skeleton, writ
     order = np.random.default_rng(3).permutation(skeleton.keypoint_count)
     names = [keypoint_names(skeleton)[place] for place in order]
     spelled = [spelt(name) for name in names]
-    meta = {"dataset_name": "coco", "keypoint_id2name": {str(n): name for n, name in enumerate(spelled)}}
+    meta = {
+        "dataset_name": "coco",
+        "keypoint_id2name": {str(n): name for n, name in enumerate(spelled)},
+    }
     content = data_set(spelled, len(names)) if write == "data set" else video(meta, len(names))
     table = read_detections(written(tmp_path, content), rig)
     assert places(table) == {name: place for place, name in enumerate(names)}
@@ -90,8 +104,14 @@ def test_names_in_the_file_are_obeyed_in_any_order(tmp_path, rig, skeleton, writ
 
 
 def test_a_data_set_s_name_is_obeyed(tmp_path, rig):
-    assert read_detections(written(tmp_path, video({"dataset_name": "h36m"}, 17)), rig).skeleton.name == "H36M_17"
-    assert read_detections(written(tmp_path, video({"dataset_name": "coco"}, 17)), rig).skeleton is COCO_17
+    assert (
+        read_detections(written(tmp_path, video({"dataset_name": "h36m"}, 17)), rig).skeleton.name
+        == "H36M_17"
+    )
+    assert (
+        read_detections(written(tmp_path, video({"dataset_name": "coco"}, 17)), rig).skeleton
+        is COCO_17
+    )
     table = read_detections(written(tmp_path, video({"dataset_name": "horse10"}, 17)), rig)
     assert any("names horse10, which are not a known layout" in note for note in table.notes)
 
@@ -120,16 +140,25 @@ def test_names_that_cannot_be_are_refused(tmp_path, rig):
 
 
 def test_the_user_s_word_goes_before_the_file_s_and_it_is_said(tmp_path, rig):
-    table = read_detections(written(tmp_path, data_set(keypoint_names(COCO_17)[::-1], 17)), rig, "COCO_17")
+    table = read_detections(
+        written(tmp_path, data_set(keypoint_names(COCO_17)[::-1], 17)), rig, "COCO_17"
+    )
     assert table.skeleton is COCO_17
-    assert any("names its joints, but they are read as COCO_17, as requested" in note for note in table.notes)
+    assert any(
+        "names its joints, but they are read as COCO_17, as requested" in note
+        for note in table.notes
+    )
 
 
-@pytest.mark.parametrize("names", [None, [], [f"kp{n}" for n in range(17)]], ids=["none", "empty", "numbers"])
+@pytest.mark.parametrize(
+    "names", [None, [], [f"kp{n}" for n in range(17)]], ids=["none", "empty", "numbers"]
+)
 def test_files_without_names_are_read_by_their_number(tmp_path, rig, names):
     table = read_detections(written(tmp_path, data_set(names, 17)), rig)
     assert table.skeleton is COCO_17
-    assert any("17 keypoints per person without joint names: read as COCO_17" in n for n in table.notes)
+    assert any(
+        "17 keypoints per person without joint names: read as COCO_17" in n for n in table.notes
+    )
 
 
 def test_mmpose_s_pictures_of_its_demo_are_read(tmp_path, rig):
@@ -138,7 +167,10 @@ def test_mmpose_s_pictures_of_its_demo_are_read(tmp_path, rig):
     for name in "ab":
         (tmp_path / name).mkdir()
         for frame in range(3):
-            content = {"meta_info": meta, "instance_info": video({}, 17)["instance_info"][0]["instances"]}
+            content = {
+                "meta_info": meta,
+                "instance_info": video({}, 17)["instance_info"][0]["instances"],
+            }
             (tmp_path / name / f"results_{frame:06d}.json").write_text(json.dumps(content))
     table = read_detections(tmp_path, rig)
     assert len(table) == 3 and places(table) == {name: place for place, name in enumerate(names)}
@@ -152,8 +184,10 @@ def project(folder: Path, pose: str, count: int = 25) -> Path:
     """A Pose2Sim project whose people have `count` keypoints, and [pose] says `pose`."""
     (folder / "calibration").mkdir(parents=True)
     table = (
-        '[{0}]\nname = "{0}"\nsize = [1001.0, 801.0]\nmatrix = [[1000.0, 0, 500], [0, 1000.0, 400], [0, 0, 1]]\n'
-        "distortions = [0.0, 0.0, 0.0, 0.0]\nrotation = [0.0, 0.0, 0.0]\ntranslation = [{1}, 0.0, 0.0]\n"
+        '[{0}]\nname = "{0}"\nsize = [1001.0, 801.0]\n'
+        "matrix = [[1000.0, 0, 500], [0, 1000.0, 400], [0, 0, 1]]\n"
+        "distortions = [0.0, 0.0, 0.0, 0.0]\nrotation = [0.0, 0.0, 0.0]\n"
+        "translation = [{1}, 0.0, 0.0]\n"
         "fisheye = false\n"
     )
     calibration = table.format("a", "0.0") + table.format("b", "1.0")
@@ -199,7 +233,12 @@ id = "None"
         ("[pose]\npose_model = 'COCO'", 18, "COCO_18", "names COCO"),
         ("[pose]\npose_model = 'MPII'", 15, "MPI_15", "names MPII"),
         ("[pose]\npose_model = 'BLAZEPOSE'", 33, "BLAZEPOSE_33", "names BLAZEPOSE"),
-        ("[pose]\npose_model = 'Body_with_feet'", 17, "COCO_17", "which have 26 keypoints instead of 17"),
+        (
+            "[pose]\npose_model = 'Body_with_feet'",
+            17,
+            "COCO_17",
+            "which have 26 keypoints instead of 17",
+        ),
         ("[pose]\npose_model = 'unheard_of'", 17, "COCO_17", "which are not a known layout"),
         ("[pose]\n", 17, "COCO_17", "without joint names"),
         (CUSTOM, 8, "NAMED_8", "names its joints"),
@@ -221,7 +260,9 @@ def test_a_project_that_makes_no_sense_is_refused(tmp_path):
 def test_human36m_s_names_in_a_real_coco_file(shared_cases):
     rig = read_rig(shared_cases / "body25b" / "Calib_qca.toml")
     table = read_detections(shared_cases / "h36m_coco" / "detections_end_to_end", rig)
-    assert {"MidHip", "LHip", "RHip", "Neck", "Head", "LAnkle", "RWrist"} <= set(table.skeleton.joints)
+    assert {"MidHip", "LHip", "RHip", "Neck", "Head", "LAnkle", "RWrist"} <= set(
+        table.skeleton.joints
+    )
     # The feet are where people stand: the lowest in every picture.
     frame = table[0]
     ankles = np.isin(frame.joint, [table.skeleton.index("LAnkle"), table.skeleton.index("RAnkle")])
@@ -244,7 +285,9 @@ def looks(points: list[str], people: int, seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     known = [point or "Nose" for point in points]
     body = BodyModel.default().with_keypoints(tuple(dict.fromkeys(known)))
-    turn = np.column_stack([rng.normal(0, 0.2, people), rng.uniform(-3, 3, people), np.zeros(people)])
+    turn = np.column_stack(
+        [rng.normal(0, 0.2, people), rng.uniform(-3, 3, people), np.zeros(people)]
+    )
     poses, nowhere = PosePrior.default().sample(rng, people), np.zeros((people, 3))
     xyz = body.keypoints(BodyParameters(rng.normal(0, 0.7, (people, 10)), turn, poses, nowhere))
     xyz = xyz[:, [body.keypoint_names.index(point) for point in known]]
@@ -282,7 +325,9 @@ def test_how_people_look_tells_layouts_of_one_number_apart(tmp_path, rig, skelet
         "POSETRACK_17",
         "COCO_17",
     )
-    assert any(f"without joint names: read as {table.skeleton.name}" in note for note in table.notes)
+    assert any(
+        f"without joint names: read as {table.skeleton.name}" in note for note in table.notes
+    )
 
 
 def test_a_few_people_are_enough_for_layouts_that_differ_much(tmp_path, rig):
@@ -292,16 +337,21 @@ def test_a_few_people_are_enough_for_layouts_that_differ_much(tmp_path, rig):
 
 
 def test_people_who_look_like_no_layout_leave_the_most_usual_and_it_is_said(tmp_path, rig):
-    mixed = looks(keypoint_names(SKELETONS["BODY_25B"]), 60, 1)[:, np.random.default_rng(0).permutation(25)]
+    mixed = looks(keypoint_names(SKELETONS["BODY_25B"]), 60, 1)[
+        :, np.random.default_rng(0).permutation(25)
+    ]
     mixed[..., :2] = np.random.default_rng(1).uniform(200, 600, mixed[..., :2].shape)
     table = read_detections(results(tmp_path, a=mixed, b=mixed), rig)
-    assert table.skeleton is BODY_25 and any("people look like none of them" in note for note in table.notes)
+    assert table.skeleton is BODY_25 and any(
+        "people look like none of them" in note for note in table.notes
+    )
 
 
 def test_cameras_of_two_models_are_refused(tmp_path, rig):
     one, other = (looks(keypoint_names(SKELETONS[name]), 60, 1) for name in ("BODY_25", "BODY_25B"))
     with pytest.raises(
-        InputError, match=r"people look like BODY_25, those of .* like BODY_25B; give the detections"
+        InputError,
+        match=r"people look like BODY_25, those of .* like BODY_25B; give the detections",
     ):
         read_detections(results(tmp_path, a=one, b=other), rig)
 
@@ -338,22 +388,36 @@ def test_names_are_text_of_strangers(tmp_path, rig):
 
 
 def median_error_m(people, joints: np.ndarray, names: list[str]) -> float:
-    """Median over joints and frames of the distance to one person's (T, K, 3) joints, of who is nearest."""
-    shared = [name for name in people.joint_names.tolist() if name in names and name not in ("Neck", "Head")]
+    """Median over joints and frames of the distance to one person's (T, K, 3) joints, of who is
+    nearest.
+    """
+    shared = [
+        name
+        for name in people.joint_names.tolist()
+        if name in names and name not in ("Neck", "Head")
+    ]
     found = people.joints[:, [people.joint_names.tolist().index(name) for name in shared]]
     wanted = joints[people.frame][:, [names.index(name) for name in shared]]
     apart = np.linalg.norm(found - wanted, axis=2)
-    return min(float(np.nanmedian(apart[people.person == each])) for each in np.unique(people.person))
+    return min(
+        float(np.nanmedian(apart[people.person == each])) for each in np.unique(people.person)
+    )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("folder", ["body25b/detections", "h36m_coco/detections_end_to_end"])
 def test_real_people_are_where_pose2sim_has_them(shared_cases, folder):
-    """Pose2Sim's own result of the same detections: 24 mm away, 500 mm with joints of other names."""
+    """Pose2Sim's own result of the same detections: 24 mm away, 500 mm with joints of other
+    names.
+    """
     rows = (shared_cases / "body25b" / "demo_0-100.trc").read_text().split("\n")
     names = [name for name in rows[3].split("\t")[2:] if name.strip()]
-    values = [[float(value or "nan") for value in row.split("\t")[2:]] for row in rows[5:] if row.strip()]
-    truth = np.array([row[: 3 * len(names)] for row in values]).reshape(len(values), -1, 3)[..., [2, 0, 1]]
+    values = [
+        [float(value or "nan") for value in row.split("\t")[2:]] for row in rows[5:] if row.strip()
+    ]
+    truth = np.array([row[: 3 * len(names)] for row in values]).reshape(len(values), -1, 3)[
+        ..., [2, 0, 1]
+    ]
     rig = read_rig(shared_cases / "body25b" / "Calib_qca.toml")
     detections = read_detections(shared_cases / folder, rig)
     frames = Recording(detections.skeleton, [detections[t] for t in range(40)])

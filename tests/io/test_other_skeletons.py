@@ -1,4 +1,6 @@
-"""The whole way from another detector's files: people of the built-in scene, written as COCO's results."""
+"""The whole way from another detector's files: people of the built-in scene, written as COCO's
+results.
+"""
 
 import json
 
@@ -15,7 +17,9 @@ FRAMES = 4
 
 
 def written(folder, skeleton: Skeleton) -> None:
-    """The scene's people as the simulated detector saw and grouped them, without what the skeleton lacks."""
+    """The scene's people as the simulated detector saw and grouped them, without what the skeleton
+    lacks.
+    """
     scene = built_in_scene(frames=FRAMES)
     detections = simulate(scene)
     names = [skeleton.joints[joint] for joint in (skeleton.keypoints or range(len(skeleton)))]
@@ -31,7 +35,9 @@ def written(folder, skeleton: Skeleton) -> None:
                     xy = camera.distort(found.xy[row][None])[0]
                     keypoints[column[found.joint[row]]] = [*xy, found.confidence[row]]
             if np.count_nonzero(keypoints[:, 2]) >= 3:
-                results[camera.name].append({"image_id": frame, "keypoints": keypoints.ravel().tolist()})
+                results[camera.name].append(
+                    {"image_id": frame, "keypoints": keypoints.ravel().tolist()}
+                )
     for name, people in results.items():
         (folder / f"{name}.json").write_text(json.dumps(people))
     write_rig(scene.rig, folder / "rig.json")
@@ -51,9 +57,12 @@ def test_everybody_is_found(tmp_path, skeleton):
     errors = []
     for frame in range(FRAMES):
         truth = scene.truth_at(frame)[:, [BODY_25.index(name) for name in shared]]
-        apart = np.linalg.norm(ours[people.frame == frame][:, None] - truth[None], axis=-1).mean(axis=-1)
+        apart = np.linalg.norm(ours[people.frame == frame][:, None] - truth[None], axis=-1).mean(
+            axis=-1
+        )
         assert sorted(apart.argmin(axis=1)) == list(range(scene.people))
         errors += apart.min(axis=1).tolist()
-    # 18 mm in twelve frames, 19 with BODY_25 of the same scene; a person exchanged would be 500 mm off.
+    # 18 mm in twelve frames, 19 with BODY_25 of the same scene; a person exchanged would be 500 mm
+    # off.
     assert np.mean(errors) < 0.03
     assert np.isfinite(people.betas).all()

@@ -10,7 +10,15 @@ from numpy.typing import NDArray
 
 from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.skeleton import BODY_25, COCO_17, COCO_18, COCO_133, HALPE_26, SKELETONS, Skeleton
+from shapepose_fg.core.skeleton import (
+    BODY_25,
+    COCO_17,
+    COCO_18,
+    COCO_133,
+    HALPE_26,
+    SKELETONS,
+    Skeleton,
+)
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detection_table import DetectionTable
 from shapepose_fg.io.detections import read_detections, reading
@@ -26,7 +34,10 @@ def two_cameras(*names: str) -> Rig:
     poses = [np.eye(4) for _ in names]
     for index, pose in enumerate(poses):
         pose[0, 3] = index
-    return Rig(tuple(Camera(name, K, pose, (1001, 801)) for name, pose in zip(names, poses, strict=True)), "-y")
+    return Rig(
+        tuple(Camera(name, K, pose, (1001, 801)) for name, pose in zip(names, poses, strict=True)),
+        "-y",
+    )
 
 
 @pytest.fixture
@@ -53,7 +64,10 @@ def openpose(folder: Path, people: dict) -> None:
     for name, frames in people.items():
         (folder / name).mkdir()
         for number, found in enumerate(frames):
-            content = {"version": 1.3, "people": [{"pose_keypoints_2d": each.ravel().tolist()} for each in found]}
+            content = {
+                "version": 1.3,
+                "people": [{"pose_keypoints_2d": each.ravel().tolist()} for each in found],
+            }
             (folder / name / f"{name}_{number:012d}_keypoints.json").write_text(json.dumps(content))
 
 
@@ -84,14 +98,17 @@ def coco_data_set(folder: Path, people: dict) -> None:
     """With ids that are no frame numbers, and pictures of them."""
     for name, frames in people.items():
         images = [
-            {"id": 700 - number, "file_name": f"{name}/img_{number:05d}.jpg"} for number in range(len(frames))
+            {"id": 700 - number, "file_name": f"{name}/img_{number:05d}.jpg"}
+            for number in range(len(frames))
         ]
         annotations = [
             {"image_id": 700 - number, "keypoints": each.ravel().tolist()}
             for number, found in enumerate(frames)
             for each in found
         ]
-        (folder / f"{name}.json").write_text(json.dumps({"images": images, "annotations": annotations}))
+        (folder / f"{name}.json").write_text(
+            json.dumps({"images": images, "annotations": annotations})
+        )
 
 
 def alphapose(folder: Path, people: dict) -> None:
@@ -113,20 +130,30 @@ def alphapose(folder: Path, people: dict) -> None:
 
 def instances(found: list) -> list[dict]:
     return [
-        {"keypoints": each[:, :2].tolist(), "keypoint_scores": each[:, 2].tolist(), "bbox_score": 0.9}
+        {
+            "keypoints": each[:, :2].tolist(),
+            "keypoint_scores": each[:, 2].tolist(),
+            "bbox_score": 0.9,
+        }
         for each in found
     ]
 
 
 def mmpose_video(folder: Path, people: dict) -> None:
     for name, frames in people.items():
-        content = [{"frame_id": number, "instances": instances(found)} for number, found in enumerate(frames)]
+        content = [
+            {"frame_id": number, "instances": instances(found)}
+            for number, found in enumerate(frames)
+        ]
         (folder / f"{name}.json").write_text(json.dumps(content))
 
 
 def mmpose_demo(folder: Path, people: dict) -> None:
     for name, frames in people.items():
-        info = [{"frame_id": number, "instances": instances(found)} for number, found in enumerate(frames, 1)]
+        info = [
+            {"frame_id": number, "instances": instances(found)}
+            for number, found in enumerate(frames, 1)
+        ]
         content = {"meta_info": {"dataset_name": "coco"}, "instance_info": info}
         (folder / f"results_{name}.json").write_text(json.dumps(content))
 
@@ -150,7 +177,9 @@ WRITERS = {
 }
 
 
-def expected_joints(person: NDArray[np.float64], skeleton: Skeleton) -> dict[str, NDArray[np.float64]]:
+def expected_joints(
+    person: NDArray[np.float64], skeleton: Skeleton
+) -> dict[str, NDArray[np.float64]]:
     """Joints by name that must come out of a person, middles too, worked out by hand."""
     places = range(len(skeleton)) if skeleton.keypoints is None else skeleton.keypoints
     found = {
@@ -183,7 +212,8 @@ def test_every_joint_and_limb_arrives(tmp_path, rig, program, skeleton):
         for view, name in enumerate(rig.names):
             mine = [members for members in groups if detections.view[members[0]] == view]
             wanted = [expected_joints(person, skeleton) for person in people[name][frame]]
-            # No limb may lead to a joint whose neighbours were all missed: it then is a group of its own.
+            # No limb may lead to a joint whose neighbours were all missed: it then is a group of
+            # its own.
             assert sum(map(len, mine)) == sum(map(len, wanted))
             rows = np.flatnonzero(detections.view == view)
             got = {
@@ -207,11 +237,18 @@ def test_every_joint_and_limb_arrives(tmp_path, rig, program, skeleton):
 
 
 def test_pose2sim_s_own_writer(rig):
-    """Files that Pose2Sim 0.10.49 wrote: HALPE_26, a person of NaN, an empty one, scores over 1 and below 0."""
+    """Files that Pose2Sim 0.10.49 wrote: HALPE_26, a person of NaN, an empty one, scores over 1 and
+    below 0.
+    """
     table = read_detections(DATA / "pose2sim", two_cameras("cam01", "cam02"))
     assert table.skeleton is HALPE_26
-    # One whole person in frame 0; in frame 2 one whose first two joints have scores of 1.3 and -0.1.
-    assert [np.bincount(frame.view, minlength=2).tolist() for frame in table] == [[26, 26], [0, 0], [25, 25]]
+    # One whole person in frame 0; in frame 2 one whose first two joints have scores of 1.3 and
+    # -0.1.
+    assert [np.bincount(frame.view, minlength=2).tolist() for frame in table] == [
+        [26, 26],
+        [0, 0],
+        [25, 25],
+    ]
     assert max(frame.confidence.max(initial=0) for frame in table) == 1.0
     note, layout = table.notes
     assert layout.startswith("26 keypoints per person without joint names: read as HALPE_26")
@@ -244,7 +281,10 @@ def test_cameras_are_told_by_their_names_within_others(tmp_path):
 def test_middles_are_said(tmp_path, rig):
     coco(tmp_path, people_of(COCO_17))
     assert read_detections(tmp_path, rig).notes[1:] == (
-        "COCO_17 has no Neck and no MidHip: they are the midpoints of two joints, if both were detected",
+        (
+            "COCO_17 has no Neck and no MidHip: they are the midpoints of two joints, if both were "
+            "detected"
+        ),
     )
 
 
@@ -254,7 +294,9 @@ def test_scores_of_other_kinds(tmp_path, rig):
         each[:, 2] *= 100
     openpose(tmp_path, people)
     table = read_detections(tmp_path, rig)
-    every = np.concatenate([person[:, 2] for frames in people.values() for found in frames for person in found])
+    every = np.concatenate(
+        [person[:, 2] for frames in people.values() for found in frames for person in found]
+    )
     scale = np.quantile(every[every > 0], 0.99)
     found = np.concatenate([frame.confidence for frame in table])
     np.testing.assert_allclose(np.sort(found), np.sort(np.minimum(every[every > 0] / scale, 1)))
@@ -272,7 +314,9 @@ def test_coco_s_visibilities(tmp_path, rig):
 
 
 def test_frames_that_only_some_cameras_list(tmp_path, rig):
-    """COCO's results have no line for a frame without people: the other cameras tell that it was there."""
+    """COCO's results have no line for a frame without people: the other cameras tell that it was
+    there.
+    """
     people = people_of(COCO_17)
     people["right"] = [[], people["right"][0], []]
     coco(tmp_path, people)
@@ -286,7 +330,9 @@ def test_pictures_without_people_are_frames_where_the_file_lists_them(tmp_path, 
     frames = [[person] if number in (37, 38, 39) else [] for number in range(50)]
     coco_data_set(tmp_path, dict.fromkeys(rig.names, frames))
     table = read_detections(tmp_path, rig)
-    assert [number for number, frame in enumerate(table) if len(frame) > 0] == [37, 38, 39] and len(table) == 50
+    assert [number for number, frame in enumerate(table) if len(frame) > 0] == [37, 38, 39] and len(
+        table
+    ) == 50
     assert not any("frame 0 has number" in note for note in table.notes)
 
 
@@ -295,7 +341,9 @@ def test_lists_that_begin_without_people_keep_their_numbers(tmp_path, rig, write
     person = people_of(COCO_17)["left"][0][0]
     write(tmp_path, dict.fromkeys(rig.names, [[]] * 37 + [[person]] * 3))
     table = read_detections(tmp_path, rig)
-    assert [number for number, frame in enumerate(table) if len(frame) > 0] == [37, 38, 39] and len(table) == 40
+    assert [number for number, frame in enumerate(table) if len(frame) > 0] == [37, 38, 39] and len(
+        table
+    ) == 40
     assert table.first == 37 and not any("number" in note for note in table.notes)
 
 
@@ -310,10 +358,15 @@ def test_numbers_too_high_for_frames_count_from_the_first_and_it_is_said(tmp_pat
 
 
 def test_numbers_in_are_numbers_out_of_an_operating_room(shared_data):
-    """MVOR's second detector sees nobody in the first moment; the truth of moment 1 is then in frame 1."""
+    """MVOR's second detector sees nobody in the first moment; the truth of moment 1 is then in
+    frame 1.
+    """
     rig = read_rig(shared_data / "mvor" / "rig.json")
     tables = [read_detections(shared_data / "mvor" / name, rig) for name in ("openpose", "rtpose")]
-    assert [len(table) for table in tables] == [387, 387] and [table.first for table in tables] == [0, 1]
+    assert [len(table) for table in tables] == [387, 387] and [table.first for table in tables] == [
+        0,
+        1,
+    ]
     for view, name in enumerate(rig.names):
         found = json.loads((shared_data / "mvor" / "rtpose" / f"{name}.json").read_text())
         numbers = {each["image_id"] for each in found}
@@ -337,7 +390,8 @@ def test_a_number_that_no_frame_has(tmp_path, rig):
 USER = """
 name = "ours"
 keypoints = ["head", "", "r_sho", "l_sho", "r_hip", "l_hip", "r_wri", "l_wri"]
-limbs = [["head", "neck"], ["neck", "r_sho"], ["neck", "l_sho"], ["neck", "MidHip"], ["r_sho", "r_wri"],
+limbs = [["head", "neck"], ["neck", "r_sho"], ["neck", "l_sho"], ["neck", "MidHip"],
+         ["r_sho", "r_wri"],
          ["l_sho", "l_wri"]]
 mirror = [["r_sho", "l_sho"], ["r_hip", "l_hip"], ["r_wri", "l_wri"]]
 anchor = ["r_hip", "l_hip"]
@@ -364,9 +418,14 @@ def test_a_skeleton_of_the_user_s_own(tmp_path, rig):
     openpose(tmp_path, {name: [[person]] for name in rig.names})
     table = read_detections(tmp_path, rig, tmp_path / "ours.toml")
     skeleton = table.skeleton
-    assert skeleton.joints == tuple("Nose RShoulder LShoulder RHip LHip RWrist LWrist Neck MidHip".split())
+    assert skeleton.joints == tuple(
+        "Nose RShoulder LShoulder RHip LHip RWrist LWrist Neck MidHip".split()
+    )
     assert skeleton.anchor == (skeleton.index("RHip"), skeleton.index("LHip"))
-    assert [skeleton.joints[skeleton.parents[skeleton.index(name)]] for name in ("Neck", "Nose", "RWrist")] == [
+    assert [
+        skeleton.joints[skeleton.parents[skeleton.index(name)]]
+        for name in ("Neck", "Nose", "RWrist")
+    ] == [
         "MidHip",
         "Neck",
         "RShoulder",
@@ -395,7 +454,11 @@ BAD_SKELETONS = [
     ('["head", "neck"]', '["head", "throat"]', "ours has no joint 'throat'; it has Nose"),
     ('["r_sho", "r_wri"],', "", "no limbs connect the anchor MidHip with RWrist; add limbs"),
     ('anchor = ["r_hip", "l_hip"]', 'anchor = "head"', "ours has no joint 'MidHip'; it has Nose"),
-    ('anchor = ["r_hip", "l_hip"]', 'anchor = ["r_sho", "l_sho"]', "an anchor of two joints must be the hips"),
+    (
+        'anchor = ["r_hip", "l_hip"]',
+        'anchor = ["r_sho", "l_sho"]',
+        "an anchor of two joints must be the hips",
+    ),
     ('name = "ours"', "", "name is missing; docs/conventions.md describes the file"),
     ('neck = "Neck"', 'nick = "Neck"', "body.nick is not a keypoint of ours; it has head"),
     ('r_wri = "RWrist"', 'r_wri = "LWrist"', "joint LWrist occurs twice"),
@@ -410,7 +473,11 @@ BAD_SKELETONS = [
         'neck = ["MidHip", "l_sho"]',
         "the midpoint Neck uses MidHip, which must be",
     ),
-    ("[middles]", "core = []\n[middles]", "core must have at least one joint, by which a person is found"),
+    (
+        "[middles]",
+        "core = []\n[middles]",
+        "core must have at least one joint, by which a person is found",
+    ),
 ]
 
 
@@ -431,7 +498,8 @@ def test_a_named_skeleton(tmp_path, rig):
     assert read_detections(tmp_path, rig, "COCO_133").skeleton is COCO_133
     refuses(tmp_path, rig, "with 133 keypoints per person, but COCO_17 has 17", skeleton="COCO_17")
     with pytest.raises(
-        InputError, match="COCO_99: this is neither a file nor a known skeleton; give a TOML file, or one of"
+        InputError,
+        match="COCO_99: this is neither a file nor a known skeleton; give a TOML file, or one of",
     ):
         read_detections(tmp_path, rig, "COCO_99")
 
@@ -448,30 +516,54 @@ def refuses(folder: Path, rig: Rig, *parts: str, skeleton: str | None = None) ->
 def test_unknown_numbers_of_keypoints(tmp_path, rig):
     openpose(tmp_path, {name: [[np.full((12, 3), 0.5) * 100]] for name in rig.names})
     refuses(
-        tmp_path, rig, "recognised as OpenPose's JSON with 12 keypoints per person, which is not a known layout"
+        tmp_path,
+        rig,
+        "recognised as OpenPose's JSON with 12 keypoints per person, which is not a known layout",
     )
     (tmp_path / "b").mkdir()
     coco(tmp_path / "b", {name: [[np.full((21, 3), 50.0)]] for name in rig.names})
-    refuses(tmp_path / "b", rig, "COCO's keypoint results with 21 keypoints", "--skeleton", "26 (HALPE_26)")
+    refuses(
+        tmp_path / "b",
+        rig,
+        "COCO's keypoint results with 21 keypoints",
+        "--skeleton",
+        "26 (HALPE_26)",
+    )
 
 
 def test_people_of_two_models(tmp_path, rig):
     openpose(tmp_path, {"left": people_of(BODY_25)["left"], "right": people_of(COCO_18)["right"]})
-    refuses(tmp_path, rig, "left has people of 25 keypoints", "right of 18; give the detections of one model")
+    refuses(
+        tmp_path,
+        rig,
+        "left has people of 25 keypoints",
+        "right of 18; give the detections of one model",
+    )
     (tmp_path / "b").mkdir()
     mixed = [[people_of(COCO_17)["left"][0][0], people_of(HALPE_26)["left"][0][0]]]
     coco(tmp_path / "b", {"left": mixed, "right": mixed})
     refuses(
-        tmp_path / "b", rig, "recognised as COCO's keypoint results, but people have 17 and 26 keypoints; give the"
+        tmp_path / "b",
+        rig,
+        "recognised as COCO's keypoint results, but people have 17 and 26 keypoints; give the",
     )
 
 
 BAD_FILES = [
-    ('{"a": 1}', "recognised as JSON (an object), but a list of people with image_id (COCO, AlphaPose)"),
+    (
+        '{"a": 1}',
+        "recognised as JSON (an object), but a list of people with image_id (COCO, AlphaPose)",
+    ),
     ("[{]", "line 1 column 3 is not JSON"),
     ('[{"image_id": 1}]', "[0].keypoints is missing; write the results again, in pixels"),
-    ('[{"image_id": 1, "keypoints": [1, 2]}]', "[0].keypoints must hold x, y and score of each keypoint, got 2"),
-    ('[{"image_id": "a.jpg", "keypoints": [1, 2, 3]}]', "[0].image_id 'a.jpg' has no frame number; run AlphaPose"),
+    (
+        '[{"image_id": 1, "keypoints": [1, 2]}]',
+        "[0].keypoints must hold x, y and score of each keypoint, got 2",
+    ),
+    (
+        '[{"image_id": "a.jpg", "keypoints": [1, 2, 3]}]',
+        "[0].image_id 'a.jpg' has no frame number; run AlphaPose",
+    ),
     (
         '[{"frame_id": 0, "instances": [{"keypoints": [[1]], "keypoint_scores": [1]}]}]',
         "must hold 2 values, got 1",
@@ -490,7 +582,11 @@ BAD_FILES = [
         "[0].image_id '-5' is not a frame number; write the results again",
     ),
     (
-        '[{"image_id": "a/7.jpg", "keypoints": [1, 2, 3]}, {"image_id": "b/7.jpg", "keypoints": [1, 2, 3]}]',
+        (
+            '[{"image_id": "a/7.jpg", "keypoints": [1, 2, 3]}, '
+            '{"image_id": "b/7.jpg", "keypoints": '
+            "[1, 2, 3]}]"
+        ),
         "the pictures 'a/7.jpg' and 'b/7.jpg' have the same frame number 7; run AlphaPose again",
     ),
     ('{"images": [{"id": [1]}], "annotations": []}', "images[0].id must be a whole number or text"),
@@ -504,7 +600,9 @@ def test_bad_file_of_one_camera(tmp_path, rig, text, sentence):
     (tmp_path / "right.json").write_text(text)
     with pytest.raises(InputError) as caught:
         read_detections(tmp_path, rig)
-    assert str(caught.value).startswith(f"{tmp_path / 'right.json'}: ") and sentence in str(caught.value)
+    assert str(caught.value).startswith(f"{tmp_path / 'right.json'}: ") and sentence in str(
+        caught.value
+    )
     assert "\n" not in str(caught.value)
 
 
@@ -512,7 +610,9 @@ def test_mmpose_pictures_that_do_not_fit(tmp_path, rig):
     mmpose_pictures(tmp_path, people_of(COCO_17))
     file = tmp_path / "left" / "000001.json"
     file.write_text('[{"keypoints": [[1, 2]], "keypoint_scores": [1, 1]}]')
-    with pytest.raises(InputError, match=r"000001\.json: \[0\]: there are 1 keypoints, but 2 keypoint_scores"):
+    with pytest.raises(
+        InputError, match=r"000001\.json: \[0\]: there are 1 keypoints, but 2 keypoint_scores"
+    ):
         read_detections(tmp_path, rig)
 
 
@@ -530,8 +630,14 @@ def test_a_few_joints_far_outside_the_picture_are_left_out_and_said(tmp_path, ri
 
 def test_ids_of_pictures_that_are_no_frames(tmp_path, rig):
     coco(tmp_path, people_of(COCO_17))
-    (tmp_path / "right.json").write_text(json.dumps([{"image_id": 900_100_200, "keypoints": [5.0, 5, 0.5] * 17}]))
-    refuses(tmp_path, rig, "but its frames would run from 0 to 900100200; number the pictures by their frames")
+    (tmp_path / "right.json").write_text(
+        json.dumps([{"image_id": 900_100_200, "keypoints": [5.0, 5, 0.5] * 17}])
+    )
+    refuses(
+        tmp_path,
+        rig,
+        "but its frames would run from 0 to 900100200; number the pictures by their frames",
+    )
 
 
 def test_nobody_anywhere(tmp_path, rig):
@@ -543,8 +649,9 @@ def test_nobody_anywhere(tmp_path, rig):
 
 
 def test_a_format_of_the_user_s_own(tmp_path, rig):
-    """An entry in the registry and a function: which files are whose, scores and skeletons are as of every
-    other."""
+    """An entry in the registry and a function: which files are whose, scores and skeletons are as
+    of every other.
+    """
     people = people_of(COCO_17)
     for name, frames in people.items():
         rows = [[frame, *person.ravel()] for frame, found in enumerate(frames) for person in found]

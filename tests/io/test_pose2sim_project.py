@@ -42,7 +42,9 @@ def project(tmp_path, five_cameras):
         place = folder / "pose" / f"{name}_json"
         place.mkdir(parents=True)
         for number in range(3, 7):
-            (place / f"{name}_{number:06d}.json").write_text(json.dumps({"version": 1.3, "people": []}))
+            (place / f"{name}_{number:06d}.json").write_text(
+                json.dumps({"version": 1.3, "people": []})
+            )
     write_config(folder)
     return folder
 
@@ -57,7 +59,12 @@ def refusal(folder):
 def test_a_project_is_read_as_it_lies(project):
     found = read_pose2sim_project(project)
     assert found.calibration.name == "rig.json" and found.detections == project / "pose"
-    assert (found.fps, found.first_number, found.frames, found.multi_person) == (50.0, 3, None, False)
+    assert (found.fps, found.first_number, found.frames, found.multi_person) == (
+        50.0,
+        3,
+        None,
+        False,
+    )
     assert found.span(4) == range(4)
     assert found.name_of(None, 3, 6) == "Walk_3-6" and found.name_of(1, 3, 6) == "Walk_P1_3-6"
 
@@ -68,7 +75,9 @@ def test_the_project_s_own_numbers_choose_frames(project):
     write_config(project, frames="[5, 400]")
     assert read_pose2sim_project(project).span(4) == range(2, 4)
     write_config(project, frames="[40, 60]")
-    with pytest.raises(InputError, match=r"frame_range is \[40, 60\], but the detections have frames 3 to 6"):
+    with pytest.raises(
+        InputError, match=r"frame_range is \[40, 60\], but the detections have frames 3 to 6"
+    ):
         read_pose2sim_project(project).span(4)
 
 
@@ -107,7 +116,9 @@ def test_the_rate_is_the_video_s_where_the_project_says_auto(project):
     write_config(project, rate="'auto'")
     assert read_pose2sim_project(project).fps == 30.0
     (project / "videos").mkdir()
-    video = cv2.VideoWriter(str(project / "videos" / "cam0.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 24, (64, 48))
+    video = cv2.VideoWriter(
+        str(project / "videos" / "cam0.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 24, (64, 48)
+    )
     for _ in range(3):
         video.write(np.zeros((48, 64, 3), np.uint8))
     video.release()
@@ -171,7 +182,9 @@ def two_tracks(two_people):
         transl=np.full((count, 3), np.nan),
         status=np.full(count, "body undetermined"),
         time_s=frames / 50.0,
-        known=np.where((persons == 4)[:, None], Known.SEEN, Known.BODY).repeat(25, axis=1).astype(np.uint8),
+        known=np.where((persons == 4)[:, None], Known.SEEN, Known.BODY)
+        .repeat(25, axis=1)
+        .astype(np.uint8),
         run={"frames": [0, 4], "time": {"fps": 50.0}},
     )
 
@@ -196,7 +209,9 @@ def test_trc_and_c3d_are_where_the_next_steps_look(project, two_tracks, two_peop
     np.testing.assert_allclose(rows[0, 2:].reshape(25, 3), two_people[0][:, [1, 2, 0]], atol=1e-6)
     c3d = ezc3d.c3d(str(project / "pose-3d" / "Walk_3-6.c3d"))
     assert c3d["header"]["points"]["frame_rate"] == 50
-    np.testing.assert_allclose(c3d["data"]["points"][:3, :, 0].T, 1e3 * two_people[0][:, [1, 2, 0]], atol=1e-2)
+    np.testing.assert_allclose(
+        c3d["data"]["points"][:3, :, 0].T, 1e3 * two_people[0][:, [1, 2, 0]], atol=1e-2
+    )
 
 
 def test_everybody_has_files_where_the_project_is_of_several(project, two_tracks):
@@ -236,7 +251,9 @@ def test_c3d_of_high_frame_numbers(project, two_tracks):
 
 
 def test_nobody_is_a_note(project):
-    written = write_pose2sim_files(Reconstruction.empty(BODY_25.joints), "z", read_pose2sim_project(project))
+    written = write_pose2sim_files(
+        Reconstruction.empty(BODY_25.joints), "z", read_pose2sim_project(project)
+    )
     assert written.files == [] and "the result has no people" in written.notes[0]
 
 

@@ -1,4 +1,6 @@
-"""Detections of cameras with clocks of their own: put together by their times, and told apart again."""
+"""Detections of cameras with clocks of their own: put together by their times, and told apart
+again.
+"""
 
 import numpy as np
 import pytest
@@ -28,7 +30,9 @@ def together(scene, tmp_path_factory):
     """The recording as it would be if all cameras had been started together, as it is read."""
     once = simulate(scene)
     frames = [once[frame % len(once)] for frame in range(FRAMES)]
-    write_association(Recording(once.skeleton, frames), scene.rig, folder := tmp_path_factory.mktemp("whole"))
+    write_association(
+        Recording(once.skeleton, frames), scene.rig, folder := tmp_path_factory.mktemp("whole")
+    )
     return read_detections(folder, scene.rig)
 
 
@@ -67,9 +71,13 @@ def test_frames_are_what_all_cameras_saw_at_one_time(scene, together, apart, tmp
     np.testing.assert_allclose(np.ptp(times.time_s, axis=1), 0.004, atol=2e-6)
     assert recording.picture is not None and recording.picture[0].tolist() == [LATE, 0, LATE]
     for frame in (0, 1, BLOCK_FRAMES - 1, BLOCK_FRAMES, len(recording) - 1):
-        for found, expected in zip(sets(recording[frame]), sets(together[frame + LATE]), strict=True):
+        for found, expected in zip(
+            sets(recording[frame]), sets(together[frame + LATE]), strict=True
+        ):
             np.testing.assert_allclose(found, expected, atol=1e-4)  # the digits that files have
-    assert any("frames without a picture of every camera are left out" in note for note in recording.notes)
+    assert any(
+        "frames without a picture of every camera are left out" in note for note in recording.notes
+    )
 
 
 @pytest.mark.slow
@@ -82,7 +90,9 @@ def test_cameras_may_have_different_numbers_of_frames(scene, apart, tmp_path):
     assert all((whole[frame].view != 1).all() for frame in range(shorter, FRAMES))
     part = Recording(whole.skeleton, [whole[frame] for frame in range(shorter)])
     write_association(part, scene.rig, tmp_path / "short")
-    (tmp_path / f"{name}.txt").write_bytes((tmp_path / "short" / "detection" / f"{name}.txt").read_bytes())
+    (tmp_path / f"{name}.txt").write_bytes(
+        (tmp_path / "short" / "detection" / f"{name}.txt").read_bytes()
+    )
     common, _ = read_recording(tmp_path, scene.rig, None, tmp_path / "kept", fps=FPS)
     assert len(common) == shorter and f"the {shorter} that all have" in common.notes[-1]
     found, _ = read_recording(tmp_path, scene.rig, None, tmp_path / "again")
@@ -90,7 +100,9 @@ def test_cameras_may_have_different_numbers_of_frames(scene, apart, tmp_path):
     assert len(found) == len(expected)
     for frame in range(len(found)):
         for name in COLUMNS:
-            np.testing.assert_allclose(getattr(found[frame], name), getattr(expected[frame], name), atol=1e-4)
+            np.testing.assert_allclose(
+                getattr(found[frame], name), getattr(expected[frame], name), atol=1e-4
+            )
 
 
 def test_moments_are_read_as_they_were_written(scene, tmp_path):
@@ -99,7 +111,14 @@ def test_moments_are_read_as_they_were_written(scene, tmp_path):
     found = read_moments(tmp_path / "moments.csv")
     assert list(found) == list(scene.rig.names)
     np.testing.assert_array_equal(np.column_stack(list(found.values())), picture)
-    for damage in ("", "frame, a\n0\n", "frame, a\n1, 0\n", "frame, a\n0, x\n", "frame, a\n0, -2\n", "a\n"):
+    for damage in (
+        "",
+        "frame, a\n0\n",
+        "frame, a\n1, 0\n",
+        "frame, a\n0, x\n",
+        "frame, a\n0, -2\n",
+        "a\n",
+    ):
         (tmp_path / "moments.csv").write_text(damage)
         with pytest.raises(InputError, match=r"moments\.csv"):
             read_moments(tmp_path / "moments.csv")

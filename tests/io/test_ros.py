@@ -35,10 +35,12 @@ def people() -> Reconstruction:
     known = np.full((N, 25), Known.SEEN, dtype=np.uint8)
     known[3, 4] = Known.UNKNOWN
     return Reconstruction(
-        frame=np.repeat(np.arange(T), 2), person=np.tile([3, 12], T), joint_names=np.array(BODY_25.joints),
-        joints=joints, covariance=np.tile(np.eye(3) * 1e-4, (N, 25, 1, 1)), confidence=np.ones((N, 25)),
+        frame=np.repeat(np.arange(T), 2), person=np.tile([3, 12], T),
+        joint_names=np.array(BODY_25.joints), joints=joints,
+        covariance=np.tile(np.eye(3) * 1e-4, (N, 25, 1, 1)), confidence=np.ones((N, 25)),
         status=np.full(N, "ok"), time_s=START_S + np.repeat(np.arange(T), 2) / 30,
-        velocity=rng.normal(0, 1, (N, 25, 3)), velocity_covariance=np.tile(np.eye(3), (N, 25, 1, 1)), known=known,
+        velocity=rng.normal(0, 1, (N, 25, 3)),
+        velocity_covariance=np.tile(np.eye(3), (N, 25, 1, 1)), known=known,
         betas=rng.normal(size=(N, 10)), global_orient=orient, body_pose=rng.normal(size=(N, 23, 3)),
         transl=rng.normal(size=(N, 3)),
     )  # fmt: skip
@@ -76,7 +78,9 @@ def by_topic(file) -> dict[str, list]:
 
 def matrix(transform) -> np.ndarray:
     t, q = transform.transform.translation, transform.transform.rotation
-    return gtsam.Pose3(gtsam.Rot3.Quaternion(q.w, q.x, q.y, q.z), np.array([t.x, t.y, t.z])).matrix()
+    return gtsam.Pose3(
+        gtsam.Rot3.Quaternion(q.w, q.x, q.y, q.z), np.array([t.x, t.y, t.z])
+    ).matrix()
 
 
 def test_people_are_read_back_as_they_were_written(file, people):
@@ -87,11 +91,15 @@ def test_people_are_read_back_as_they_were_written(file, people):
         stamp = message.header.stamp
         # A double holds a time since 1970 to a quarter of a microsecond.
         assert stamp.sec + 1e-9 * stamp.nanosec == pytest.approx(START_S + frame / 30, abs=1e-6)
-        assert message.header.frame_id == "world" and list(message.joint_names) == list(BODY_25.joints)
+        assert message.header.frame_id == "world" and list(message.joint_names) == list(
+            BODY_25.joints
+        )
         assert [each.person for each in message.people] == [3, 12]
         for row, each in enumerate(message.people):
             assert each.status == "ok"
-            for name in "joints covariance velocity velocity_covariance known betas body_pose transl".split():
+            for name in (
+                "joints covariance velocity velocity_covariance known betas body_pose transl"
+            ).split():
                 np.testing.assert_array_equal(
                     np.array(list(getattr(each, name))), getattr(rows, name)[row].ravel()
                 )
@@ -106,8 +114,12 @@ def test_bodies_face_along_x_with_the_head_along_z(file, people):
     assert {each.child_frame_id for each in seen} == {"body_3", "body_12", "robot_tum"}
     R = gtsam.Rot3.Rodrigues(people.global_orient[0]).matrix()
     np.testing.assert_allclose(matrix(bodies[0])[:3, 0], R[:, 2], atol=1e-12)  # SMPL faces +z
-    np.testing.assert_allclose(matrix(bodies[0])[:3, 2], R[:, 1], atol=1e-12)  # and its head is at +y
-    np.testing.assert_allclose(matrix(bodies[0])[:3, 3], people.joints[0, BODY_25.index("MidHip")], atol=1e-12)
+    np.testing.assert_allclose(
+        matrix(bodies[0])[:3, 2], R[:, 1], atol=1e-12
+    )  # and its head is at +y
+    np.testing.assert_allclose(
+        matrix(bodies[0])[:3, 3], people.joints[0, BODY_25.index("MidHip")], atol=1e-12
+    )
 
 
 def test_the_map_has_z_up_and_cameras_look_along_z(file, rig):
@@ -116,11 +128,20 @@ def test_the_map_has_z_up_and_cameras_look_along_z(file, rig):
     world, *cameras = static.transforms
     assert (world.header.frame_id, world.child_frame_id) == ("map", "world")
     np.testing.assert_allclose(matrix(world)[:3, :3] @ rig.up_vector, [0, 0, 1], atol=1e-12)
-    assert [each.header.frame_id for each in cameras] == ["robot_tum", "world", "world", "world", "world"]
+    assert [each.header.frame_id for each in cameras] == [
+        "robot_tum",
+        "world",
+        "world",
+        "world",
+        "world",
+    ]
     for transform, camera in zip(cameras, rig.cameras, strict=True):
         np.testing.assert_allclose(matrix(transform), camera.wTc, atol=1e-9)
     (info,) = found["/_2_left/camera_info"]
-    assert info.header.frame_id == "_2_left_optical" and (info.width, info.height) == rig.cameras[1].image_size
+    assert (
+        info.header.frame_id == "_2_left_optical"
+        and (info.width, info.height) == rig.cameras[1].image_size
+    )
     np.testing.assert_array_equal(np.array(list(info.k)).reshape(3, 3), rig.cameras[1].K)
     assert info.distortion_model == "plumb_bob" and len(info.d) == 5
 
@@ -167,14 +188,18 @@ def test_a_damaged_file_is_refused_in_one_sentence(tmp_path, file, five_cameras)
 
 @pytest.mark.parametrize("how", ["zstd", "lz4", ""])
 def test_a_chunk_that_claims_more_memory_than_it_may_is_not_unpacked(tmp_path, five_cameras, how):
-    """The frame itself says its size, and a chunk says it beside: either is refused; 80 MB of zeros are 8 kB."""
+    """The frame itself says its size, and a chunk says it beside: either is refused; 80 MB of zeros
+    are 8 kB.
+    """
     import lz4.frame
     import zstandard
     from mcap.data_stream import RecordBuilder
     from mcap.records import Chunk
 
     zeros = bytes(80 * 2**20)
-    packed = {"zstd": zstandard.compress, "lz4": lz4.frame.compress}.get(how, lambda data: data[:100])(zeros)
+    packed = {"zstd": zstandard.compress, "lz4": lz4.frame.compress}.get(
+        how, lambda data: data[:100]
+    )(zeros)
     for claimed in (100, len(zeros)):
         if how == "" and claimed == 100:
             continue  # it is as long as it says
@@ -182,7 +207,9 @@ def test_a_chunk_that_claims_more_memory_than_it_may_is_not_unpacked(tmp_path, f
         Chunk(how, packed, 0, 0, 0, claimed).write(records)
         (tmp_path / "bomb.mcap").write_bytes(b"\x89MCAP0\r\n" + records.end())
         tracemalloc.start()
-        with pytest.raises(InputError, match=r"bomb\.mcap: cannot be read \(ValueError: a chunk claims 83886080 "):
+        with pytest.raises(
+            InputError, match=r"bomb\.mcap: cannot be read \(ValueError: a chunk claims 83886080 "
+        ):
             list(read_views(tmp_path / "bomb.mcap", five_cameras, BODY_25, print))
         assert tracemalloc.get_traced_memory()[1] < 2**24
         tracemalloc.stop()
@@ -206,8 +233,15 @@ def test_a_second_reader_with_definitions_of_its_own_agrees(file, people):
         for connection, _, raw in reader.messages():
             message = store.deserialize_cdr(raw, connection.msgtype)
             counts[connection.msgtype] = counts.get(connection.msgtype, 0) + 1
-            if connection.msgtype == "shapepose_msgs/msg/People" and counts[connection.msgtype] == 1:
-                np.testing.assert_array_equal(message.people[1].covariance, people.covariance[1].ravel())
+            if (
+                connection.msgtype == "shapepose_msgs/msg/People"
+                and counts[connection.msgtype] == 1
+            ):
+                np.testing.assert_array_equal(
+                    message.people[1].covariance, people.covariance[1].ravel()
+                )
             if connection.msgtype == "visualization_msgs/msg/MarkerArray":
                 assert message.markers[0].mesh_use_embedded_materials is False
-        assert counts["tf2_msgs/msg/TFMessage"] == T + 1 and counts["sensor_msgs/msg/CameraInfo"] == 5
+        assert (
+            counts["tf2_msgs/msg/TFMessage"] == T + 1 and counts["sensor_msgs/msg/CameraInfo"] == 5
+        )

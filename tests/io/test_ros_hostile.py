@@ -1,4 +1,6 @@
-"""MCAP files made to do harm: definitions that lack fields, and chunks that are not as large as they say."""
+"""MCAP files made to do harm: definitions that lack fields, and chunks that are not as large as
+they say.
+"""
 
 import struct
 import tracemalloc
@@ -19,7 +21,12 @@ KINDS = (
     "geometry_msgs/PoseStamped", "geometry_msgs/PoseWithCovarianceStamped", "nav_msgs/Odometry",
     "tf2_msgs/TFMessage", "shapepose_msgs/Detections",
 )  # fmt: skip
-LINES = [(kind, line) for kind in KINDS for line in sorted({*definition(kind).splitlines()}) if line[:1].islower()]
+LINES = [
+    (kind, line)
+    for kind in KINDS
+    for line in sorted({*definition(kind).splitlines()})
+    if line[:1].islower()
+]
 
 
 def write(path, kind: str, text: str, data: bytes, count: int = 2):
@@ -43,14 +50,22 @@ def said_of(path, rig) -> str:
     return str(caught.value)
 
 
-@pytest.mark.parametrize(("kind", "line"), LINES, ids=[f"{kind}-{line}".replace("/", ".") for kind, line in LINES])
+@pytest.mark.parametrize(
+    ("kind", "line"), LINES, ids=[f"{kind}-{line}".replace("/", ".") for kind, line in LINES]
+)
 def test_a_definition_that_lacks_a_field_is_named(tmp_path, five_cameras, kind, line):
     """Each field of each message that is read, left out, called otherwise, or of another type."""
     check_definition(kind, definition(kind))
     word, name = line.split()
     data = b"\0\1\0\0" + bytes(600)
     other = "uint8" if word != "uint8" and not word.startswith(("int", "uint")) else "float64"
-    for text in ("", f"{word} {name}_other", f"{other} {name}", f"{word}[3] {name}", f"{word}[] {name}"):
+    for text in (
+        "",
+        f"{word} {name}_other",
+        f"{other} {name}",
+        f"{word}[3] {name}",
+        f"{word}[] {name}",
+    ):
         if f"{word}[] {name}" == line:
             continue
         lacks = definition(kind).replace(f"\n{line}\n", f"\n{text}\n")
@@ -63,14 +78,24 @@ def test_a_definition_that_lacks_a_field_is_named(tmp_path, five_cameras, kind, 
 
 def test_definitions_may_have_more_and_be_written_otherwise():
     text = definition("geometry_msgs/PoseStamped")
-    check_definition("geometry_msgs/PoseStamped", text.replace("std_msgs/Header header", "Header header  # when"))
+    check_definition(
+        "geometry_msgs/PoseStamped", text.replace("std_msgs/Header header", "Header header  # when")
+    )
     check_definition("geometry_msgs/PoseStamped", text.replace("float64 x\n", "float64 x 0.5\n"))
-    check_definition("geometry_msgs/PoseStamped", f"uint8 A=1\nstring NAME='a # b'\n# int8 b\n\n{text}")
-    check_definition("geometry_msgs/PoseStamped", text.replace("MSG: geometry_msgs/", "MSG: geometry_msgs/msg/"))
-    check_definition("geometry_msgs/PoseStamped", text.replace("\n", "\r\n") + "string<=5[<=10] more\n")
+    check_definition(
+        "geometry_msgs/PoseStamped", f"uint8 A=1\nstring NAME='a # b'\n# int8 b\n\n{text}"
+    )
+    check_definition(
+        "geometry_msgs/PoseStamped", text.replace("MSG: geometry_msgs/", "MSG: geometry_msgs/msg/")
+    )
+    check_definition(
+        "geometry_msgs/PoseStamped", text.replace("\n", "\r\n") + "string<=5[<=10] more\n"
+    )
     apart = text.index("=" * 80 + "\nMSG: builtin_interfaces/Time")
     rest = text[apart:].partition("\n" + "=" * 80)[2]
-    check_definition("geometry_msgs/PoseStamped", text[:apart] + "=" * 80 + rest)  # the library knows Time
+    check_definition(
+        "geometry_msgs/PoseStamped", text[:apart] + "=" * 80 + rest
+    )  # the library knows Time
 
 
 @pytest.mark.parametrize("length", [4_000_000_000, 100_000])
@@ -80,10 +105,19 @@ def test_arrays_of_nothing_are_refused(tmp_path, five_cameras, length):
     head = b"\0\1\0\0" + struct.pack("<iII", 1, 0, 2) + b"a\0\0\0"
     for array in ("[]", f"[{length}]"):
         lied = text.replace(
-            "geometry_msgs/Pose pose\n", f"geometry_msgs/Nothing{array} a\ngeometry_msgs/Pose pose\n", 1
+            "geometry_msgs/Pose pose\n",
+            f"geometry_msgs/Nothing{array} a\ngeometry_msgs/Pose pose\n",
+            1,
         )
-        data = head + (struct.pack("<I", length) if array == "[]" else b"") + struct.pack("<7d", *[0] * 6, 1)
-        said = said_of(write(tmp_path / "a.mcap", "geometry_msgs/PoseStamped", lied + nothing, data), five_cameras)
+        data = (
+            head
+            + (struct.pack("<I", length) if array == "[]" else b"")
+            + struct.pack("<7d", *[0] * 6, 1)
+        )
+        said = said_of(
+            write(tmp_path / "a.mcap", "geometry_msgs/PoseStamped", lied + nothing, data),
+            five_cameras,
+        )
         assert "an array of" in said or "has no field" in said
 
 
@@ -93,7 +127,13 @@ def record(code: int, body: bytes) -> bytes:
 
 def chunk(how: str, data: bytes, size: int) -> bytes:
     name = how.encode()
-    return record(6, struct.pack("<QQQII", 0, 0, size, 0, len(name)) + name + struct.pack("<Q", len(data)) + data)
+    return record(
+        6,
+        struct.pack("<QQQII", 0, 0, size, 0, len(name))
+        + name
+        + struct.pack("<Q", len(data))
+        + data,
+    )
 
 
 @pytest.mark.parametrize("how", ["lz4", "zstd"])
@@ -102,7 +142,9 @@ def test_chunks_that_do_not_say_their_size_are_not_unpacked_whole(tmp_path, five
     import zstandard
 
     zeros = bytes(2**22)
-    packing = lz4.frame.LZ4FrameCompressor() if how == "lz4" else zstandard.ZstdCompressor().compressobj()
+    packing = (
+        lz4.frame.LZ4FrameCompressor() if how == "lz4" else zstandard.ZstdCompressor().compressobj()
+    )
     begin = packing.begin() if how == "lz4" else b""
     data = begin + b"".join(packing.compress(zeros) for _ in range(80)) + packing.flush()  # 320 MiB
     head = record(1, struct.pack("<I", 4) + b"ros2" + struct.pack("<I", 1) + b"x")

@@ -1,4 +1,6 @@
-"""The node of docs/ros.md, with a ROS that only remembers; and the definitions that the page lists."""
+"""The node of docs/ros.md, with a ROS that only remembers; and the definitions that the page
+lists.
+"""
 
 import json
 import re
@@ -34,7 +36,9 @@ class Remembering:
         return SimpleNamespace(value=default)
 
     def create_publisher(self, kind: type, topic: str, qos: object) -> SimpleNamespace:
-        return SimpleNamespace(publish=lambda message: self.published.append((topic, message.fields)))
+        return SimpleNamespace(
+            publish=lambda message: self.published.append((topic, message.fields))
+        )
 
     def create_subscription(self, kind: type, topic: str, callback: object, qos: object) -> None:
         self.subscribed[topic] = callback
@@ -55,7 +59,10 @@ def ros(monkeypatch):
     module("rclpy.node", Node=Remembering)
     module("rclpy.qos", QoSProfile=dict, DurabilityPolicy=SimpleNamespace(TRANSIENT_LOCAL=1))
     module("rosidl_runtime_py")
-    module("rosidl_runtime_py.set_message", set_message_fields=lambda to, fields: setattr(to, "fields", fields))
+    module(
+        "rosidl_runtime_py.set_message",
+        set_message_fields=lambda to, fields: setattr(to, "fields", fields),
+    )
     for package, name in (
         ("std_msgs", "String"),
         ("tf2_msgs", "TFMessage"),
@@ -81,7 +88,11 @@ def test_the_node_publishes_who_is_there(ros, tmp_path, monkeypatch, five_camera
         assert len(node.warned) == 1
         for frame in range(8):
             for view, callback in enumerate(node.subscribed.values()):
-                flat = np.concatenate([xy[view], np.full((2, 25, 1), 0.9)], axis=-1).reshape(2, -1).tolist()
+                flat = (
+                    np.concatenate([xy[view], np.full((2, 25, 1), 0.9)], axis=-1)
+                    .reshape(2, -1)
+                    .tolist()
+                )
                 seen = {"camera": five_cameras.names[view], "time_s": frame / 10}
                 data = json.dumps(seen | {"people": [{"pose_keypoints_2d": each} for each in flat]})
                 callback(SimpleNamespace(data=data))

@@ -1,4 +1,6 @@
-"""Trajectories and moving cameras from MCAP files of ROS 2 messages, written by the library of MCAP."""
+"""Trajectories and moving cameras from MCAP files of ROS 2 messages, written by the library of
+MCAP.
+"""
 
 from dataclasses import replace
 
@@ -24,8 +26,9 @@ APART = "=" * 80 + "\n"
 POSE = definition("geometry_msgs/Pose")
 ODOMETRY = (
     "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/PoseWithCovariance pose\n"
-    f"{APART}MSG: geometry_msgs/PoseWithCovariance\ngeometry_msgs/Pose pose\nfloat64[36] covariance\n"
-    f"{APART}MSG: geometry_msgs/Pose\n{POSE}{APART}MSG: std_msgs/Header\n{definition('std_msgs/Header')}"
+    f"{APART}MSG: geometry_msgs/PoseWithCovariance\ngeometry_msgs/Pose pose\nfloat64[36] "
+    f"covariance\n{APART}MSG: geometry_msgs/Pose\n{POSE}{APART}MSG: "
+    f"std_msgs/Header\n{definition('std_msgs/Header')}"
 )
 ALONE = (
     f"std_msgs/Header header\ngeometry_msgs/Pose pose\n{APART}MSG: geometry_msgs/Pose\n{POSE}"
@@ -53,7 +56,12 @@ def write(path, messages: list[tuple[str, float, Message]]):
 
 def parts(pose: gtsam.Pose3) -> tuple[Message, Message]:
     q = pose.rotation().toQuaternion()
-    return dict(zip("xyz", pose.translation(), strict=True)), {"x": q.x(), "y": q.y(), "z": q.z(), "w": q.w()}
+    return dict(zip("xyz", pose.translation(), strict=True)), {
+        "x": q.x(),
+        "y": q.y(),
+        "z": q.z(),
+        "w": q.w(),
+    }
 
 
 def transform(parent: str, child: str, time_s: float, pose: gtsam.Pose3) -> Message:
@@ -71,7 +79,10 @@ def transform(parent: str, child: str, time_s: float, pose: gtsam.Pose3) -> Mess
 
 def odometry(time_s: float, pose: gtsam.Pose3, covariance: np.ndarray) -> Message:
     way, turn = parts(pose)
-    told = {"pose": {"position": way, "orientation": turn}, "covariance": covariance.ravel().tolist()}
+    told = {
+        "pose": {"position": way, "orientation": turn},
+        "covariance": covariance.ravel().tolist(),
+    }
     return {"header": header("odom", time_s), "child_frame_id": "base", "pose": told}
 
 
@@ -86,7 +97,10 @@ def robot(tmp_path):
     """SLAM corrects an odometry, and a camera is fixed to the base."""
     messages = [("/tf_static", 0.0, transform("base", "eye", 0.0, MOUNT))]
     for t, a, b in zip(TIMES.tolist(), MAP, ODOM, strict=True):
-        messages += [("/tf", t, transform("map", "odom", t, a)), ("/tf", t, transform("odom", "/base", t, b))]
+        messages += [
+            ("/tf", t, transform("map", "odom", t, a)),
+            ("/tf", t, transform("odom", "/base", t, b)),
+        ]
     return write(tmp_path / "robot.mcap", messages)
 
 
@@ -98,23 +112,35 @@ def test_a_trajectory_is_put_together_along_the_frames(robot):
         np.testing.assert_allclose(base.wTb[n], (a * b).matrix(), atol=1e-12)
         np.testing.assert_allclose(eye.wTb[n], (a * b * MOUNT).matrix(), atol=1e-12)
     rig = with_trajectories(ring_of_cameras(3, np.random.default_rng(0)), [f"cam1={robot}#base"])
-    np.testing.assert_allclose(rig.at(np.full(3, 0.5)).cameras[1].wTc, (MAP[5] * ODOM[5]).matrix(), atol=1e-9)
+    np.testing.assert_allclose(
+        rig.at(np.full(3, 0.5)).cameras[1].wTc, (MAP[5] * ODOM[5]).matrix(), atol=1e-9
+    )
 
 
 def test_ros_covariances_are_of_the_parents_axes(tmp_path):
-    """Errors of way, and of turn, along the parent's axes are drawn; the frame's own spread as is read."""
+    """Errors of way, and of turn, along the parent's axes are drawn; the frame's own spread as is
+    read.
+    """
     root = np.random.default_rng(0).normal(0, 0.01, (6, 6))
     parents = root @ root.T
-    file = write(tmp_path / "odom.mcap", [("/odom", t, odometry(t, ODOM[0], parents)) for t in (0.0, 0.1)])
+    file = write(
+        tmp_path / "odom.mcap", [("/odom", t, odometry(t, ODOM[0], parents)) for t in (0.0, 0.1)]
+    )
     found = read_trajectory(file)
     assert found.covariance is not None
-    drawn = np.random.default_rng(1).multivariate_normal(np.zeros(6), parents, 20_000, method="cholesky")
+    drawn = np.random.default_rng(1).multivariate_normal(
+        np.zeros(6), parents, 20_000, method="cholesky"
+    )
     R, t = ODOM[0].rotation(), ODOM[0].translation()
     errors = [
-        gtsam.Pose3.Logmap(ODOM[0].between(gtsam.Pose3(gtsam.Rot3.Expmap(e[3:]) * R, t + e[:3]))) for e in drawn
+        gtsam.Pose3.Logmap(ODOM[0].between(gtsam.Pose3(gtsam.Rot3.Expmap(e[3:]) * R, t + e[:3])))
+        for e in drawn
     ]
-    # The entries of a covariance of 20,000 draws are right to 1 % of the largest; other axes are 100 % off.
-    np.testing.assert_allclose(found.covariance[1], np.cov(np.array(errors).T), atol=0.03 * parents.max())
+    # The entries of a covariance of 20,000 draws are right to 1 % of the largest; other axes are
+    # 100 % off.
+    np.testing.assert_allclose(
+        found.covariance[1], np.cov(np.array(errors).T), atol=0.03 * parents.max()
+    )
 
 
 def test_the_errors_of_a_chain_add_up_as_in_gtsam(tmp_path):
@@ -122,7 +148,13 @@ def test_the_errors_of_a_chain_add_up_as_in_gtsam(tmp_path):
     messages = [("/tf_static", 0.0, transform("base", "eye", 0.0, MOUNT))]
     file = write(
         tmp_path / "odom.mcap",
-        [*messages, *[("/odom", t, odometry(t, each, parents)) for t, each in zip(TIMES, ODOM, strict=True)]],
+        [
+            *messages,
+            *[
+                ("/odom", t, odometry(t, each, parents))
+                for t, each in zip(TIMES, ODOM, strict=True)
+            ],
+        ],
     )
     base, eye = read_trajectory(f"{file}#base"), read_trajectory(f"{file}#eye")
     assert base.covariance is not None and eye.covariance is not None
@@ -138,7 +170,11 @@ def test_odometry_is_taken_for_transforms_of_its_frame_and_a_pose_has_its_topics
         messages += [
             ("/tf", t, transform("odom", "base", t, MAP[2])),
             ("/odom", t, odometry(t, told, sure)),
-            ("/slam", t, {"header": header("map", t), "pose": {"position": way, "orientation": turn}}),
+            (
+                "/slam",
+                t,
+                {"header": header("map", t), "pose": {"position": way, "orientation": turn}},
+            ),
         ]
     file = write(tmp_path / "robot.mcap", messages)
     base, slam = read_trajectory(f"{file}#base"), read_trajectory(f"{file}#/slam")
@@ -148,15 +184,23 @@ def test_odometry_is_taken_for_transforms_of_its_frame_and_a_pose_has_its_topics
 
 
 def test_refused_in_a_sentence(tmp_path, robot):
-    messages = [("/tf", t, transform("map", each, t, MOUNT)) for t in (0.0, 0.1) for each in ("base", "arm")]
+    messages = [
+        ("/tf", t, transform("map", each, t, MOUNT)) for t in (0.0, 0.1) for each in ("base", "arm")
+    ]
     two = write(tmp_path / "two.mcap", messages)
     bent = transform("map", "base", 0.0, MOUNT)
     bent["transforms"][0]["transform"]["rotation"]["w"] = 3.0
     cases = (
         (two, f"{two}: the moving frames in it are arm base; choose one with two.mcap#FRAME"),
         (f"{robot}#hand", "the moving frames in it are base; choose one with robot.mcap#FRAME"),
-        (write(tmp_path / "none.mcap", []), "the moving frames in it are none; choose one with none.mcap#FRAME"),
-        (write(tmp_path / "bent.mcap", [("/tf", 0.0, bent)]), "topic /tf, frame base: a pose must be finite"),
+        (
+            write(tmp_path / "none.mcap", []),
+            "the moving frames in it are none; choose one with none.mcap#FRAME",
+        ),
+        (
+            write(tmp_path / "bent.mcap", [("/tf", 0.0, bent)]),
+            "topic /tf, frame base: a pose must be finite",
+        ),
         (
             write(tmp_path / "once.mcap", messages[:1]),
             "frame base: 2 poses are needed, with base known at the same time; record more",
@@ -179,7 +223,11 @@ def test_views_come_with_the_pose_of_their_moment(tmp_path):
     for t, b in zip(TIMES.tolist(), ODOM, strict=True):
         messages.append(("/odom", t, odometry(t, b, sure)))
         for camera, frame in (("cam0", "/eye"), ("cam1", "wall"), ("cam2", "eye")):
-            seen = {"header": header(frame, t + 0.05), "camera": camera, "people": [{"pose_keypoints_2d": flat}]}
+            seen = {
+                "header": header(frame, t + 0.05),
+                "camera": camera,
+                "people": [{"pose_keypoints_2d": flat}],
+            }
             messages.append(("/detections", t + 0.06, seen))
     told: list[str] = []
     views = list(read_views(write(tmp_path / "seen.mcap", messages), rig, BODY_25, told.append))
@@ -193,9 +241,14 @@ def test_views_come_with_the_pose_of_their_moment(tmp_path):
         "11 pictures of cam2 are left out: frame lift_tum has no pose within 0.5 s",
     ]
     for n, (_, seen, time_s, pose, covariance) in enumerate(moving):
-        between = ODOM[n] * gtsam.Pose3.Expmap(0.5 * gtsam.Pose3.Logmap(ODOM[n].between(ODOM[n + 1]))) * MOUNT
+        between = (
+            ODOM[n]
+            * gtsam.Pose3.Expmap(0.5 * gtsam.Pose3.Logmap(ODOM[n].between(ODOM[n + 1])))
+            * MOUNT
+        )
         assert time_s == pytest.approx(TIMES[n] + 0.05) and len(seen) == 25
-        # Turn and way are interpolated apart: a metre a second at 0.3 rad a second bends 0.4 mm in 0.1 s.
+        # Turn and way are interpolated apart: a metre a second at 0.3 rad a second bends 0.4 mm in
+        # 0.1 s.
         assert pose is not None and covariance is not None
         np.testing.assert_allclose(pose, between.matrix(), atol=1e-3)
         assert np.linalg.eigvalsh(covariance)[0] > 0
@@ -220,11 +273,17 @@ def test_very_many_poses_at_one_time_of_the_log_are_gone_through_once(tmp_path, 
     """Each look at a waiting picture goes through all poses of its frame."""
     rig = ring_of_cameras(2, np.random.default_rng(0))
     flat = np.concatenate([np.full((25, 2), 300.0), np.full((25, 1), 0.8)], axis=1).ravel().tolist()
-    seen = {"header": header("base", 0.9), "camera": "cam0", "people": [{"pose_keypoints_2d": flat}]}
+    seen = {
+        "header": header("base", 0.9),
+        "camera": "cam0",
+        "people": [{"pose_keypoints_2d": flat}],
+    }
     poses = [("/tf", 0.0, transform("map", "base", n / 1000, MOUNT)) for n in range(1000)]
     file = write(tmp_path / "seen.mcap", [("/detections", 0.0, seen), *poses])
     asked = list[str]()
     at = Frames.at
-    monkeypatch.setattr(Frames, "at", lambda self, frame, time_s: asked.append(frame) or at(self, frame, time_s))
+    monkeypatch.setattr(
+        Frames, "at", lambda self, frame, time_s: asked.append(frame) or at(self, frame, time_s)
+    )
     (view,) = read_views(file, rig, BODY_25, print)
     assert view[3] is not None and len(asked) < 10

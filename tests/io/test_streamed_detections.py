@@ -1,4 +1,6 @@
-"""Recordings larger than memory: read block by block, kept as files, the same as when they are read at once."""
+"""Recordings larger than memory: read block by block, kept as files, the same as when they are read
+at once.
+"""
 
 import json
 import tracemalloc
@@ -58,11 +60,16 @@ def same(one, other) -> None:
 def test_pieces_of_any_length_and_files_give_the_same(text, scene, once, tmp_path, monkeypatch):
     whole = read_detections(text, scene.rig)
     assert len(whole) == FRAMES and len(whole[FRAMES - 1]) == 0
-    # But for their order and the digits written, frames are those that were written, whichever block they are in.
+    # But for their order and the digits written, frames are those that were written, whichever
+    # block they are in.
     for frame in (0, BLOCK_FRAMES - 1, BLOCK_FRAMES, 2 * BLOCK_FRAMES + 3):
         given = once[frame % len(once)]
-        np.testing.assert_allclose(np.sort(whole[frame].xy[:, 0]), np.sort(given.xy[:, 0]), atol=2e-3)
-        np.testing.assert_allclose(np.sort(whole[frame].affinity), np.sort(given.affinity), atol=1e-6)
+        np.testing.assert_allclose(
+            np.sort(whole[frame].xy[:, 0]), np.sort(given.xy[:, 0]), atol=2e-3
+        )
+        np.testing.assert_allclose(
+            np.sort(whole[frame].affinity), np.sort(given.affinity), atol=1e-6
+        )
     monkeypatch.setattr(files, "PIECE", 777)
     kept = read_detections(text, scene.rig, kept=InFolder(tmp_path / "kept"))
     same(kept, whole)
@@ -75,7 +82,9 @@ def test_pieces_of_any_length_and_files_give_the_same(text, scene, once, tmp_pat
 
 @pytest.mark.slow
 def test_people_in_files_give_the_same_and_scores_are_judged_over_all(rig, tmp_path):
-    """A JSON file per frame and per camera; scores of the last block alone say that they are per cent."""
+    """A JSON file per frame and per camera; scores of the last block alone say that they are per
+    cent.
+    """
     rng = np.random.default_rng(0)
     for name in ("left", "right"):
         (tmp_path / "frames" / name).mkdir(parents=True)
@@ -83,11 +92,15 @@ def test_people_in_files_give_the_same_and_scores_are_judged_over_all(rig, tmp_p
         for frame in range(FRAMES):
             score = 100.0 if frame > 2 * BLOCK_FRAMES else 0.9
             people = [
-                np.column_stack([rng.uniform(300, 700, (25, 2)), np.full(25, score)]).ravel().tolist()
+                np.column_stack([rng.uniform(300, 700, (25, 2)), np.full(25, score)])
+                .ravel()
+                .tolist()
                 for _ in range((frame + 1) % 3)
             ]
             content = {"people": [{"pose_keypoints_2d": each} for each in people]}
-            (tmp_path / "frames" / name / f"v_{frame:012d}_keypoints.json").write_text(json.dumps(content))
+            (tmp_path / "frames" / name / f"v_{frame:012d}_keypoints.json").write_text(
+                json.dumps(content)
+            )
             results += [{"image_id": frame, "keypoints": each} for each in people]
         (tmp_path / "files").mkdir(exist_ok=True)
         (tmp_path / "files" / f"{name}.json").write_text(json.dumps(results))
@@ -96,14 +109,19 @@ def test_people_in_files_give_the_same_and_scores_are_judged_over_all(rig, tmp_p
     files = read_detections(tmp_path / "files", rig, kept=InFolder(tmp_path / "b"))
     same(files, frames)
     assert "scores reach 100" in frames.notes[0] and "divided by 100" in frames.notes[0]
-    assert frames[0].confidence.max() == pytest.approx(0.009) and frames[FRAMES - 2].confidence.max() == 1
+    assert (
+        frames[0].confidence.max() == pytest.approx(0.009)
+        and frames[FRAMES - 2].confidence.max() == 1
+    )
     # People are not kept beside their candidates.
     assert {file.name.split("-")[0] for file in (tmp_path / "a").iterdir()} == {"seen"}
 
 
 @pytest.mark.slow
 def test_a_file_of_all_frames_takes_the_memory_of_its_numbers(tmp_path):
-    """10,000 people of COCO, in any order: 4 MB as arrays, 5 MB of text, and 40 as Python's objects."""
+    """10,000 people of COCO, in any order: 4 MB as arrays, 5 MB of text, and 40 as Python's
+    objects.
+    """
     rng = np.random.default_rng(0)
     frames, keypoints = rng.permutation(10_000) // 2, rng.uniform(1, 900, (10_000, 17, 3)).round(2)
     people = zip(frames.tolist(), keypoints.reshape(-1, 51).tolist(), strict=True)
@@ -121,7 +139,9 @@ def test_a_file_of_all_frames_takes_the_memory_of_its_numbers(tmp_path):
     every = [first, *blocks]
     order = np.argsort(frames, kind="stable")
     np.testing.assert_array_equal(np.concatenate([each.frame for each in every]), frames[order])
-    np.testing.assert_array_equal(np.concatenate([each.keypoints for each in every]), keypoints[order])
+    np.testing.assert_array_equal(
+        np.concatenate([each.keypoints for each in every]), keypoints[order]
+    )
     assert all(np.ptp(each.frame) < BLOCK_FRAMES for each in every)
 
 
@@ -134,7 +154,9 @@ def test_a_file_of_all_frames_takes_the_memory_of_its_numbers(tmp_path):
         (0, "4 1", "numbers after the last of the 1 frames"),
     ],
 )
-def test_the_line_of_a_mistake_is_told_wherever_it_is(text, scene, tmp_path, monkeypatch, place, word, sentence):
+def test_the_line_of_a_mistake_is_told_wherever_it_is(
+    text, scene, tmp_path, monkeypatch, place, word, sentence
+):
     """In the last block, whose pieces are read when the lines before are forgotten."""
     detections = tmp_path / "detection"
     detections.mkdir()
@@ -156,7 +178,9 @@ def test_the_line_of_a_mistake_is_told_wherever_it_is(text, scene, tmp_path, mon
         assert f": line {line}: " in said[0]
 
 
-def test_text_is_utf_8_and_may_have_a_mark_and_other_ends_of_lines(text, scene, tmp_path, monkeypatch):
+def test_text_is_utf_8_and_may_have_a_mark_and_other_ends_of_lines(
+    text, scene, tmp_path, monkeypatch
+):
     name = scene.rig.names[0]
     content = (text / "detection" / f"{name}.txt").read_bytes()
     for each in scene.rig.names:
@@ -185,11 +209,22 @@ def test_memory_does_not_grow_with_the_recording(scene, once, tmp_path, monkeypa
     assert peaks[1] < 1.1 * peaks[0]
 
 
-@pytest.mark.parametrize("other", ["", "1e-07", "+3", "1234567890123456789", "0.1234567890123456789"])
+@pytest.mark.parametrize(
+    "other", ["", "1e-07", "+3", "1234567890123456789", "0.1234567890123456789"]
+)
 def test_numbers_are_read_as_python_reads_them(other, tmp_path):
     rng = np.random.default_rng(0)
     words = [f"{value:.{digits}f}" for digits in range(13) for value in rng.normal(0, 9, 200)]
-    words += ["-0", "5.", ".5", "-.25", "0000.10", "999999999999999", "0.00000000000001", *other.split()]
+    words += [
+        "-0",
+        "5.",
+        ".5",
+        "-.25",
+        "0000.10",
+        "999999999999999",
+        "0.00000000000001",
+        *other.split(),
+    ]
     file = tmp_path / "numbers.txt"
     file.write_bytes(" \n\t\r\n".join(words).encode())
     stream = NumberStream(file)
@@ -199,21 +234,29 @@ def test_numbers_are_read_as_python_reads_them(other, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("lead", "end"), [(0, 3), (1, 0), (BLOCK_FRAMES, 3), (BLOCK_FRAMES + 7, 0)])
+@pytest.mark.parametrize(
+    ("lead", "end"), [(0, 3), (1, 0), (BLOCK_FRAMES, 3), (BLOCK_FRAMES + 7, 0)]
+)
 def test_files_of_which_some_frames_are_common(scene, once, tmp_path, lead, end):
-    """Camera 1 has `lead` frames less at the beginning and `end` less at the end: by number, block by block."""
+    """Camera 1 has `lead` frames less at the beginning and `end` less at the end: by number, block
+    by block.
+    """
     whole = repeated(once, FRAMES)
     write_openpose(whole, scene.rig, tmp_path / "whole")
     everything = read_detections(tmp_path / "whole", scene.rig)
     folder = tmp_path / "whole" / scene.rig.names[1]
-    files = sorted(folder.iterdir() if folder.is_dir() else folder.with_name(f"{folder.name}_json").iterdir())
+    files = sorted(
+        folder.iterdir() if folder.is_dir() else folder.with_name(f"{folder.name}_json").iterdir()
+    )
     for file in [*files[:lead], *files[FRAMES - end :]]:
         file.unlink()
     table = read_detections(tmp_path / "whole", scene.rig)
     assert len(table) == FRAMES - lead - end
     for frame in range(len(table)):
         for name in COLUMNS:
-            np.testing.assert_array_equal(getattr(table[frame], name), getattr(everything[lead + frame], name))
+            np.testing.assert_array_equal(
+                getattr(table[frame], name), getattr(everything[lead + frame], name)
+            )
     every = read_detections(tmp_path / "whole", scene.rig, own_frames=True)
     assert len(every) == FRAMES
     for frame in range(FRAMES):

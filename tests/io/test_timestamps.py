@@ -32,7 +32,8 @@ def read(tmp_path: Path, text: str, rig: Rig, frames: int = 3):
         "time_s\n0\n0.04\n0.12\n",
         "# taken with a phone\n\n0.0 # first\n4e-2\n.12",
         "frame,time_s\n0,0\n1,0.04\n2,0.12\n",
-        "time_s frame note\n0.12 2 5\n0 0 5\n0.04 1 5\n9 3 5\n",  # in any order, frames that the recording lacks
+        # in any order, frames that the recording lacks
+        "time_s frame note\n0.12 2 5\n0 0 5\n0.04 1 5\n9 3 5\n",
     ],
 )
 def test_one_time_for_all_cameras(tmp_path, rig, text):
@@ -42,13 +43,19 @@ def test_one_time_for_all_cameras(tmp_path, rig, text):
 
 
 def test_a_time_for_each_camera(tmp_path, rig):
-    times = read(tmp_path, "frame, cam1, other, cam0\n0, 0.01, 9, 0\n1, 0.05, 9, 0.04\n2, 0.13, 9, 0.12\n", rig)
+    times = read(
+        tmp_path,
+        "frame, cam1, other, cam0\n0, 0.01, 9, 0\n1, 0.05, 9, 0.04\n2, 0.13, 9, 0.12\n",
+        rig,
+    )
     np.testing.assert_allclose(times.time_s, [[0, 0.01], [0.04, 0.05], [0.12, 0.13]])
 
 
 def test_cameras_that_are_called_by_numbers(tmp_path):
     cameras = ring_of_cameras(2, np.random.default_rng(0)).cameras
-    rig = Rig(tuple(replace(each, name=name) for each, name in zip(cameras, ("1", "2"), strict=True)), "z")
+    rig = Rig(
+        tuple(replace(each, name=name) for each, name in zip(cameras, ("1", "2"), strict=True)), "z"
+    )
     times = read(tmp_path, "2 1\n0.01 0\n0.05 0.04\n0.13 0.12\n", rig)
     np.testing.assert_allclose(times.time_s, [[0, 0.01], [0.04, 0.05], [0.12, 0.13]])
     np.testing.assert_allclose(read(tmp_path, "1\n2\n3\n", rig).time_s, [1, 2, 3])
@@ -59,16 +66,26 @@ def test_cameras_that_began_apart_are_put_together_by_their_times(tmp_path, rig)
     text = "cam0 cam1\n0 .084\n.04 .124\n.08 .164\n.12 -\n.16 .244\n.2 .284\n.24 -\n"
     (tmp_path / "times.csv").write_text(text)
     times, moments = read_timestamps(tmp_path / "times.csv", rig, 7)
-    assert moments is not None and moments.picture.tolist() == [[2, 0], [3, 1], [4, 2], [5, -1], [6, 4]]
+    assert moments is not None and moments.picture.tolist() == [
+        [2, 0],
+        [3, 1],
+        [4, 2],
+        [5, -1],
+        [6, 4],
+    ]
     expected = [[0.08, 0.084], [0.12, 0.124], [0.16, 0.164], [0.2, 0.2], [0.24, 0.244]]
     np.testing.assert_allclose(times.time_s, expected)
-    assert "1 of 5 synchronised frames have no picture within half a frame" in " ".join(moments.notes)
+    assert "1 of 5 synchronised frames have no picture within half a frame" in " ".join(
+        moments.notes
+    )
 
 
 def test_what_is_written_is_read(tmp_path, rig):
     given = np.array([[0.5, 0.51], [0.54, 0.55]])
     write_timestamps(tmp_path / "times.csv", rig.names, given)
-    np.testing.assert_allclose(read_timestamps(tmp_path / "times.csv", rig, 2)[0].time_s, given - 0.5, atol=1e-6)
+    np.testing.assert_allclose(
+        read_timestamps(tmp_path / "times.csv", rig, 2)[0].time_s, given - 0.5, atol=1e-6
+    )
     with pytest.raises(InputError, match="has a blank, a comma or #; rename it in the calibration"):
         write_timestamps(tmp_path / "times.csv", ["left one", "b"], given)
 
@@ -88,7 +105,10 @@ def test_a_recording_without_frames(tmp_path, rig):
         ("0\nsoon\n1\n", "line 2 must hold numbers, got 'soon'; write seconds like 0.033"),
         ("0\nnan\n1\n", "line 2 must hold numbers, got 'nan'"),
         ("0\ninf\n1\n", "line 2 must hold numbers, got 'inf'"),
-        ("0 0\n1 1\n2 2\n", "line 1 must hold 1 numbers, got 2; correct the line, or name the columns"),
+        (
+            "0 0\n1 1\n2 2\n",
+            "line 1 must hold 1 numbers, got 2; correct the line, or name the columns",
+        ),
         ("cam0 cam1\n0 0\n1\n2 2\n", "line 3 must hold 2 numbers, got 1; correct the line"),
         (
             "cam0 cam2\n0 0\n1 1\n2 2\n",
@@ -105,7 +125,10 @@ def test_a_recording_without_frames(tmp_path, rig):
         ("0\n33\n67\n", "frames are 33.5 s apart; write seconds"),
         (
             "cam0 cam1\n0 1000\n1 1001\n2 1002\n",
-            "camera cam0 ends at 2 s and camera cam1 starts at 1000 s: they have no time in common; give times",
+            (
+                "camera cam0 ends at 2 s and camera cam1 starts at 1000 s: they have no time in "
+                "common; give times"
+            ),
         ),
         ("cam0 cam1\n0 -\n1 -\n2 -\n", "camera cam1 has no times; leave it out with --without"),
         ("frame cam0 cam1\n0 0 0\n- 1 1\n2 2 2\n", "line 3 must hold numbers, got '-'"),
@@ -114,7 +137,9 @@ def test_a_recording_without_frames(tmp_path, rig):
 def test_what_cannot_be_used_is_one_sentence(tmp_path, rig, text, sentence):
     with pytest.raises(InputError) as caught:
         read(tmp_path, text, rig)
-    assert str(caught.value).startswith(f"{tmp_path / 'times.csv'}: ") and sentence in str(caught.value)
+    assert str(caught.value).startswith(f"{tmp_path / 'times.csv'}: ") and sentence in str(
+        caught.value
+    )
 
 
 def test_damaged_files_are_one_sentence_or_none(tmp_path, rig):
@@ -125,6 +150,8 @@ def test_damaged_files_are_one_sentence_or_none(tmp_path, rig):
         (tmp_path / "times.csv").write_bytes(bytes(damaged))
         try:
             times, moments = read_timestamps(tmp_path / "times.csv", rig, 3)
-            assert np.isfinite(times.time_s).all() and (moments is None or len(moments) == len(times))
+            assert np.isfinite(times.time_s).all() and (
+                moments is None or len(moments) == len(times)
+            )
         except InputError as error:
             assert "\n" not in str(error)

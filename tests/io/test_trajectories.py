@@ -1,4 +1,6 @@
-"""Trajectories from files: what odometry and SLAM write, and one sentence for what cannot be used."""
+"""Trajectories from files: what odometry and SLAM write, and one sentence for what cannot be
+used.
+"""
 
 import json
 from dataclasses import replace
@@ -49,15 +51,19 @@ def test_columns_in_any_order_with_covariances(tmp_path):
         ("0 1 2 3 0 0 0 1\n", "a trajectory needs 2 poses or more, got 1; write a line for each"),
         (TUM + "11 1 2 3 0 0 1\n", "line 4 must hold 8 numbers, got 7; correct the line"),
         (TUM + "11 1 2 x 0 0 0 1\n", "line 4 must hold numbers, got 'x'; write seconds and metres"),
-        (TUM + "11 1 2 nan 0 0 0 1\n", "line 4 must hold numbers, got 'nan'; write seconds and metres"),
+        (TUM + "11 1 2 nan 0 0 0 1\n",
+         "line 4 must hold numbers, got 'nan'; write seconds and metres"),
         (TUM + "10.5 1 2 3 0 0 0 1\n", "line 4 must be later than the pose before; sort by time"),
-        (TUM + "11 1 2 3 1 0 0 1\n", "line 4: the quaternion qx qy qz qw must have length 1, got 1.414; write"),
+        (TUM + "11 1 2 3 1 0 0 1\n",
+         "line 4: the quaternion qx qy qz qw must have length 1, got 1.414; write"),
         (TUM + "11 1e9 2 3 0 0 0 1\n", "line 4 is more than 1e+06 m away; write metres"),
         ("time_s x y z qx qy qz\n", "line 1: column qw is missing; name the columns time_s"),
-        ("time_s x y z qx qy qz qw speed\n", "line 1: column 'speed' is unknown or occurs twice; name"),
+        ("time_s x y z qx qy qz qw speed\n",
+         "line 1: column 'speed' is unknown or occurs twice; name"),
         ("time_s x y z qx qy qz qw x_x\n", "line 1: the covariance lacks rx_rx; give rx_rx ry_ry"),
         (
-            "time_s x y z qx qy qz qw rx_rx ry_ry rz_rz x_x y_y z_z\n" + "0 0 0 0 0 0 0 1 1 1 1 1 1 -1\n" * 1
+            "time_s x y z qx qy qz qw rx_rx ry_ry rz_rz x_x y_y z_z\n"
+            "0 0 0 0 0 0 0 1 1 1 1 1 1 -1\n"
             + "1 0 0 0 0 0 0 1 1 1 1 1 1 1\n",
             "line 2: the covariance must have no negative eigenvalue; write variances",
         ),
@@ -119,7 +125,10 @@ def test_an_odometry_that_starts_at_zero_is_put_into_the_world(tmp_path, rig):
             {"wTc": np.eye(4).tolist()},
             "give exactly one of wTc and cTw, or, of a moving camera, trajectory and bTc",
         ),
-        ({"bTc": [[1, 2], [3, 4]]}, "bTc must hold 16 numbers, got 4; write the 4x4 carrier-from-camera"),
+        (
+            {"bTc": [[1, 2], [3, 4]]},
+            "bTc must hold 16 numbers, got 4; write the 4x4 carrier-from-camera",
+        ),
     ],
 )
 def test_refuses_a_rig_file_that_says_wrongly_how_a_camera_moves(tmp_path, rig, change, says):
@@ -139,7 +148,10 @@ def test_a_trajectory_of_a_camera_of_any_calibration(tmp_path, rig):
     assert [each.carrier for each in found.cameras] == ["", "cam1"]
     np.testing.assert_allclose(found.cameras[1].wTc, rig.trajectories[0].wTb[0], atol=1e-12)
     for given, says in (
-        (["cam9=a.tum"], "--trajectory cam9=a.tum: must name a camera and a file; write CAMERA=FILE with one of"),
+        (
+            ["cam9=a.tum"],
+            "--trajectory cam9=a.tum: must name a camera and a file; write CAMERA=FILE with one of",
+        ),
         (["cam1"], "must name a camera and a file"),
         (
             ["cam0=a.tum", "cam1=a.tum"],

@@ -1,4 +1,6 @@
-"""Detections written for other systems, read back by our readers and by one that knows the format's text alone."""
+"""Detections written for other systems, read back by our readers and by one that knows the format's
+text alone.
+"""
 
 import json
 from dataclasses import replace
@@ -18,8 +20,8 @@ from shapepose_fg.proposal.people_2d import group_people
 from shapepose_fg.simulation import built_in_scene, simulate
 
 LIMBS = (
-    "1-8 9-10 10-11 8-9 8-12 12-13 13-14 1-2 2-3 3-4 2-17 1-5 5-6 6-7 5-18 1-0 0-15 0-16 15-17 16-18 "
-    "14-19 19-20 14-21 11-22 22-23 11-24"
+    "1-8 9-10 10-11 8-9 8-12 12-13 13-14 1-2 2-3 3-4 2-17 1-5 5-6 6-7 5-18 1-0 0-15 0-16 15-17 "
+    "16-18 14-19 19-20 14-21 11-22 22-23 11-24"
 )
 """As the description of the format lists them."""
 
@@ -33,7 +35,10 @@ def rig() -> Rig:
         {"name": "0", "image_size": (1281, 722)},
         {"name": "wide angle", "distortion": np.array([-0.05, 0, 0, 0, 0])},
     )
-    return Rig(tuple(replace(camera, **change) for camera, change in zip(cameras, changes, strict=True)), up="z")
+    return Rig(
+        tuple(replace(camera, **change) for camera, change in zip(cameras, changes, strict=True)),
+        up="z",
+    )
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +49,9 @@ def recording() -> Recording:
 
 
 def in_order(found: Detections) -> Detections:
-    """The same candidates sorted by view, then joint, then as they stood; pairs too, by their candidates."""
+    """The same candidates sorted by view, then joint, then as they stood; pairs too, by their
+    candidates.
+    """
     order = np.lexsort((found.joint, found.view))
     place = np.argsort(order)
     pairs = place[found.pairs]
@@ -59,7 +66,9 @@ def in_order(found: Detections) -> Detections:
     )
 
 
-def test_our_reader_finds_the_same_in_the_association_text(rig: Rig, recording: Recording, tmp_path: Path):
+def test_our_reader_finds_the_same_in_the_association_text(
+    rig: Rig, recording: Recording, tmp_path: Path
+):
     write_association(recording, rig, tmp_path)
     again = read_rig(tmp_path / "calibration.json")
     assert again.names == rig.names and again.up == "z"
@@ -85,8 +94,9 @@ def test_our_reader_finds_the_same_in_the_association_text(rig: Rig, recording: 
 def read_by_the_description(text: str) -> list[tuple[list, list]]:
     """Per frame the candidates (x, y, score) of each joint, and the matrix of each limb.
 
-    From the format's description alone: the skeleton's type and the number of frames; per frame, for each of
-    25 joints n, then n x, n y, n scores; then for each of 26 limbs the matrix, row by row.
+    From the format's description alone: the skeleton's type and the number of frames; per frame,
+    for each of 25 joints n, then n x, n y, n scores; then for each of 26 limbs the matrix, row by
+    row.
     """
     words = iter(text.split())
     assert next(words) == "4"
@@ -114,10 +124,14 @@ def test_a_reader_that_is_not_ours_finds_the_same(rig: Rig, recording: Recording
         width, height = entry["imgSize"]
         rotation = np.array(entry["RT"]).reshape(3, 4)
         np.testing.assert_allclose(rotation[:, :3] @ camera.centre + rotation[:, 3], 0, atol=1e-12)
-        frames = read_by_the_description((tmp_path / "detection" / f"{camera.name}.txt").read_text())
+        frames = read_by_the_description(
+            (tmp_path / "detection" / f"{camera.name}.txt").read_text()
+        )
         assert len(frames) == len(recording)
         for (joints, matrices), found in zip(frames, recording, strict=True):
-            rows = [np.flatnonzero((found.view == view) & (found.joint == joint)) for joint in range(25)]
+            rows = [
+                np.flatnonzero((found.view == view) & (found.joint == joint)) for joint in range(25)
+            ]
             for mine, read in zip(rows, joints, strict=True):
                 assert len(read) == len(mine)
                 if len(read) == 0:
@@ -131,12 +145,16 @@ def test_a_reader_that_is_not_ours_finds_the_same(rig: Rig, recording: Recording
             for limb, matrix in zip(LIMBS.split(), matrices, strict=True):
                 a, b = (rows[int(joint)] for joint in limb.split("-"))
                 expected = scores[np.ix_(a, b)]
-                np.testing.assert_allclose(np.array(matrix).reshape(expected.shape), expected, atol=5.01e-7)
+                np.testing.assert_allclose(
+                    np.array(matrix).reshape(expected.shape), expected, atol=5.01e-7
+                )
                 compared += np.count_nonzero(expected)
     assert compared == sum(len(found.affinity) for found in recording) > 300
 
 
-def test_what_lies_far_outside_the_picture_is_left_out(rig: Rig, recording: Recording, tmp_path: Path):
+def test_what_lies_far_outside_the_picture_is_left_out(
+    rig: Rig, recording: Recording, tmp_path: Path
+):
     xy = recording[0].xy.copy()
     rows = np.flatnonzero(recording[0].view == 1)
     rows = rows[np.argsort(~np.isin(rows, recording[0].pairs))]  # those with affinities lie outside
@@ -150,7 +168,9 @@ def test_what_lies_far_outside_the_picture_is_left_out(rig: Rig, recording: Reco
     assert len(back.affinity) < len(recording[0].affinity)
 
 
-def test_openpose_files_hold_the_people_that_affinities_make(rig: Rig, recording: Recording, tmp_path: Path):
+def test_openpose_files_hold_the_people_that_affinities_make(
+    rig: Rig, recording: Recording, tmp_path: Path
+):
     write_openpose(recording, rig, tmp_path)
     table = read_detections(tmp_path, rig)
     assert len(table) == 3
@@ -163,13 +183,16 @@ def test_openpose_files_hold_the_people_that_affinities_make(rig: Rig, recording
                 np.flatnonzero(
                     (found.view == truth.view[row])
                     & (found.joint == truth.joint[row])
-                    & (np.abs(found.xy - truth.xy[row]).max(axis=1) < 1.5e-3)  # three decimals, and the lens
+                    # three decimals, and the lens
+                    & (np.abs(found.xy - truth.xy[row]).max(axis=1) < 1.5e-3)
                 )
                 for row in rows
             ])  # fmt: skip
             assert same.shape == (len(rows), 1)
             inside = np.isin(found.pairs, same[:, 0])
-            np.testing.assert_array_equal(inside[:, 0], inside[:, 1])  # no pair leads from one person to another
+            np.testing.assert_array_equal(
+                inside[:, 0], inside[:, 1]
+            )  # no pair leads from one person to another
         assert (found.affinity == 1).all()
 
 
@@ -184,7 +207,9 @@ def test_groups_are_people_where_the_detector_is_perfect():
     true_xy = scene.rig.project(scene.truth_at(0))[0]
     for rows in groups:
         assert len(set(found.view[rows].tolist())) == 1
-        error = np.linalg.norm(true_xy[found.view[rows], :, found.joint[rows]] - found.xy[rows][:, None], axis=-1)
+        error = np.linalg.norm(
+            true_xy[found.view[rows], :, found.joint[rows]] - found.xy[rows][:, None], axis=-1
+        )
         assert error.max(axis=0).min() < 1e-6  # all of one person
 
 
@@ -192,7 +217,9 @@ def test_a_stronger_pair_is_grouped_first_and_nobody_gets_two_of_a_kind():
     neck, hip, wrist = 1, 8, 4
     joint = np.array([neck, hip, hip, wrist, neck])
     pairs = np.array([[0, 1], [0, 2], [4, 2]])
-    found = Detections(np.zeros(5, int), joint, np.zeros((5, 2)), np.ones(5), pairs, np.array([0.5, 0.7, 0.6]))
+    found = Detections(
+        np.zeros(5, int), joint, np.zeros((5, 2)), np.ones(5), pairs, np.array([0.5, 0.7, 0.6])
+    )
     groups = sorted(sorted(rows.tolist()) for rows in group_people(found))
     # 0-2 wins; 4-2 would give two necks, 0-1 two hips.
     assert groups == [[0, 2], [1], [3], [4]]
@@ -202,7 +229,9 @@ def test_misuse_and_leftovers_are_refused(rig: Rig, recording: Recording, tmp_pa
     with pytest.raises(ValueError, match="z up"):
         write_association(recording, Rig(rig.cameras, up="y"), tmp_path)
     fisheye = replace(rig.cameras[0], distortion=np.zeros(4), lens="fisheye")
-    with pytest.raises(ValueError, match="five distortion coefficients, but camera left has another lens"):
+    with pytest.raises(
+        ValueError, match="five distortion coefficients, but camera left has another lens"
+    ):
         write_association(recording, replace(rig, cameras=(fisheye, *rig.cameras[1:])), tmp_path)
     with pytest.raises(ValueError, match="no frame"):
         write_association(Recording(BODY_25, []), rig, tmp_path)

@@ -44,11 +44,15 @@ def played(dance) -> Played:
 
 @pytest.fixture
 def start(dance):
-    """A function (**options) -> a live reconstruction before the dance's cameras; they end with the test."""
+    """A function (**options) -> a live reconstruction before the dance's cameras; they end with the
+    test.
+    """
     begun = []
 
     def make(rig=None, **options):
-        begun.append(OnlineReconstructor(dance.scene.rig if rig is None else rig, **{"workers": 1} | options))
+        begun.append(
+            OnlineReconstructor(dance.scene.rig if rig is None else rig, **{"workers": 1} | options)
+        )
         return begun[-1]
 
     yield make
@@ -57,8 +61,12 @@ def start(dance):
 
 
 def errors_mm(people: Reconstruction, truth) -> tuple[np.ndarray, np.ndarray]:
-    """(M, J) errors of rows of `people` that are somebody of the truth (T, P, J, 3), and who (M,)."""
+    """(M, J) errors of rows of `people` that are somebody of the truth (T, P, J, 3), and who
+    (M,).
+    """
     from shapepose_fg.evaluation.metrics import match_people
 
     found = match_people(people.frame, people.joints, truth)
-    return 1e3 * np.linalg.norm(people.joints[found.row] - truth[found.frame, found.person], axis=-1), found
+    return 1e3 * np.linalg.norm(
+        people.joints[found.row] - truth[found.frame, found.person], axis=-1
+    ), found

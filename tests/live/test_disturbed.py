@@ -87,7 +87,10 @@ def test_a_camera_whose_clock_is_set_is_left_out_and_named(live, five_cameras, s
     play(live, given)
     assert live.report().frames == FRAMES and live.report().jumps == 0
     said = [(each.camera, each.state) for each in live.said()]
-    assert (five_cameras.names[2], CameraState.OFF_CLOCK) not in said  # eight views are too few to say
+    assert (
+        five_cameras.names[2],
+        CameraState.OFF_CLOCK,
+    ) not in said  # eight views are too few to say
     again = list(views(five_cameras, seen, range(FRAMES, 2 * FRAMES)))
     for each in again:
         each[2] += shift_s if each[0] == five_cameras.names[2] else 0.0
@@ -207,7 +210,11 @@ def test_a_line_of_rubbish_is_left_out_and_named(tmp_path, five_cameras, what):
 
 def test_marks_of_editors_and_empty_lines_are_no_rubbish(tmp_path, five_cameras):
     lines = lines_of(five_cameras, 9)
-    for content in (b"\xef\xbb\xbf" + b"\r\n".join(lines), b"\n\n".join(lines), b"\n \n" + b"\n".join(lines)):
+    for content in (
+        b"\xef\xbb\xbf" + b"\r\n".join(lines),
+        b"\n\n".join(lines),
+        b"\n \n" + b"\n".join(lines),
+    ):
         assert len(fed(tmp_path, five_cameras, content)[0]) == 9
 
 
@@ -236,7 +243,11 @@ def test_notes_do_not_flood():
     with SparingNotes(told.append) as note:
         for n in range(1000):
             note(str(n))
-    assert told[:3] == ["0", "1", "2"] and 10 < len(told) < 20 and "more notes were left out" in told[-1]
+    assert (
+        told[:3] == ["0", "1", "2"]
+        and 10 < len(told) < 20
+        and "more notes were left out" in told[-1]
+    )
 
 
 class Served:
@@ -267,7 +278,9 @@ class Served:
         assert len(self.taken) == count
 
     def wait_for_note(self, words: str) -> None:
-        """Notes are written by the thread that lets clients in: nothing orders them against frames taken."""
+        """Notes are written by the thread that lets clients in: nothing orders them against frames
+        taken.
+        """
         self._wait(lambda: any(words in each for each in self.notes))
         assert any(words in each for each in self.notes), self.notes
 

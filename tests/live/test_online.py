@@ -1,4 +1,6 @@
-"""People as detections come, against the truth and against the same recording reconstructed as a whole."""
+"""People as detections come, against the truth and against the same recording reconstructed as a
+whole.
+"""
 
 from dataclasses import replace
 
@@ -21,7 +23,8 @@ def truth(dance):
 
 def test_everybody_is_there_at_once_and_keeps_their_identity(played, truth):
     error, found = errors_mm(played.now, truth)
-    # The first frames are those of a new scene: who is not sure yet is not shown for up to three of them.
+    # The first frames are those of a new scene: who is not sure yet is not shown for up to three of
+    # them.
     assert len(found.missed) <= 12 and len(found.invented) == len(found.duplicated) == 0
     assert sorted(np.unique(played.now.person)) == [0, 1, 2, 3]
     for who in range(4):
@@ -38,7 +41,10 @@ def test_what_settles_is_what_the_whole_recording_gives(played, dance, truth):
     assert len(found.missed) == 0
     assert np.nanmean(error) < np.nanmean(offline) + 4.0
     at = {(f, p): n for n, (f, p) in enumerate(zip(of_whole.frame, of_whole.person, strict=True))}
-    pairs = [(r, of_whole.row[at[f, p]]) for r, f, p in zip(found.row, found.frame, found.person, strict=True)]
+    pairs = [
+        (r, of_whole.row[at[f, p]])
+        for r, f, p in zip(found.row, found.frame, found.person, strict=True)
+    ]
     one, other = np.array(pairs).T
     apart = 1e3 * np.linalg.norm(settled.joints[one] - whole.joints[other], axis=-1)
     assert np.nanmedian(apart) < 8.0
@@ -49,11 +55,14 @@ def test_what_settles_is_what_the_whole_recording_gives(played, dance, truth):
 def test_regions_of_95_percent_hold_about_so_many(played, truth, which):
     people = getattr(played, which)
     # 0.1 s ahead of people's first frames little is known of how they move.
-    people = people.rows((people.frame < len(truth)) & (people.frame >= (8 if which == "ahead" else 0)))
+    people = people.rows(
+        (people.frame < len(truth)) & (people.frame >= (8 if which == "ahead" else 0))
+    )
     _, found = errors_mm(people, truth)
     error = people.joints[found.row] - truth[found.frame, found.person]
     inside = covariance_calibration(error, people.covariance[found.row]).coverage[0.95]
-    # 4,000 joints of four people whose errors last for most of the 1.3 s: several per cent either way.
+    # 4,000 joints of four people whose errors last for most of the 1.3 s: several per cent either
+    # way.
     assert 0.85 < inside < 0.998
 
 
@@ -68,7 +77,8 @@ def test_covariances_grow_with_the_time_ahead_and_nothing_is_said_of_other_times
     for frame in range(4):
         live.push(dance.recording[frame], frame / 30)
     sizes = [
-        np.nanmean(np.trace(live.people(0.1 + ahead).covariance, axis1=2, axis2=3)) for ahead in (0, 0.1, 0.3, 1)
+        np.nanmean(np.trace(live.people(0.1 + ahead).covariance, axis1=2, axis2=3))
+        for ahead in (0, 0.1, 0.3, 1)
     ]
     assert (np.diff(sizes) > 0).all() and sizes[3] > 5 * sizes[2] > 25 * sizes[1]
     for time_s in (0.05, 1.2):
@@ -86,7 +96,8 @@ def test_a_late_frame_takes_part_and_one_that_is_too_late_is_counted(start, danc
         inorder.push(dance.recording[frame], frame / 30)
     one, other = live.people(), inorder.people()
     assert one.person.tolist() == other.person.tolist()
-    # The filter goes the same way; what was refined meanwhile, and fed back of unseen joints, may differ.
+    # The filter goes the same way; what was refined meanwhile, and fed back of unseen joints, may
+    # differ.
     assert np.nanmedian(np.linalg.norm(one.joints - other.joints, axis=-1)) < 1e-9
     assert (live.report().frames, live.report().late, live.report().dropped) == (11, 1, 0)
     live.push(dance.recording[0], -0.1)
@@ -182,7 +193,9 @@ def test_a_state_of_something_else_is_refused_in_a_sentence(start, dance, tmp_pa
 def test_misuse_is_refused(start, dance):
     live, seen = start(), dance.recording[0]
     with pytest.raises(ValueError, match="at least 2 cameras"):
-        OnlineReconstructor(replace(dance.scene.rig, cameras=dance.scene.rig.cameras[:1]), workers=1)
+        OnlineReconstructor(
+            replace(dance.scene.rig, cameras=dance.scene.rig.cameras[:1]), workers=1
+        )
     with pytest.raises(ValueError, match=r"lag_s must be 0\.1 to 2"):
         OnlineReconstructor(dance.scene.rig, lag_s=5, workers=1)
     with pytest.raises(ValueError, match="view must be 0 to 5"):
@@ -203,8 +216,9 @@ def test_processes_of_their_own_settle_the_same_rows(start, dance, played):
         parts.append(live.settled(wait=True))
     settled = rows([*parts, live.finish()])
     assert np.array_equal(settled.frame, played.settled.frame)
-    # In `push` the refined bodies come back in the same frame, from other processes in a later one: a millimetre
-    # in the median, where joints are 15 mm from the truth and another person's half a metre.
+    # In `push` the refined bodies come back in the same frame, from other processes in a later one:
+    # a millimetre in the median, where joints are 15 mm from the truth and another person's half a
+    # metre.
     assert np.nanmedian(np.linalg.norm(settled.joints - played.settled.joints, axis=-1)) < 3e-3
 
 

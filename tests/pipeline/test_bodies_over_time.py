@@ -1,4 +1,6 @@
-"""People recognised from one recording to the next, by shape: their names, and what is known of them."""
+"""People recognised from one recording to the next, by shape: their names, and what is known of
+them.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -29,12 +31,16 @@ SIGMA_M = 0.003
 
 
 def seen(scene: Scene, frames: slice, seed: int) -> Reconstruction:
-    """The scene's people in these frames, taken 2 s apart (each tells of the shape anew), joints with noise."""
+    """The scene's people in these frames, taken 2 s apart (each tells of the shape anew), joints
+    with noise.
+    """
     truth = truth_of(scene)
     people = truth.rows(np.isin(truth.frame, np.arange(len(scene))[frames]))
     noise = np.random.default_rng(seed).normal(0, SIGMA_M, people.joints.shape)
     covariance = np.broadcast_to(SIGMA_M**2 * np.eye(3), people.covariance.shape)
-    return replace(people, time_s=2.0 * people.frame, joints=people.joints + noise, covariance=covariance)
+    return replace(
+        people, time_s=2.0 * people.frame, joints=people.joints + noise, covariance=covariance
+    )
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +56,8 @@ def fitter() -> SmplFitter:
 
 
 def of_unlike_people() -> Scene:
-    """Two people whose first number of the shape, mostly stature, is far from the mean, and one far from both.
+    """Two people whose first number of the shape, mostly stature, is far from the mean, and one far
+    from both.
 
     Average people cannot be recognised: that number is known to 0.2, and many adults are like them.
     """
@@ -72,9 +79,17 @@ def test_people_keep_their_names_and_strangers_get_free_ones(fitter):
     known = first.rows(np.array([0, 1])).named(["Ann", "1"])
     alone = with_bodies_over_time(people, fitter)
     second = with_bodies_over_time(people, fitter, known)
-    assert second.shapes.names.tolist() == ["1", "2", "Ann"]  # of persons 0, 1, 7: "1" is somebody else's name
-    # What was known counts: shapes of the known are surer than from this recording alone, the stranger's is not.
-    gain = np.linalg.slogdet(second.shapes.information)[1] - np.linalg.slogdet(alone.shapes.information)[1]
+    assert second.shapes.names.tolist() == [
+        "1",
+        "2",
+        "Ann",
+    ]  # of persons 0, 1, 7: "1" is somebody else's name
+    # What was known counts: shapes of the known are surer than from this recording alone, the
+    # stranger's is not.
+    gain = (
+        np.linalg.slogdet(second.shapes.information)[1]
+        - np.linalg.slogdet(alone.shapes.information)[1]
+    )
     assert gain[[0, 2]].min() > 1 and abs(gain[1]) < 0.5
     both = known.updated(second.shapes)
     assert sorted(both.names.tolist()) == ["1", "2", "Ann"]
@@ -90,7 +105,10 @@ def test_nobody_and_no_file(scene, fitter):
 
 def test_bodies_stand_on_the_floor_that_was_found(scene, fitter):
     """A floor 20 cm above the scene's own: whoever stands there is lifted out of it."""
-    people, floor = seen(scene, slice(0, 4), 0), Floor(np.array([0.0, 0.0, 1.0]), 0.2, 0.01, 100, 1.0)
+    people, floor = (
+        seen(scene, slice(0, 4), 0),
+        Floor(np.array([0.0, 0.0, 1.0]), 0.2, 0.01, 100, 1.0),
+    )
     lowest = []
     for each in (None, floor):
         found = with_bodies_over_time(people, fitter, floor=each)
@@ -101,14 +119,18 @@ def test_bodies_stand_on_the_floor_that_was_found(scene, fitter):
 
 
 def test_every_row_gets_its_own_body():
-    """Person 3 has five rows in two segments, person 8 three in one; windows of four rows each, people mixed."""
+    """Person 3 has five rows in two segments, person 8 three in one; windows of four rows each,
+    people mixed.
+    """
     names = {3: {"a": range(0, 3), "b": range(3, 5)}, 8: {"c": range(3)}}
     kept, number = InMemory(), {"a": [30, 31, 32], "b": [33, 34], "c": [80, 81, 82]}
     for name, values in number.items():
         ok = np.array(values) != 81
         kept.keep(name, {"ok": ok, "transl": np.array(values)[:, None] + np.zeros(3)})
     bodies = BodiesOverTime(kept, names, SubjectShapes.empty("b" * 64))
-    statuses = np.array([Status.OK, Status.BODY_UNDETERMINED, Status.BODY_UNDETERMINED, Status.NOT_SOLVED])
+    statuses = np.array(
+        [Status.OK, Status.BODY_UNDETERMINED, Status.BODY_UNDETERMINED, Status.NOT_SOLVED]
+    )
     for person, before, expected in (
         ([8, 3, 3, 8], {}, [80, 30, 31, -1]),
         ([3, 8, 3, 3], {3: 2, 8: 2}, [32, 82, 33, 34]),
@@ -126,7 +148,9 @@ def test_every_row_gets_its_own_body():
 
 @pytest.mark.slow
 def test_a_long_track_is_fitted_in_stretches_that_fit_together(fitter):
-    """240 frames at 25 a second in three stretches against one: the same person, without a step at the borders."""
+    """240 frames at 25 a second in three stretches against one: the same person, without a step at
+    the borders.
+    """
     scene = built_in_scene(people=1, frames=240)
     people = seen(scene, slice(0, 240), 0)
     people = replace(people, time_s=people.frame / 25)
@@ -160,7 +184,10 @@ def test_a_long_track_is_fitted_in_stretches_that_fit_together(fitter):
     apart = (cut.shapes.betas - whole.shapes.betas)[0]
     assert apart @ cut.shapes.information[0] @ apart < 10
     # A third of the rows know less, and say so.
-    gain = np.linalg.slogdet(whole.shapes.information[0])[1] - np.linalg.slogdet(cut.shapes.information[0])[1]
+    gain = (
+        np.linalg.slogdet(whole.shapes.information[0])[1]
+        - np.linalg.slogdet(cut.shapes.information[0])[1]
+    )
     assert gain > 1
     # What 80 rows, three looks, leave open of the shape.
     joints, usual = (fitter.model.keypoints(each) for each in (found, expected))
@@ -172,14 +199,17 @@ def test_a_long_track_is_fitted_in_stretches_that_fit_together(fitter):
     same = fitter.model.keypoints(BodyParameters(*pose))
     off_mm = 1e3 * np.linalg.norm(joints - same, axis=-1)
     assert np.median(off_mm) < 0.1 and off_mm.max() < 8
-    # With 8 rows of the neighbours half the joints jump by 0.15 mm or more, with 2 one by 7 mm or more.
+    # With 8 rows of the neighbours half the joints jump by 0.15 mm or more, with 2 one by 7 mm or
+    # more.
     apart_mm = 1e3 * np.linalg.norm(np.diff(joints, axis=0) - np.diff(same, axis=0), axis=-1)
     assert np.median(apart_mm[[79, 159]]) < 0.1 and apart_mm[[79, 159]].max() < 2
 
 
 @pytest.mark.slow
 def test_a_long_track_of_somebody_known(fitter):
-    """Who is recognised is fitted with what was known before, in a track of several stretches as in one of one."""
+    """Who is recognised is fitted with what was known before, in a track of several stretches as in
+    one of one.
+    """
     scene = built_in_scene(people=2, frames=96)
     people = seen(scene, slice(0, 96), 0)
     first = people.rows(people.frame < 48)
@@ -196,7 +226,12 @@ def test_a_long_track_of_somebody_known(fitter):
         everybody = dict.fromkeys(numbers.tolist(), 48)
         jobs = InMemory()
         return fit_everybody(
-            everybody, person, lambda jobs: (job.fitted(fitter) for job in jobs), jobs, known, (24, 8)
+            everybody,
+            person,
+            lambda jobs: (job.fitted(fitter) for job in jobs),
+            jobs,
+            known,
+            (24, 8),
         ).shapes
 
     alone, again = fitted(SubjectShapes.empty(known.body)), fitted(known)

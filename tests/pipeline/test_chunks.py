@@ -1,4 +1,6 @@
-"""Chunks of a recording, reconstructed side by side: the same people, the same joints, the same names."""
+"""Chunks of a recording, reconstructed side by side: the same people, the same joints, the same
+names.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -28,7 +30,9 @@ from shapepose_fg.tracking.tracker import BodyScale, TrackingConfig, Tracks
 from tests.marks import slow
 
 CONFIG = PipelineConfig(
-    batch_frames=12, following=FollowingConfig(look_ahead_s=0.3), windows=WindowConfig(overlap_s=0.16)
+    batch_frames=12,
+    following=FollowingConfig(look_ahead_s=0.3),
+    windows=WindowConfig(overlap_s=0.16),
 )
 CUTS = (30,)
 
@@ -70,25 +74,40 @@ def whole(assembly) -> Reconstruction:
 
 @pytest.fixture(scope="module")
 def in_chunks(scene, recording, times):
-    return reconstruct(recording, scene.rig, CONFIG, times=times, cuts=CUTS, execution=Execution(chunk_frames=12))
+    return reconstruct(
+        recording, scene.rig, CONFIG, times=times, cuts=CUTS, execution=Execution(chunk_frames=12)
+    )
 
 
 @pytest.mark.slow
 def test_every_row_is_of_its_frame_and_its_person(scene, whole):
-    """In a run of several windows: where somebody is when, how fast, with which body, from which detections."""
+    """In a run of several windows: where somebody is when, how fast, with which body, from which
+    detections.
+    """
     assert np.bincount(whole.frame).tolist() == [2] * 54
     assert np.lexsort((whole.person, whole.frame)).tolist() == list(range(len(whole)))
     np.testing.assert_allclose(whole.time_s, whole.frame / scene.fps, atol=1e-9)
     places, speeds = scene.keypoints, np.gradient(scene.keypoints, 1 / scene.fps, axis=0)
     apart = np.linalg.norm(whole.joints[:, None] - places[whole.frame], axis=-1)
     who = apart.mean(axis=-1).argmin(axis=1)
-    assert len(set(zip(whole.person.tolist(), who.tolist(), (whole.frame >= 30).tolist(), strict=True))) == 4
-    truth, speed, seen = places[whole.frame, who], speeds[whole.frame, who], whole.known == Known.SEEN
+    assert (
+        len(
+            set(zip(whole.person.tolist(), who.tolist(), (whole.frame >= 30).tolist(), strict=True))
+        )
+        == 4
+    )
+    truth, speed, seen = (
+        places[whole.frame, who],
+        speeds[whole.frame, who],
+        whole.known == Known.SEEN,
+    )
     error = whole.joints - truth
     assert np.median(np.linalg.norm(error, axis=-1)[seen]) < 0.03
     assert np.median(np.linalg.norm(whole.velocity - speed, axis=-1)[seen]) < 0.25
     squared = np.einsum("nji,njik,njk->nj", error, np.linalg.inv(whole.covariance), error)
-    assert 0.75 < (squared[seen] < 7.81).mean() <= 1  # of a Gaussian 95 %; two people whose errors last
+    assert (
+        0.75 < (squared[seen] < 7.81).mean() <= 1
+    )  # of a Gaussian 95 %; two people whose errors last
     columns = (whole.betas, whole.global_orient, whole.body_pose, whole.transl)
     body = scene.body.keypoints(BodyParameters(*columns))
     moving = seen & (np.linalg.norm(speed, axis=-1) > 0.5)
@@ -96,11 +115,15 @@ def test_every_row_is_of_its_frame_and_its_person(scene, whole):
         mine = np.flatnonzero(whole.person == track)
         for other in (truth, body):
             late = {
-                step: np.linalg.norm(whole.joints[mine] - np.roll(other[mine], step, axis=0), axis=-1)[2:-2]
+                step: np.linalg.norm(
+                    whole.joints[mine] - np.roll(other[mine], step, axis=0), axis=-1
+                )[2:-2]
                 for step in (-1, 0, 1)
             }
             late = {step: each[moving[mine][2:-2]].mean() for step, each in late.items()}
-            assert min(late, key=late.__getitem__) == 0, "nearest to the truth and the body of its own frame"
+            assert min(late, key=late.__getitem__) == 0, (
+                "nearest to the truth and the body of its own frame"
+            )
     projected = np.moveaxis(scene.rig.project(whole.joints)[0], 0, 2)
     table = whole.observations
     residual = (projected - table.xy)[table.used]
@@ -119,12 +142,17 @@ def test_a_person_s_rows_are_read_from_all_windows(assembly, whole):
         known = np.linalg.norm(found.targets.information, axis=(-2, -1)) > 0
         np.testing.assert_array_equal(found.targets.xyz[known], whole.joints[chosen][known])
         np.testing.assert_allclose(
-            np.linalg.inv(found.targets.information[known]), whole.covariance[chosen][known], rtol=1e-6, atol=1e-12
+            np.linalg.inv(found.targets.information[known]),
+            whole.covariance[chosen][known],
+            rtol=1e-6,
+            atol=1e-12,
         )
         np.testing.assert_array_equal(found.time_s, whole.time_s[chosen])
     first, last = min(assembly.rows_of), max(assembly.rows_of)
     named = replace(assembly, names={first: 40, last: first}, bodies=None).reconstruction()
-    expected = np.where(whole.person == first, 40, np.where(whole.person == last, first, whole.person))
+    expected = np.where(
+        whole.person == first, 40, np.where(whole.person == last, first, whole.person)
+    )
     np.testing.assert_array_equal(named.person, expected)
     np.testing.assert_array_equal(named.observations.person, expected)
     thinned = assembly.reconstruction(every=5)
@@ -138,11 +166,13 @@ def test_chunks_change_neither_people_nor_names(whole, in_chunks):
     assert np.array_equal(in_chunks.frame, whole.frame)
     pairs = set(zip(whole.person.tolist(), in_chunks.person.tolist(), strict=True))
     assert len(pairs) == len(np.unique(whole.person)) == len(np.unique(in_chunks.person))
-    # The same windows and detections. Only where tracks expected joints differs, after half a second of warm-up,
-    # and that is where joints start that no two views see.
+    # The same windows and detections. Only where tracks expected joints differs, after half a
+    # second of warm-up, and that is where joints start that no two views see.
     apart = np.abs(in_chunks.joints - whole.joints)
     assert apart.max() < 2e-3 and apart.mean() < 1e-5
-    one, other = ({e["person"]: e["evidence"] for e in each.run["probability"]} for each in (whole, in_chunks))
+    one, other = (
+        {e["person"]: e["evidence"] for e in each.run["probability"]} for each in (whole, in_chunks)
+    )
     assert one.keys() == {name for name, _ in pairs}
     assert len(set(one.values())) == 4, "everybody's own"
     for name, in_chunk in pairs:
@@ -152,11 +182,18 @@ def test_chunks_change_neither_people_nor_names(whole, in_chunks):
 @pytest.mark.slow
 def test_processes_change_no_byte_of_it(scene, recording, times, in_chunks):
     found = reconstruct(
-        recording, scene.rig, CONFIG, times=times, cuts=CUTS, execution=Execution(chunk_frames=12, workers=2)
+        recording,
+        scene.rig,
+        CONFIG,
+        times=times,
+        cuts=CUTS,
+        execution=Execution(chunk_frames=12, workers=2),
     )
     for name in found.ROWS:
         equal_nan = name != "status"
-        assert np.array_equal(getattr(found, name), getattr(in_chunks, name), equal_nan=equal_nan), name
+        assert np.array_equal(
+            getattr(found, name), getattr(in_chunks, name), equal_nan=equal_nan
+        ), name
 
 
 @pytest.mark.slow
@@ -165,7 +202,9 @@ def test_a_dask_cluster_changes_no_byte_of_it(scene, recording, times, in_chunks
     execution = Execution(chunk_frames=12, workers=2, cluster="local")
     found = reconstruct(recording, scene.rig, CONFIG, times=times, cuts=CUTS, execution=execution)
     for name in ("joints", "covariance", "person", "body_pose"):
-        assert np.array_equal(getattr(found, name), getattr(in_chunks, name), equal_nan=name != "person"), name
+        assert np.array_equal(
+            getattr(found, name), getattr(in_chunks, name), equal_nan=name != "person"
+        ), name
 
 
 @pytest.mark.slow
@@ -183,7 +222,9 @@ def test_a_run_in_chunks_that_was_stopped_goes_on(scene, recording, times, in_ch
     assert done[0] > 20
     for name in ("joints", "covariance", "person", "body_pose", "frame"):
         equal_nan = name not in ("person", "frame")
-        assert np.array_equal(getattr(found, name), getattr(in_chunks, name), equal_nan=equal_nan), name
+        assert np.array_equal(
+            getattr(found, name), getattr(in_chunks, name), equal_nan=equal_nan
+        ), name
 
 
 def test_every_frame_is_in_one_chunk_whose_borders_are_those_of_windows():
@@ -226,10 +267,17 @@ class NobodyIsThere:
 
 @pytest.mark.parametrize(
     ("batch", "views", "fps"),
-    [(12, 3, 3.0), *slow((12, 1, 25.0), (12, 3, 50.0), (12, 6, 60.0), (1, 1, 60.0), (1, 6, 25.0), (1, 3, 50.0))],
+    [
+        (12, 3, 3.0),
+        *slow(
+            (12, 1, 25.0), (12, 3, 50.0), (12, 6, 60.0), (1, 1, 60.0), (1, 6, 25.0), (1, 3, 50.0)
+        ),
+    ],
 )
 def test_every_chunk_gives_its_own_frames_and_whole_windows(fps, views, batch):
-    """Times of views are rounded when their mean is taken: 0.4 s or 1 s are a frame more or less then."""
+    """Times of views are rounded when their mean is taken: 0.4 s or 1 s are a frame more or less
+    then.
+    """
     config = PipelineConfig(batch_frames=batch)
     times = FrameTimes.from_fps(fps, 200)
     of_views = times.of_views(views)
@@ -240,7 +288,9 @@ def test_every_chunk_gives_its_own_frames_and_whole_windows(fps, views, batch):
     def spans(chunk: Chunk) -> list[tuple[list[int], int, int]]:
         engine = Engine(NobodyIsThere(), config)  # type: ignore[arg-type]
         found = windows_of(engine, chunk, read)
-        return [([given.frame for given, _ in span.decided], span.start, span.stop) for span in found]
+        return [
+            ([given.frame for given, _ in span.decided], span.start, span.stop) for span in found
+        ]
 
     whole = [
         (frames, start, stop)
@@ -277,7 +327,9 @@ def test_a_chunk_without_its_frames_is_an_error_and_no_gap(scene, recording):
     setup = Setup(scene.rig, recording.skeleton, CONFIG, make_fitter(CONFIG.body))
     given = tuple(Input(n, np.full(4, n / 25), Detections.empty(), scene.rig) for n in range(16))
     short = Chunk(range(0, 12), 0, 16, ended=False)  # half a window and 0.3 s more are needed
-    with pytest.raises(RuntimeError, match=r"windows of 0 frames were found for a chunk of range\(0, 12\)"):
+    with pytest.raises(
+        RuntimeError, match=r"windows of 0 frames were found for a chunk of range\(0, 12\)"
+    ):
         solve_chunk(setup, (short, given))
 
 
@@ -285,18 +337,25 @@ def border(track, candidate, place):
     """Rows of one frame with one joint and one view."""
     n = len(track)
     return Border(
-        np.zeros(n, int), np.array(track), np.array(candidate).reshape(n, 1, 1), np.array(place).reshape(n, 1, 3)
+        np.zeros(n, int),
+        np.array(track),
+        np.array(candidate).reshape(n, 1, 1),
+        np.array(place).reshape(n, 1, 3),
     )
 
 
 def test_who_is_who_by_detections_and_out_of_sight_by_place():
     before = border([0, 1, 2], [7, 8, -1], [[0, 0, 0], [9, 0, 0], [5, 0, 0.0]])
-    after = border([10, 11, 12, 13], [8, 7, -1, -1], [[0, 0, 0], [9, 0, 0], [5.1, 0, 0], [5.0, 2, 0.0]])
+    after = border(
+        [10, 11, 12, 13], [8, 7, -1, -1], [[0, 0, 0], [9, 0, 0], [5.1, 0, 0], [5.0, 2, 0.0]]
+    )
     assert same_people(before, after) == {10: 1, 11: 0, 12: 2}
 
 
 def test_strangers_on_both_sides_of_a_border_stay_strangers():
-    """Other detections; out of sight in other places, or who knows where; one who is seen and one who is not."""
+    """Other detections; out of sight in other places, or who knows where; one who is seen and one
+    who is not.
+    """
     nowhere = [np.nan] * 3
     for before, after in (
         (([7], [[0, 0, 0.0]]), ([9], [[0, 0, 0.0]])),

@@ -7,7 +7,14 @@ import time
 import pytest
 
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.pipeline.cluster import cluster, has_dashboard, local_cluster, one_item, pool_of, this_program
+from shapepose_fg.pipeline.cluster import (
+    cluster,
+    has_dashboard,
+    local_cluster,
+    one_item,
+    pool_of,
+    this_program,
+)
 from shapepose_fg.pipeline.workers import Here
 
 
@@ -63,7 +70,9 @@ def test_a_process_that_comes_later_with_another_program_does_no_work():
     own = this_program()
     assert one_item(tuple(own.items()), 2, power, 5) == 32
     other = tuple((own | {"numpy": "1.0"}).items())
-    with pytest.raises(InputError, match=r"another version of numpy \(\S+ there, 1\.0 here\); install the same"):
+    with pytest.raises(
+        InputError, match=r"another version of numpy \(\S+ there, 1\.0 here\); install the same"
+    ):
         one_item(other, 2, power, 5)
 
 

@@ -1,4 +1,6 @@
-"""Joints that were spoiled on purpose: `explain` names what was done, and says nothing of those that were not."""
+"""Joints that were spoiled on purpose: `explain` names what was done, and says nothing of those
+that were not.
+"""
 
 import json
 import re
@@ -54,7 +56,14 @@ def rows_of(people: Reconstruction, person: int) -> np.ndarray:
 
 def without(table: ObservationTable, rows: np.ndarray, views: list[int]) -> dict[str, np.ndarray]:
     """Columns of a table in which some views have not seen the elbow."""
-    empty = {"xy": np.nan, "residual_px": np.nan, "gate": 0, "candidate": -1, "confidence": 0, "probability": 0}
+    empty = {
+        "xy": np.nan,
+        "residual_px": np.nan,
+        "gate": 0,
+        "candidate": -1,
+        "confidence": 0,
+        "probability": 0,
+    }
     columns = {name: getattr(table, name).copy() for name in empty}
     for name, nothing in empty.items():
         columns[name][rows[:, None], ELBOW, np.array(views)] = nothing
@@ -84,12 +93,16 @@ def test_no_view_and_one_view(people, scene):
     person, _, cameras = seen_by_many(people)
     rows = rows_of(people, person)
     nobody = asked(
-        solved(people, scene.rig, **without(people.observations, rows, [0, 1, 2, 3])), scene.rig, person
+        solved(people, scene.rig, **without(people.observations, rows, [0, 1, 2, 3])),
+        scene.rig,
+        person,
     )
     assert first(nobody) == (Cause.PRIOR_ONLY, ())
     assert nobody.body_share + nobody.motion_share == pytest.approx(1, abs=1e-9)
     others = [view for view in range(4) if view != cameras[0]]
-    one = asked(solved(people, scene.rig, **without(people.observations, rows, others)), scene.rig, person)
+    one = asked(
+        solved(people, scene.rig, **without(people.observations, rows, others)), scene.rig, person
+    )
     assert first(one) == (Cause.ONE_VIEW, (scene.rig.names[cameras[0]],))
 
 
@@ -127,8 +140,8 @@ def test_somebody_elses_detection(people, scene):
 
 @pytest.mark.slow
 def test_detections_that_were_not_taken_are_named_where_the_recording_is_given(people, scene):
-    """Spoiled before anybody is sought: in one camera an elbow is half a metre up, in another it is missed, and
-    the detector joins somebody else's with the arm. Neither is given to the person.
+    """Spoiled before anybody is sought: in one camera an elbow is half a metre up, in another it is
+    missed, and the detector joins somebody else's with the arm. Neither is given to the person.
     """
     person, row, cameras = seen_by_many(people)
     table, recording = people.observations, simulate(scene, seed=3)
@@ -140,12 +153,17 @@ def test_detections_that_were_not_taken_are_named_where_the_recording_is_given(p
     assert taken is not None
     frames = [recording[t] for t in range(len(recording))]
     for mine in rows_of(people, person):
-        frame, theirs = int(people.frame[mine]), (people.person == name) & (people.frame == people.frame[mine])
+        frame, theirs = (
+            int(people.frame[mine]),
+            (people.person == name) & (people.frame == people.frame[mine]),
+        )
         seen = replace(frames[frame], xy=frames[frame].xy.copy(), pairs=frames[frame].pairs.copy())
         of = table.candidate[[mine, *np.flatnonzero(theirs)]][:, ELBOW]
         up = np.flatnonzero((seen.view == away) & (seen.place == of[0, away]))
         seen.xy[up, 1] -= 150
-        lost, joined = (np.flatnonzero((seen.view == taken) & (seen.place == each)) for each in of[:, taken])
+        lost, joined = (
+            np.flatnonzero((seen.view == taken) & (seen.place == each)) for each in of[:, taken]
+        )
         if len(lost) and len(joined):
             ends = seen.pairs
             seen.affinity[(ends == joined[0]).any(axis=1)] = 0.0
@@ -161,8 +179,12 @@ def test_detections_that_were_not_taken_are_named_where_the_recording_is_given(p
     told = explain(found, scene.rig, person=who, joint="LElbow", frame=5, detections=spoiled)
     assert done <= {(each.cause, *each.cameras[:1]) for each in told.findings}
     # Of what was given to them neither is seen.
-    assert not done & {(each.cause, *each.cameras[:1]) for each in asked(found, scene.rig, who).findings}
-    untouched = explain(people, scene.rig, person=person, joint="LElbow", frame=5, detections=recording)
+    assert not done & {
+        (each.cause, *each.cameras[:1]) for each in asked(found, scene.rig, who).findings
+    }
+    untouched = explain(
+        people, scene.rig, person=person, joint="LElbow", frame=5, detections=recording
+    )
     assert not done & {(each.cause, *each.cameras[:1]) for each in untouched.findings}
 
 
@@ -174,7 +196,8 @@ def test_views_that_the_body_contradicts(people, scene):
     up = np.array([0.0, 0.0, 0.6])
     for row in rows:
         moved = (
-            scene.rig.project(people.joints[row, ELBOW] + up)[0] - scene.rig.project(people.joints[row, ELBOW])[0]
+            scene.rig.project(people.joints[row, ELBOW] + up)[0]
+            - scene.rig.project(people.joints[row, ELBOW])[0]
         )
         xy[row, ELBOW] += moved
     found = asked(solved(people, scene.rig, xy=xy), scene.rig, person)
@@ -199,7 +222,9 @@ def with_turned(rig, view: int, degrees: float):
 
 def turned_by(found: Explanation) -> tuple[float, float]:
     """Degrees by which the finding says that a camera is off, and their sigma."""
-    turn, sigma = re.search(r"rotated by ([\d.]+) ± ([\d.]+) degrees", found.findings[0].words).groups()
+    turn, sigma = re.search(
+        r"rotated by ([\d.]+) ± ([\d.]+) degrees", found.findings[0].words
+    ).groups()
     return float(turn), float(sigma)
 
 
@@ -215,8 +240,8 @@ def test_a_camera_that_was_turned(people, scene):
 
 @pytest.mark.slow
 def test_a_camera_of_which_hardly_anything_was_taken(scene):
-    """Turned by 4 degrees before anybody is sought, 28 cm at 4 m: what it saw was given to nobody, and tells. Of a
-    turn a part may as well be a shift.
+    """Turned by 4 degrees before anybody is sought, 28 cm at 4 m: what it saw was given to nobody,
+    and tells. Of a turn a part may as well be a shift.
     """
     rig, recording = with_turned(scene.rig, 3, 4.0), simulate(scene, seed=3)
     found = reconstruct(recording, rig)
@@ -229,7 +254,11 @@ def test_a_camera_of_which_hardly_anything_was_taken(scene):
     turn, sigma = turned_by(told)
     assert abs(turn - 4.0) < 3 * sigma and sigma < 3.0  # 5 before anything was seen
     # Without the detections it is not known, or little; no other camera is.
-    others = [each.cameras for each in asked(found, rig, person).findings if each.cause == Cause.WRONG_CAMERA]
+    others = [
+        each.cameras
+        for each in asked(found, rig, person).findings
+        if each.cause == Cause.WRONG_CAMERA
+    ]
     assert set(others) <= {(rig.names[3],)}
 
 
@@ -270,7 +299,13 @@ def test_who_is_not_there_is_said(people, scene):
     with pytest.raises(InputError, match="person 77: not in the result"):
         explain(people, scene.rig, person=77, joint="LElbow", frame=5)
     with pytest.raises(InputError, match="joint Tail: the result has no joint of this name"):
-        explain(people, scene.rig, person=int(people.person[0]), joint="Tail", frame=int(people.frame[0]))
+        explain(
+            people,
+            scene.rig,
+            person=int(people.person[0]),
+            joint="Tail",
+            frame=int(people.frame[0]),
+        )
     with pytest.raises(InputError, match="is not in frame 99"):
         explain(people, scene.rig, person=int(people.person[0]), joint="LElbow", frame=99)
 
@@ -283,10 +318,15 @@ def test_who_is_not_there_is_said(people, scene):
         "occurs twice in frame": lambda people: with_both(people, frame=np.full(len(people), 5)),
         "persons must be at most": lambda people: with_both(people, person=people.person + 10**6),
         "people.problems must be": lambda people: people.with_run(people={"problems": 3}),
-        "setup.left_out": lambda people: people.with_run(setup={"left_out": [{"camera": {}, "frames": [0, 9]}]}),
+        "setup.left_out": lambda people: people.with_run(
+            setup={"left_out": [{"camera": {}, "frames": [0, 9]}]}
+        ),
         "extra_factors must be": lambda people: people.with_run(extra_factors=[1]),
         "cameras are not those of": lambda people: replace(
-            people, observations=replace(people.observations, view_names=people.observations.view_names[::-1])
+            people,
+            observations=replace(
+                people.observations, view_names=people.observations.view_names[::-1]
+            ),
         ),
     }.items(),
 )

@@ -1,4 +1,6 @@
-"""Limbs that swing and kick, over time and frame by frame: what the cameras see is not smoothed away."""
+"""Limbs that swing and kick, over time and frame by frame: what the cameras see is not smoothed
+away.
+"""
 
 import numpy as np
 import pytest
@@ -18,7 +20,9 @@ ARM, LEG = (3, 4), (13, 14, 19, 20, 21)
 
 
 def swinging(times_s: np.ndarray, frequency_hz: float) -> np.ndarray:
-    """(T, 25, 3) a person whose right arm and left leg swing forwards and backwards by 60 and 45 degrees."""
+    """(T, 25, 3) a person whose right arm and left leg swing forwards and backwards by 60 and 45
+    degrees.
+    """
     people = np.tile(STANDING, (len(times_s), 1, 1))
     phase = np.sin(2 * np.pi * frequency_hz * times_s)
     for joints, about, reach, middle in ((ARM, 2, 60, 30), (LEG, 12, 45, 15)):
@@ -56,14 +60,18 @@ def test_limbs_that_swing_are_where_they_are_frame_by_frame(five_cameras, fps, f
     people = swinging(times, frequency_hz)
     recording = seen(rig, people, np.random.default_rng(0))
     clock = FrameTimes.from_fps(fps, len(people))
-    over_time, alone = (reconstruct(recording, rig, config, times=clock) for config in (PipelineConfig(), ALONE))
+    over_time, alone = (
+        reconstruct(recording, rig, config, times=clock) for config in (PipelineConfig(), ALONE)
+    )
     error, without = errors(over_time, people), errors(alone, people)
     limbs = [*ARM, *LEG]
     assert error[:, limbs].mean() < 1.15 * without[:, limbs].mean()
     assert error.mean() < 1.05 * without.mean()
     assert error.max() < 0.15
     off = over_time.joints - people
-    squared = np.einsum("tji,tji->tj", off, np.linalg.solve(over_time.covariance, off[..., None])[..., 0])
+    squared = np.einsum(
+        "tji,tji->tj", off, np.linalg.solve(over_time.covariance, off[..., None])[..., 0]
+    )
     assert (squared < 7.81).mean() > 0.88
 
 

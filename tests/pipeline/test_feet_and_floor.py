@@ -1,4 +1,6 @@
-"""Feet and floor in a whole run: standing feet are still, moving ones as before, no body sinks into the floor."""
+"""Feet and floor in a whole run: standing feet are still, moving ones as before, no body sinks into
+the floor.
+"""
 
 from dataclasses import replace
 
@@ -23,7 +25,9 @@ def without(dance):
 
 
 def errors(scene, people):
-    """How fast feet are in truth, and by how much their velocities and places are wrong: m/s, m/s, m."""
+    """How fast feet are in truth, and by how much their velocities and places are wrong: m/s, m/s,
+    m.
+    """
     truth = scene.keypoints[people.frame]
     apart = np.linalg.norm(people.joints[:, None] - truth, axis=-1).mean(axis=2)
     who, rows = apart.argmin(axis=1), np.arange(len(people))
@@ -52,8 +56,8 @@ def test_covariances_of_feet_hold(dance):
     who = np.linalg.norm(people.joints[:, None] - truth, axis=-1).mean(axis=2).argmin(axis=1)
     apart = (people.joints - truth[np.arange(len(people)), who])[:, FEET]
     squared = np.einsum("nji,njik,njk->nj", apart, np.linalg.inv(people.covariance[:, FEET]), apart)
-    # Of a Gaussian 95 % are within 7.81. Eight feet of four people stand twice or so: of 16 that are independent
-    # 12 or more are, but once in 1,000; with half the covariance it is 55 to 73 %.
+    # Of a Gaussian 95 % are within 7.81. Eight feet of four people stand twice or so: of 16 that
+    # are independent 12 or more are, but once in 1,000; with half the covariance it is 55 to 73 %.
     assert 0.75 < (squared < 7.81).mean() <= 1.0
 
 

@@ -1,9 +1,10 @@
-"""What may not matter: the order of cameras and detections, the pictures' size, the world's origin, its unit, left
-and right, a frame given twice.
+"""What may not matter: the order of cameras and detections, the pictures' size, the world's origin,
+its unit, left and right, a frame given twice.
 
-Each is a small scene, reconstructed twice. Tolerances: sums over cameras and people are made in another order, and
-the solver stops when steps are small, so that places differ by far less than they are known to (1 cm): 1 mm.
-Where all is mirrored the learned fitter, which is not quite the same on both sides, may differ by more.
+Each is a small scene, reconstructed twice. Tolerances: sums over cameras and people are made in
+another order, and the solver stops when steps are small, so that places differ by far less than
+they are known to (1 cm): 1 mm. Where all is mirrored the learned fitter, which is not quite the
+same on both sides, may differ by more.
 """
 
 from dataclasses import replace
@@ -30,7 +31,11 @@ from tests.marks import slow
 FRAMES = 6
 SAME_M = 1e-3
 few = settings(
-    max_examples=2, derandomize=True, database=None, deadline=None, suppress_health_check=list(HealthCheck)
+    max_examples=2,
+    derandomize=True,
+    database=None,
+    deadline=None,
+    suppress_health_check=list(HealthCheck),
 )
 
 
@@ -53,7 +58,9 @@ def as_it_is() -> Reconstruction:
 
 
 def farthest_m(one: Reconstruction, other: Reconstruction, joints: NDArray[np.float64]) -> float:
-    """How far the `joints` (N, J, 3) of `other` are from `one` at most; people may have other numbers."""
+    """How far the `joints` (N, J, 3) of `other` are from `one` at most; people may have other
+    numbers.
+    """
     assert len(one) == len(other)
     apart = 0.0
     for frame in np.unique(one.frame):
@@ -65,8 +72,9 @@ def farthest_m(one: Reconstruction, other: Reconstruction, joints: NDArray[np.fl
 
 @cache
 def crowd() -> tuple[Rig, tuple[Detections, ...]]:
-    """Four people who hide each other before three cameras, and a detector that rounds: what is whose is decided
-    by little, and scores are often equal."""
+    """Four people who hide each other before three cameras, and a detector that rounds: what is
+    whose is decided by little, and scores are often equal.
+    """
     scene = built_in_scene(people=4, cameras=3, frames=FRAMES)
     return scene.rig, tuple(
         replace(each, confidence=np.round(each.confidence, 1), affinity=np.round(each.affinity))
@@ -90,7 +98,9 @@ def test_the_order_of_cameras_people_and_detections():
         mixed = each.rows(rng.permutation(len(each)))
         pairs = rng.permutation(len(mixed.pairs))
         view = np.argsort(order)[mixed.view]
-        turned.append(replace(mixed, view=view, pairs=mixed.pairs[pairs], affinity=mixed.affinity[pairs]))
+        turned.append(
+            replace(mixed, view=view, pairs=mixed.pairs[pairs], affinity=mixed.affinity[pairs])
+        )
     people = solved(Rig(tuple(rig.cameras[view] for view in order), rig.up), tuple(turned))
     assert farthest_m(crowd_as_it_is(), people, people.joints) < SAME_M
 
@@ -104,7 +114,9 @@ def test_the_size_of_the_pictures():
         width, height = camera.image_size
         K = camera.K * [[0.5], [0.5], [1.0]]
         cameras.append(replace(camera, K=K, image_size=(width // 2, height // 2)))
-    people = solved(Rig(tuple(cameras), rig.up), tuple(replace(each, xy=each.xy / 2) for each in frames))
+    people = solved(
+        Rig(tuple(cameras), rig.up), tuple(replace(each, xy=each.xy / 2) for each in frames)
+    )
     assert farthest_m(crowd_as_it_is(), people, people.joints) < SAME_M
 
 
@@ -135,7 +147,9 @@ def test_the_unit_of_the_calibration(tmp_path):
 
 
 def test_left_and_right():
-    """World and pictures in a mirror, the left hand called right: stage I finds the mirrored candidates."""
+    """World and pictures in a mirror, the left hand called right: stage I finds the mirrored
+    candidates.
+    """
     rig, frames = recording()
     flip = np.diag([-1.0, 1.0, 1.0])
     cameras = []
@@ -148,7 +162,9 @@ def test_left_and_right():
     names = np.array(BODY_25.mirror)
     turned = []
     for each in frames:
-        xy = each.xy * (-1, 1) + np.stack([rig.image_sizes[each.view, 0] - 1, np.zeros(len(each))], axis=1)
+        xy = each.xy * (-1, 1) + np.stack(
+            [rig.image_sizes[each.view, 0] - 1, np.zeros(len(each))], axis=1
+        )
         turned.append(replace(each, joint=names[each.joint], xy=xy))
     config = PipelineConfig().candidates
     for before, after in zip(frames, turned, strict=True):
@@ -158,21 +174,28 @@ def test_left_and_right():
         )
         key = np.lexsort((*np.round(other.xyz @ flip, 6).T, names[other.joint]))
         same = np.lexsort((*np.round(one.xyz, 6).T, one.joint))
-        np.testing.assert_allclose((other.xyz @ flip)[key], one.xyz[same], atol=1e-9)  # rounding only
+        np.testing.assert_allclose(
+            (other.xyz @ flip)[key], one.xyz[same], atol=1e-9
+        )  # rounding only
         np.testing.assert_array_equal(other.votes[key], one.votes[same])
     people = solved(mirrored, tuple(turned))
     back = people.joints[:, names] @ flip
     apart = np.linalg.norm(back - as_it_is().joints, axis=-1)
-    # The body and its priors are nearly, not quite, the same on both sides: 1 cm, and most joints far less.
+    # The body and its priors are nearly, not quite, the same on both sides: 1 cm, and most joints
+    # far less.
     assert float(np.median(apart)) < 2e-3 and float(np.quantile(apart, 0.95)) < 2e-2
 
 
 @pytest.mark.parametrize("twice", [3, *slow(0, FRAMES - 1)])
 def test_a_frame_given_twice(twice: int):
-    """People who stand still for a frame: nobody is lost, new or farther than they move in a frame (2.5 m/s)."""
+    """People who stand still for a frame: nobody is lost, new or farther than they move in a frame
+    (2.5 m/s).
+    """
     rig, frames = recording()
     people = solved(rig, (*frames[: twice + 1], *frames[twice:]))
     assert len(people) == 2 * (FRAMES + 1) and len(set(people.person.tolist())) == 2
     kept = people.rows(people.frame != twice + 1)
-    kept = replace(kept, frame=np.where(kept.frame > twice, kept.frame - 1, kept.frame), observations=None)
+    kept = replace(
+        kept, frame=np.where(kept.frame > twice, kept.frame - 1, kept.frame), observations=None
+    )
     assert farthest_m(as_it_is(), kept, kept.joints) < 0.1

@@ -1,4 +1,6 @@
-"""Two people who hand each other a box: factors between their wrists, and what becomes of the result."""
+"""Two people who hand each other a box: factors between their wrists, and what becomes of the
+result.
+"""
 
 from dataclasses import replace
 
@@ -25,7 +27,8 @@ def scene_of(seed: int):
 
 
 class Box:
-    """r = (left wrist of one person - right wrist of the other) - d, with d as it is in truth: a box between them.
+    """r = (left wrist of one person - right wrist of the other) - d, with d as it is in truth: a
+    box between them.
 
     Whose wrist is whose is chosen by place, as rows have no identities frame by frame.
     """
@@ -37,10 +40,19 @@ class Box:
         for other in window.partners:
             for t, u in zip(*window.shared(other), strict=True):
                 truth = self.truth[window.frames[t]]
-                away = [np.linalg.norm(each - truth[0, R]) for each in (window.first[t, R], other.first[u, R])]
-                ends = (other.keys[u, R], keys[t, L]) if away[0] > away[1] else (keys[t, R], other.keys[u, L])
+                away = [
+                    np.linalg.norm(each - truth[0, R])
+                    for each in (window.first[t, R], other.first[u, R])
+                ]
+                ends = (
+                    (other.keys[u, R], keys[t, L])
+                    if away[0] > away[1]
+                    else (keys[t, R], other.keys[u, L])
+                )
                 apart = truth[1, L] - truth[0, R]
-                yield gtsam.BetweenFactorPoint3(int(ends[0]), int(ends[1]), apart, isotropic(3, SIGMA_M))
+                yield gtsam.BetweenFactorPoint3(
+                    int(ends[0]), int(ends[1]), apart, isotropic(3, SIGMA_M)
+                )
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +75,8 @@ def ends_of(people: Reconstruction, truth: np.ndarray, frame: int) -> tuple[int,
 def errors(people: Reconstruction, truth: np.ndarray) -> tuple[float, float]:
     """Mean error of both wrists, and of what lies between them, metres."""
     ends = [
-        (people.joints[a, R], people.joints[b, L]) for a, b in (ends_of(people, truth, f) for f in range(FRAMES))
+        (people.joints[a, R], people.joints[b, L])
+        for a, b in (ends_of(people, truth, f) for f in range(FRAMES))
     ]
     off = [(one - truth[f, 0, R], other - truth[f, 1, L]) for f, (one, other) in enumerate(ends)]
     each = np.linalg.norm(np.array(off), axis=-1).mean()
@@ -78,9 +91,13 @@ def test_a_box_between_two_people_is_held_and_both_wrists_are_nearer_to_the_trut
         scene = scene_of(seed)
         recording = simulate(scene, seed=seed)
         people = [
-            reconstruct(recording, scene.rig, config, extra_factors=factors) for factors in (None, Box(scene))
+            reconstruct(recording, scene.rig, config, extra_factors=factors)
+            for factors in (None, Box(scene))
         ]
-        assert people[1].run["extra_factors"] == {"Box": {"made": FRAMES, "inactive": 0}} or not temporal
+        assert (
+            people[1].run["extra_factors"] == {"Box": {"made": FRAMES, "inactive": 0}}
+            or not temporal
+        )
         assert set(people[1].status.tolist()) <= {"ok", *people[0].status.tolist()}
         found.append([errors(each, scene.keypoints) for each in people])
     (alone, between), (tied, box) = np.mean(found, axis=0)
@@ -95,16 +112,28 @@ def test_its_share_is_explained_and_the_sum_is_one(joined, scene):
     who, whom = int(joined.person[one]), int(joined.person[other])
     asked = {"person": who, "joint": "RWrist", "frame": 5}
     told = explain(joined, scene.rig, **asked, extra_factors=Box(scene))
-    assert [(each.name, each.others) for each in told.factors] == [("Box", (f"person {whom}'s LWrist",))]
-    shares = [view.share for view in told.views] + [told.body_share, told.motion_share, told.factors[0].share]
+    assert [(each.name, each.others) for each in told.factors] == [
+        ("Box", (f"person {whom}'s LWrist",))
+    ]
+    shares = [view.share for view in told.views] + [
+        told.body_share,
+        told.motion_share,
+        told.factors[0].share,
+    ]
     assert sum(shares) == pytest.approx(1, abs=1e-9) and min(shares) >= 0
-    # The other's wrist is known as well as this one from three cameras, and the box better than both.
+    # The other's wrist is known as well as this one from three cameras, and the box better than
+    # both.
     assert 0.2 < told.factors[0].share < 0.9
-    assert any(f"Box (with person {whom}'s LWrist) {told.factors[0].share:.0%}" in each for each in told.words)
+    assert any(
+        f"Box (with person {whom}'s LWrist) {told.factors[0].share:.0%}" in each
+        for each in told.words
+    )
     silent = explain(joined, scene.rig, **asked)
     assert silent.factors == () and silent.missing_factors == ("Box",)
     assert any("solved with factors of Box" in each for each in silent.words)
-    untied = explain(joined, scene.rig, person=who, joint="RKnee", frame=5, extra_factors=Box(scene))
+    untied = explain(
+        joined, scene.rig, person=who, joint="RKnee", frame=5, extra_factors=Box(scene)
+    )
     assert untied.factors == () and untied.missing_factors == ()
 
 
@@ -112,7 +141,10 @@ def test_its_share_is_explained_and_the_sum_is_one(joined, scene):
 def test_it_goes_through_export_and_explain_of_the_shell(joined, scene, tmp_path, capsys):
     joined.save(tmp_path)
     who = int(joined.person[ends_of(joined, scene.keypoints, 5)[0]])
-    for line in (["export", tmp_path, "trc", "csv"], ["explain", tmp_path, who, "RWrist", "--frame", 5]):
+    for line in (
+        ["export", tmp_path, "trc", "csv"],
+        ["explain", tmp_path, who, "RWrist", "--frame", 5],
+    ):
         with pytest.raises(SystemExit) as end:
             main(list(map(str, line)))
         assert end.value.code == 0
@@ -124,19 +156,27 @@ def test_the_errors_of_two_people_correlate_as_the_graph_says(joined, scene):
     graphs = list(window_solutions(joined, scene.rig, extra_factors=Box(scene)))
     assert [len(each.together) for each in graphs] == [2, 2]
     one, other = ends_of(joined, scene.keypoints, 5)
-    ends = JointAt(int(joined.person[one]), "RWrist", 5), JointAt(int(joined.person[other]), "LWrist", 5)
+    ends = (
+        JointAt(int(joined.person[one]), "RWrist", 5),
+        JointAt(int(joined.person[other]), "LWrist", 5),
+    )
     apart, tied = distance(joined, *ends), distance(joined, *ends, graphs=graphs)
     assert tied.sigma_m < 0.95 * apart.sigma_m
     knees = [replace(each, joint="RKnee") for each in ends]
     np.testing.assert_allclose(
-        distance(joined, *knees, graphs=graphs).covariance, distance(joined, *knees).covariance, rtol=1e-9
+        distance(joined, *knees, graphs=graphs).covariance,
+        distance(joined, *knees).covariance,
+        rtol=1e-9,
     )
-    # One graph has both; its marginals are those that are reported, or the solver's where they are wider.
+    # One graph has both; its marginals are those that are reported, or the solver's where they are
+    # wider.
     marginals = gtsam.Marginals(graphs[0].graph, graphs[0].values)
     for each in graphs:
         wide = np.trace(marginals.marginalCovariance(int(each.keys[5, R])))
         both = [np.trace(each.covariance[5, R]), np.trace(each.solved_covariance[5, R])]
-        assert 0.95 * max(both) < wide < 1.05 * sum(both)  # one may be wider one way, the other another
+        assert (
+            0.95 * max(both) < wide < 1.05 * sum(both)
+        )  # one may be wider one way, the other another
 
 
 @pytest.mark.slow
@@ -151,7 +191,9 @@ def test_people_are_named_where_a_result_is_solved_anew(joined, scene):
             assert {window.track, partner.track} == {one, other}
             mine, theirs = window.shared(partner)
             knee = BODY_25.index("RKnee")
-            for a, b in zip(keys[mine, knee].tolist(), partner.keys[theirs, knee].tolist(), strict=True):
+            for a, b in zip(
+                keys[mine, knee].tolist(), partner.keys[theirs, knee].tolist(), strict=True
+            ):
                 yield gtsam.RangeFactor3(a, b, 1.0, isotropic(1, 0.005))
 
     solved = solve_rows(joined, Solver.of(joined, scene.rig), [Box(scene), knees_touch])
@@ -167,7 +209,9 @@ def test_keyframes_have_the_factor_and_worker_processes_give_the_same(scene):
     recording, box = simulate(scene, seed=0), Box(scene)
     here = reconstruct(recording, scene.rig, fast, extra_factors=box)
     assert 0 < here.run["extra_factors"]["Box"]["made"] < FRAMES
-    there = reconstruct(recording, scene.rig, fast, extra_factors=box, execution=Execution(workers=2))
+    there = reconstruct(
+        recording, scene.rig, fast, extra_factors=box, execution=Execution(workers=2)
+    )
     np.testing.assert_array_equal(here.joints, there.joints)
     assert errors(here, scene.keypoints)[1] < 0.03
 
@@ -175,10 +219,16 @@ def test_keyframes_have_the_factor_and_worker_processes_give_the_same(scene):
 @pytest.mark.slow
 def test_functions_whose_factors_do_nothing_are_said(scene):
     def of_nobody(window, keys):
-        return [gtsam.RangeFactor3(1, 2, 1.0, isotropic(1, 1)) for other in window.partners if other.track > 50]
+        return [
+            gtsam.RangeFactor3(1, 2, 1.0, isotropic(1, 1))
+            for other in window.partners
+            if other.track > 50
+        ]
 
     with pytest.warns(UserWarning, match="of_nobody: none of its factors was made"):
-        people = reconstruct(simulate(scene, seed=0), scene.rig, extra_factors=[of_nobody, Box(scene)])
+        people = reconstruct(
+            simulate(scene, seed=0), scene.rig, extra_factors=[of_nobody, Box(scene)]
+        )
     assert people.run["extra_factors"] == {
         "of_nobody": {"made": 0, "inactive": 0},
         "Box": {"made": FRAMES, "inactive": 0},

@@ -1,4 +1,6 @@
-"""Keyframes: which they are, what is said of the frames between, and that a whole run holds what it promises."""
+"""Keyframes: which they are, what is said of the frames between, and that a whole run holds what it
+promises.
+"""
 
 from dataclasses import replace
 
@@ -12,7 +14,13 @@ from shapepose_fg.core.reconstruction import Known, Reconstruction, Status
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.evaluation.metrics import covariance_calibration, joint_metrics, match_people
 from shapepose_fg.pipeline.execution import Execution
-from shapepose_fg.pipeline.keyframes import bodies_between, keyframes, spaced, strays_m, with_rows_between
+from shapepose_fg.pipeline.keyframes import (
+    bodies_between,
+    keyframes,
+    spaced,
+    strays_m,
+    with_rows_between,
+)
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.pipeline.solving import Solver, solve_rows
 from shapepose_fg.simulation import built_in_scene, simulate
@@ -21,7 +29,9 @@ FAST = PipelineConfig.fast()
 
 
 def test_keyframes_are_as_few_as_time_allows():
-    """At 25 frames a second every third; where one was dropped the step is not too long; each cut begins anew."""
+    """At 25 frames a second every third; where one was dropped the step is not too long; each cut
+    begins anew.
+    """
     time_s = np.arange(11) / 25
     assert np.flatnonzero(spaced(time_s, 0.12)).tolist() == [0, 3, 6, 9, 10]
     time_s[5:] += 0.04
@@ -32,7 +42,9 @@ def test_keyframes_are_as_few_as_time_allows():
     assert np.flatnonzero(chosen).tolist() == [0, 1, 4, 5, 6, 9, 10, 11]  # 0 and 11 are not wanted
 
 
-def moving(joints: np.ndarray, velocity: np.ndarray, time_s: np.ndarray, frame: np.ndarray) -> Reconstruction:
+def moving(
+    joints: np.ndarray, velocity: np.ndarray, time_s: np.ndarray, frame: np.ndarray
+) -> Reconstruction:
     """Rows of one person whose joints are known exactly."""
     N, J = joints.shape[:2]
     empty = Reconstruction.empty([f"joint {j}" for j in range(J)])
@@ -44,8 +56,14 @@ def moving(joints: np.ndarray, velocity: np.ndarray, time_s: np.ndarray, frame: 
 
 
 def test_between_keyframes_is_what_the_model_of_motion_says():
-    """Mean and covariance of a state between two that are known, by conditioning the model's own Gaussian."""
-    rng, frame, time_s = np.random.default_rng(0), np.array([7, 8, 9, 10]), np.array([0.2, 0.24, 0.3, 0.32])
+    """Mean and covariance of a state between two that are known, by conditioning the model's own
+    Gaussian.
+    """
+    rng, frame, time_s = (
+        np.random.default_rng(0),
+        np.array([7, 8, 9, 10]),
+        np.array([0.2, 0.24, 0.3, 0.32]),
+    )
     ends = rng.normal(size=(2, 2, 1, 3)) * np.array([0.2, 2.0])[:, None, None, None]  # m, m/s
     rows = moving(ends[0], ends[1], time_s[[0, 3]], frame[[0, 3]])
     model = replace(MotionModel.load(("RWrist",)), psd_still=np.array([3.0]), psd_speed=np.zeros(1))
@@ -53,20 +71,29 @@ def test_between_keyframes_is_what_the_model_of_motion_says():
     assert found.frame.tolist() == frame.tolist()
     for n in (1, 2):
         first, second = time_s[n] - time_s[0], time_s[3] - time_s[n]
-        F, Q = (CONSTANT_VELOCITY.transition(dt) for dt in (first, second)), CONSTANT_VELOCITY.noise(first, 3.0)
+        F, Q = (
+            (CONSTANT_VELOCITY.transition(dt) for dt in (first, second)),
+            CONSTANT_VELOCITY.noise(first, 3.0),
+        )
         before, after = F
         start = before @ ends[:, 0, 0]
-        gain = Q @ after.T @ np.linalg.inv(after @ Q @ after.T + CONSTANT_VELOCITY.noise(second, 3.0))
+        gain = (
+            Q @ after.T @ np.linalg.inv(after @ Q @ after.T + CONSTANT_VELOCITY.noise(second, 3.0))
+        )
         mean, left = start + gain @ (ends[:, 1, 0] - after @ start), Q - gain @ after @ Q
         np.testing.assert_allclose(found.joints[n, 0], mean[0], atol=1e-9)
         np.testing.assert_allclose(found.velocity[n, 0], mean[1], atol=1e-9)
         np.testing.assert_allclose(found.covariance[n, 0], left[0, 0] * np.eye(3), rtol=1e-6)
-        np.testing.assert_allclose(found.velocity_covariance[n, 0], left[1, 1] * np.eye(3), rtol=1e-6)
+        np.testing.assert_allclose(
+            found.velocity_covariance[n, 0], left[1, 1] * np.eye(3), rtol=1e-6
+        )
     assert found.known.tolist() == [[Known.SEEN], [Known.MOTION], [Known.MOTION], [Known.SEEN]]
 
 
 def test_how_far_a_joint_strays_between_keyframes_is_told_by_the_states_at_both():
-    """Of swings, 20 cm to and fro, the error of the cubic; what goes straight on, or falls, does not stray."""
+    """Of swings, 20 cm to and fro, the error of the cubic; what goes straight on, or falls, does
+    not stray.
+    """
     time_s, joint = np.arange(31) * 0.1, np.zeros((31, 1, 3))
     steady, falling = joint + time_s[:, None, None], joint - 4.9 * time_s[:, None, None] ** 2
     assert strays_m(steady, np.ones_like(steady), time_s).max() < 1e-9
@@ -81,7 +108,9 @@ def test_how_far_a_joint_strays_between_keyframes_is_told_by_the_states_at_both(
 
 
 def test_bodies_turn_evenly_between_keyframes():
-    """Once around in 0.8 s, past the angle at which rotation vectors jump; beside a row without a body is none."""
+    """Once around in 0.8 s, past the angle at which rotation vectors jump; beside a row without a
+    body is none.
+    """
     key_s, time_s = np.arange(9) * 0.1, np.arange(33) * 0.025
     axis = np.array([0.6, 0.0, 0.8])
 
@@ -95,7 +124,9 @@ def test_bodies_turn_evenly_between_keyframes():
     fine, found = bodies_between(ok, bodies(key_s), key_s, time_s)
     assert np.flatnonzero(~fine).tolist() == list(range(21, 28))
     apart = exp_so3(found[1][fine]).mT @ exp_so3(bodies(time_s[fine])[1])
-    assert np.linalg.norm(log_so3(apart), axis=-1).max() < 0.02  # 45 degrees a keyframe; a straight line: 0.05
+    assert (
+        np.linalg.norm(log_so3(apart), axis=-1).max() < 0.02
+    )  # 45 degrees a keyframe; a straight line: 0.05
     inside = fine & (time_s > 0.1) & (time_s < 0.5)  # slopes at ends are of one side
     np.testing.assert_allclose(found[3][inside], bodies(time_s[inside])[3], atol=1e-9)
     np.testing.assert_allclose(found[2][fine][:, 4], found[1][fine], atol=1e-12)
@@ -110,12 +141,17 @@ def scene():
 def results(scene):
     """By default, and fast."""
     times = FrameTimes.from_fps(scene.fps, len(scene))
-    return [reconstruct(simulate(scene), scene.rig, config, times=times) for config in (PipelineConfig(), FAST)]
+    return [
+        reconstruct(simulate(scene), scene.rig, config, times=times)
+        for config in (PipelineConfig(), FAST)
+    ]
 
 
 @pytest.mark.slow
 def test_fast_finds_the_same_people_as_surely(scene, results):
-    """Everybody in every frame, with a body; as near to the truth but for a tenth, and no surer than right."""
+    """Everybody in every frame, with a body; as near to the truth but for a tenth, and no surer
+    than right.
+    """
     accurate, fast = results
     assert len(fast) == len(accurate) == 3 * 46
     assert (fast.status == Status.OK).all()
@@ -151,12 +187,15 @@ def test_fast_is_the_same_with_processes(scene, results):
 
 @pytest.mark.slow
 def test_fast_results_are_solved_anew(scene, results):
-    """The same rows, where they were: what is between keyframes is carried again, and not solved from nothing."""
+    """The same rows, where they were: what is between keyframes is carried again, and not solved
+    from nothing.
+    """
     fast = results[1]
     again = solve_rows(fast, Solver.of(fast, scene.rig))
     np.testing.assert_array_equal(again.frame, fast.frame)
     np.testing.assert_array_equal(again.person, fast.person)
     assert (again.status == Status.OK).all()
     assert np.nanmedian(np.linalg.norm(again.joints - fast.joints, axis=-1)) < 0.003
-    # A gate falls the other way where a joint is on its edge: 2 of 3,450 on one kind of processor, 0 on another.
+    # A gate falls the other way where a joint is on its edge: 2 of 3,450 on one kind of processor,
+    # 0 on another.
     assert ((again.known == Known.MOTION) != (fast.known == Known.MOTION)).mean() < 0.002

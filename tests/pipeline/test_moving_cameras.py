@@ -1,4 +1,6 @@
-"""Two people, two fixed cameras and a robot with two more, whose odometry drifts; the truth is known."""
+"""Two people, two fixed cameras and a robot with two more, whose odometry drifts; the truth is
+known.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -72,12 +74,17 @@ class Scene:
         return float(np.nanmean(np.linalg.norm(joints - self.people, axis=-1)))
 
 
-def scene(fixed: int = 2, seed: int = 0, drift: float = 0.03, noise_px: float = 3.0, still: bool = False) -> Scene:
+def scene(
+    fixed: int = 2, seed: int = 0, drift: float = 0.03, noise_px: float = 3.0, still: bool = False
+) -> Scene:
     """People who walk past each other; detections with independent errors."""
     rng, t = np.random.default_rng(seed), TIMES.time_s
     walk = np.stack([0.5 * np.sin(1.1 * t), 0.4 * np.cos(0.9 * t), 0 * t], axis=-1)
     people = np.stack(
-        [STANDING + np.array([0.5, 0, 0]) + walk[:, None], STANDING + np.array([-0.5, 0.3, 0]) - walk[:, None]],
+        [
+            STANDING + np.array([0.5, 0, 0]) + walk[:, None],
+            STANDING + np.array([-0.5, 0.3, 0]) - walk[:, None],
+        ],
         axis=1,
     )
     time_s = np.arange(-0.1, t[-1] + 0.15, 0.02)
@@ -86,7 +93,9 @@ def scene(fixed: int = 2, seed: int = 0, drift: float = 0.03, noise_px: float = 
     for name, y in (("cam2", 0.3), ("cam3", -0.3)):
         bTc = np.array([[0, 0, 1, 0.1], [-1, 0, 0, y], [0, -1, 0, 1.2], [0, 0, 0, 1.0]])
         sides.append(Camera(name, K, true.wTb[0] @ bTc, (1280, 720), carrier="robot", bTc=bTc))
-    rig = Rig((*(camera(f"cam{n}", 1.3 * n) for n in range(fixed)), *sides), "z", trajectories=(true,))
+    rig = Rig(
+        (*(camera(f"cam{n}", 1.3 * n) for n in range(fixed)), *sides), "z", trajectories=(true,)
+    )
     frames = list[Detections]()
     for frame, now in enumerate(t.tolist()):
         seen = detect_exactly(rig.at(np.full(len(rig), now)), people[frame])
@@ -96,10 +105,14 @@ def scene(fixed: int = 2, seed: int = 0, drift: float = 0.03, noise_px: float = 
 
 
 def by_truth(made: Scene, people) -> NDArray[np.float64]:
-    """(T, 2, 25, 3) joints of a result, each of the person whom it is nearest to; NaN where there is none."""
+    """(T, 2, 25, 3) joints of a result, each of the person whom it is nearest to; NaN where there
+    is none.
+    """
     joints = np.full(made.people.shape, np.nan)
     for row, frame in enumerate(people.frame.tolist()):
-        near = np.linalg.norm(people.joints[row] - made.people[frame], axis=-1).mean(axis=-1).argmin()
+        near = (
+            np.linalg.norm(people.joints[row] - made.people[frame], axis=-1).mean(axis=-1).argmin()
+        )
         joints[frame, near] = people.joints[row]
     return joints
 
@@ -128,8 +141,11 @@ def test_people_correct_the_odometry_and_say_how_surely(drifted, refined):
     assert np.linalg.norm(rms[1][:3]) < 0.6 * np.linalg.norm(rms[0][:3])
     covariance = refined.trajectories[0].covariance_at(TIMES.time_s)
     nees = np.einsum("ti,ti->t", after, np.linalg.solve(covariance, after[..., None])[..., 0])
-    # Errors here are independent, real ones last: believed is less than is known. 16.8 is the 99 % point.
-    assert (nees < 16.8).all() and np.sqrt(covariance[:, 3:, 3:].trace(axis1=1, axis2=2)).max() < 0.1
+    # Errors here are independent, real ones last: believed is less than is known. 16.8 is the 99 %
+    # point.
+    assert (nees < 16.8).all() and np.sqrt(
+        covariance[:, 3:, 3:].trace(axis1=1, axis2=2)
+    ).max() < 0.1
 
 
 @pytest.mark.slow
@@ -140,7 +156,10 @@ def test_it_is_continuous_over_windows(drifted, refined):
     given = np.linalg.norm(np.diff(camera_error(drifted, drifted.rig), axis=0)[:, 3:], axis=1)
     # From frame to frame the odometry says best how far it went: nowhere a jump.
     assert step.max() < given.max() + 0.004
-    apart = rig.trajectories[0].at(TIMES.time_s)[:, :3, 3] - refined.trajectories[0].at(TIMES.time_s)[:, :3, 3]
+    apart = (
+        rig.trajectories[0].at(TIMES.time_s)[:, :3, 3]
+        - refined.trajectories[0].at(TIMES.time_s)[:, :3, 3]
+    )
     # Who is whom was decided with other corrections: 5 mm, and sigmas are 10 to 20.
     assert np.linalg.norm(apart, axis=1).max() < 0.005
 
@@ -149,15 +168,23 @@ def test_it_is_continuous_over_windows(drifted, refined):
 def test_people_are_nearer_to_the_truth_than_with_odometry_taken_as_it_is(drifted, refined):
     people = reconstruct(drifted.recording, refined, times=TIMES)
     taken = reconstruct(
-        drifted.recording, drifted.with_path(drifted.rig.trajectories[0].wTb, refined=True), times=TIMES
+        drifted.recording,
+        drifted.with_path(drifted.rig.trajectories[0].wTb, refined=True),
+        times=TIMES,
     )
     assert len(people) == 2 * T
-    assert drifted.error_m(by_truth(drifted, people)) < 0.85 * drifted.error_m(by_truth(drifted, taken))
+    assert drifted.error_m(by_truth(drifted, people)) < 0.85 * drifted.error_m(
+        by_truth(drifted, taken)
+    )
     error = (
         people.joints
-        - drifted.people[people.frame, np.where(people.person == people.person.min(), *_order(drifted, people))]
+        - drifted.people[
+            people.frame, np.where(people.person == people.person.min(), *_order(drifted, people))
+        ]
     )
-    nees = np.einsum("nji,nji->nj", error, np.linalg.solve(people.covariance, error[..., None])[..., 0])
+    nees = np.einsum(
+        "nji,nji->nj", error, np.linalg.solve(people.covariance, error[..., None])[..., 0]
+    )
     assert 0.90 <= (nees < 7.81).mean() <= 1.0
 
 
@@ -177,7 +204,12 @@ def test_people_join_a_graph_of_somebodys_own(drifted):
     path, every = drifted.rig.trajectories[0], 5
     taken = drifted.with_path(path.wTb, refined=True)
     people = reconstruct(drifted.recording, taken, times=TIMES)
-    frames, space, graph, values = range(0, T, every), KeySpace("p"), gtsam.NonlinearFactorGraph(), gtsam.Values()
+    frames, space, graph, values = (
+        range(0, T, every),
+        KeySpace("p"),
+        gtsam.NonlinearFactorGraph(),
+        gtsam.Values(),
+    )
     at, keys = path.at(TIMES.time_s[frames]), [key("robot", frame) for frame in frames]
     graph.addPriorPose3(keys[0], gtsam.Pose3(at[0]), diagonal([0.02] * 3 + [0.05] * 3))
     for factor in odometry_factors(keys, at, path.drifted(at, TIMES.time_s[frames])):
@@ -194,11 +226,14 @@ def test_people_join_a_graph_of_somebodys_own(drifted):
     true = drifted.true.at(TIMES.time_s[frames])
     before = np.linalg.norm(at[:, :3, 3] - true[:, :3, 3], axis=1)
     after = [
-        np.linalg.norm(found.atPose3(one).translation() - T[:3, 3]) for one, T in zip(keys, true, strict=True)
+        np.linalg.norm(found.atPose3(one).translation() - T[:3, 3])
+        for one, T in zip(keys, true, strict=True)
     ]
     assert np.mean(after) < 0.6 * before.mean()
     joints = np.full(given.joints.shape, np.nan)
-    for row, (who, frame) in enumerate(zip(given.person.tolist(), given.frame.tolist(), strict=True)):
+    for row, (who, frame) in enumerate(
+        zip(given.person.tolist(), given.frame.tolist(), strict=True)
+    ):
         for joint, place in enumerate(space.positions(who, np.arange(25), frame).tolist()):
             joints[row, joint] = found.atPoint3(place) if found.exists(place) else np.nan
     assert np.isfinite(joints).mean() > 0.95
@@ -224,9 +259,12 @@ def test_without_a_fixed_camera_people_are_where_they_are_before_the_robot():
     made = scene(fixed=0)
     rig = refine_trajectories(made.recording, made.rig, times=TIMES)
     odometry = made.rig.trajectories[0].at(TIMES.time_s)
-    # Nothing but the odometry says where the robot is: its poses stay, and their covariance grows with the way.
+    # Nothing but the odometry says where the robot is: its poses stay, and their covariance grows
+    # with the way.
     np.testing.assert_allclose(rig.trajectories[0].at(TIMES.time_s), odometry, atol=1e-6)
-    sigma = np.sqrt(rig.trajectories[0].covariance_at(TIMES.time_s)[:, 3:, 3:].trace(axis1=1, axis2=2))
+    sigma = np.sqrt(
+        rig.trajectories[0].covariance_at(TIMES.time_s)[:, 3:, 3:].trace(axis1=1, axis2=2)
+    )
     assert sigma[0] < 1e-3 and (np.diff(sigma) > 0).all() and sigma[-1] > 0.02
     people = reconstruct(made.recording, rig, times=TIMES)
     to_truth = made.true.at(TIMES.time_s) @ np.linalg.inv(odometry)
@@ -265,13 +303,17 @@ def test_a_run_keeps_its_trajectories(refined):
     # Samples of the odometry fall on frames but for rounding: each moment is there once.
     assert np.diff(again.trajectories[0].time_s).min() > 1e-4
     np.testing.assert_array_equal(again.trajectories[0].wTb, refined.trajectories[0].wTb)
-    np.testing.assert_array_equal(again.trajectories[0].covariance, refined.trajectories[0].covariance)
+    np.testing.assert_array_equal(
+        again.trajectories[0].covariance, refined.trajectories[0].covariance
+    )
 
 
 def test_a_trajectory_of_another_clock_is_refused(drifted):
     path = drifted.rig.trajectories[0]
     rig = replace(drifted.rig, trajectories=(replace(path, time_s=path.time_s + 1.7e9),))
-    with pytest.raises(ValueError, match="camera cam2 has no pose at any picture: robot runs from 17000000"):
+    with pytest.raises(
+        ValueError, match="camera cam2 has no pose at any picture: robot runs from 17000000"
+    ):
         refine_trajectories(drifted.recording, rig, times=TIMES)
 
 
@@ -280,7 +322,10 @@ def test_pictures_outside_the_trajectory_are_not_used(drifted):
     short = drifted.true
     early = short.time_s < TIMES.time_s[40]
     rig = replace(
-        drifted.rig, trajectories=(replace(short, time_s=short.time_s[early], wTb=short.wTb[early], refined=True),)
+        drifted.rig,
+        trajectories=(
+            replace(short, time_s=short.time_s[early], wTb=short.wTb[early], refined=True),
+        ),
     )
     people = reconstruct(drifted.recording, rig, times=TIMES, frames=range(36, 44))
     assert people.observations is not None

@@ -1,4 +1,6 @@
-"""A person is one person: found twice in a view, cut off by its picture, or with left and right exchanged."""
+"""A person is one person: found twice in a view, cut off by its picture, or with left and right
+exchanged.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -81,19 +83,25 @@ def test_sides_that_most_views_exchange_for_a_while_are_held(scene):
         joint_metrics(reconstruct(Recording(BODY_25, each), rig, times=times), scene.keypoints)
         for each in (right, wrong)
     ]
-    assert figures[1].mpjpe_mm < 1.5 * figures[0].mpjpe_mm, "more than twice as much where nobody holds them"
+    assert figures[1].mpjpe_mm < 1.5 * figures[0].mpjpe_mm, (
+        "more than twice as much where nobody holds them"
+    )
     assert figures[1].f1 > figures[0].f1 - 0.01
 
 
 def case(shared_data: Path, name: str):
-    """Rig, detections, and the truth of one of the cases: frames (N,), joints (N, J, 3) and their names."""
+    """Rig, detections, and the truth of one of the cases: frames (N,), joints (N, J, 3) and their
+    names.
+    """
     folder = shared_data.parent / "cases" / name
     if not folder.is_dir():
         pytest.skip(f"no {folder}: the case is not part of every copy of the data")
     rig = read_rig(folder / "rig.json")
     with np.load(folder / "truth" / "people.npz") as truth:
         columns = {key: truth[key] for key in ("frame", "joints", "joint_names")}
-    joints = columns["joints"].reshape(len(np.unique(columns["frame"])), -1, *columns["joints"].shape[1:])
+    joints = columns["joints"].reshape(
+        len(np.unique(columns["frame"])), -1, *columns["joints"].shape[1:]
+    )
     return rig, read_detections(folder / "openpose", rig), joints, columns["joint_names"].tolist()
 
 
@@ -117,7 +125,9 @@ def test_a_detector_without_suppression_of_doubles(shared_data, temporal):
 
 @pytest.mark.slow
 def test_left_and_right_exchanged_in_two_of_three_cameras(shared_data):
-    """For two seconds; without that the mean error is 22 mm, and with it it was 60 in the mean of all frames."""
+    """For two seconds; without that the mean error is 22 mm, and with it it was 60 in the mean of
+    all frames.
+    """
     found, figures = solved(shared_data, "flip2of3", PipelineConfig())
     assert len(found) == 240
     assert figures.mpjpe_mm < 26
@@ -125,7 +135,9 @@ def test_left_and_right_exchanged_in_two_of_three_cameras(shared_data):
 
 @pytest.mark.slow
 def test_legs_that_the_picture_cuts_off(shared_data):
-    """The detector puts them on the border of two of four pictures: no worse than if it had said nothing."""
+    """The detector puts them on the border of two of four pictures: no worse than if it had said
+    nothing.
+    """
     found, figures = solved(shared_data, "border", PipelineConfig())
     assert len(found) == 240
     assert figures.mpjpe_mm < 26

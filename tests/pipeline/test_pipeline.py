@@ -84,7 +84,10 @@ def test_the_run_says_how_it_came_about(people):
     assert set(run["seconds"]) >= {"triangulate", "propose", "follow", "solve"}
     assert run["versions"]["gtsam"].startswith("4.")
     assert [each["person"] for each in run["probability"]] == np.unique(people.person).tolist()
-    assert all(0.3 < each["evidence"] <= 1 and 0.9 < each["probability"] <= 1 for each in run["probability"])
+    assert all(
+        0.3 < each["evidence"] <= 1 and 0.9 < each["probability"] <= 1
+        for each in run["probability"]
+    )
 
 
 @pytest.mark.slow
@@ -95,8 +98,13 @@ def test_without_time_frames_stand_alone_and_batches_do_not_matter(scene, record
     rows = whole.rows((whole.frame >= 5) & (whole.frame < 9))
     assert_same(part, rows)
     assert part.run["frames"] == [5, 9]
-    assert sum(part.run["probability"].values()) == len(part) and set(part.run["probability"]) <= {"0.8", "0.9"}
-    assert_same(reconstruct(recording, scene.rig, replace(ALONE, batch_frames=3), frames=range(5, 9)), rows)
+    assert sum(part.run["probability"].values()) == len(part) and set(part.run["probability"]) <= {
+        "0.8",
+        "0.9",
+    }
+    assert_same(
+        reconstruct(recording, scene.rig, replace(ALONE, batch_frames=3), frames=range(5, 9)), rows
+    )
 
 
 def test_the_same_input_gives_the_same_bytes(scene, recording):
@@ -107,7 +115,8 @@ def test_the_same_input_gives_the_same_bytes(scene, recording):
 
 @pytest.mark.slow
 def test_workers_change_no_byte(scene, recording, monkeypatch):
-    """Windows of 8 frames, so that there are several; everything in the result, gates and shapes included.
+    """Windows of 8 frames, so that there are several; everything in the result, gates and shapes
+    included.
 
     By a model of motion whose name they do not know.
     """
@@ -122,7 +131,9 @@ def test_workers_change_no_byte(scene, recording, monkeypatch):
         assert getattr(alone, name).tobytes() == getattr(helped, name).tobytes(), name
     assert alone.observations is not None and helped.observations is not None
     for name, column in alone.observations.columns().items():
-        assert column.array().tobytes() == helped.observations.columns()[name].array().tobytes(), name
+        assert column.array().tobytes() == helped.observations.columns()[name].array().tobytes(), (
+            name
+        )
     assert alone.shapes is not None and helped.shapes is not None
     assert alone.shapes.betas.tobytes() == helped.shapes.betas.tobytes()
 
@@ -150,7 +161,8 @@ def carries_a_box(window, keys):
         right, left = (frame[detections.skeleton.index(name)] for name in ("RWrist", "LWrist"))
         yield gtsam.RangeFactor3(right, left, 0.40, isotropic(1, 0.01))
 alone = reconstruct(detections, scene.rig, extra_factors=carries_a_box)
-helped = reconstruct(detections, scene.rig, extra_factors=carries_a_box, execution=Execution(workers=2))
+two = Execution(workers=2)
+helped = reconstruct(detections, scene.rig, extra_factors=carries_a_box, execution=two)
 print(len(alone), alone.joints.tobytes() == helped.joints.tobytes())
 """
 
@@ -158,7 +170,9 @@ print(len(alone), alone.joints.tobytes() == helped.joints.tobytes())
 @pytest.mark.slow
 def test_factors_that_were_typed_somewhere_are_the_same_with_workers():
     """README's own factor, in a script on standard input, which no other process can import."""
-    run = subprocess.run([sys.executable, "-"], input=_TYPED, capture_output=True, text=True, timeout=300)
+    run = subprocess.run(
+        [sys.executable, "-"], input=_TYPED, capture_output=True, text=True, timeout=300
+    )
     assert run.stdout == "4 True\n", run.stderr
 
 
@@ -203,7 +217,9 @@ def test_an_empty_frame_and_a_blind_view_harm_no_other(scene, recording):
 
 @pytest.mark.parametrize(("seed", "frame"), [(0, 34), (1003, 8), (1004, 3)])
 def test_nobody_is_cut_in_two_and_nobody_invented(seed, frame):
-    """Frames where rays to different hips cross near somebody: that hip took the legs, or odds and ends."""
+    """Frames where rays to different hips cross near somebody: that hip took the legs, or odds and
+    ends.
+    """
     scene = built_in_scene(seed=seed)
     seen = simulate(scene, seed=seed, frames=range(frame, frame + 1))[0]
     people = find_people(seen, scene.rig, BODY_25, PipelineConfig())
@@ -261,7 +277,8 @@ def test_without_time_problems_and_phantoms_are_those_of_the_frames(scene, recor
     named = {(each["person"], each["frame"]) for each in result.run["people"]["problems"]}
     assert named == set(zip(result.person.tolist(), result.frame.tolist(), strict=True))
     assert {person for person, _ in named} == {0, 1, 2, 3}
-    # Who goes when detections are given out again has no problem of their own; there is hardly anybody.
+    # Who goes when detections are given out again has no problem of their own; there is hardly
+    # anybody.
     gone = "hardly any detections of their own, or at the position of another person"
     assert result.run["people"]["dropped"].get(gone, 0) <= 3
 
@@ -287,7 +304,9 @@ def test_shelf_is_as_good_as_promised(shared_data):
 
 
 def test_the_observations_are_what_the_joints_were_solved_from(dance, scene, people):
-    """Whoever reads observations.npz finds the detections, and projecting the joints gives the residuals."""
+    """Whoever reads observations.npz finds the detections, and projecting the joints gives the
+    residuals.
+    """
     table = people.observations
     assert table.used.mean() > 0.5
     row, joint, view = np.argwhere(table.used)[1000].tolist()
@@ -300,7 +319,8 @@ def test_the_observations_are_what_the_joints_were_solved_from(dance, scene, peo
     residual = projected[view, row, joint] - seen.xy[detection]
     np.testing.assert_allclose(table.residual_px[row, joint, view], residual, atol=1e-3)
     assert np.median(np.linalg.norm(table.residual_px[table.used], axis=-1)) < 10
-    # Seen means that a detection was used; the motion of others around it can tell a joint that nobody saw.
+    # Seen means that a detection was used; the motion of others around it can tell a joint that
+    # nobody saw.
     np.testing.assert_array_equal(Known.observed(people.known), table.used.any(axis=-1))
     assert Known.UNKNOWN not in people.known
     assert people.run["people"]["joints"]["seen"] == (people.known == Known.SEEN).sum()
@@ -308,7 +328,9 @@ def test_the_observations_are_what_the_joints_were_solved_from(dance, scene, peo
 
 @pytest.mark.slow
 def test_detections_are_assigned_until_hardly_any_changes():
-    """More rounds than that change nothing; where they are not assigned again, they are not there yet."""
+    """More rounds than that change nothing; where they are not assigned again, they are not there
+    yet.
+    """
     scene = built_in_scene(people=4, cameras=3, frames=16)
     recording = simulate(scene)
     rounds = {}

@@ -28,7 +28,9 @@ WRIST, KNEE = BODY_25.index("RWrist"), BODY_25.index("LKnee")
 
 
 class OneBody(BodyFitter):
-    """Fits the same body to everything: as it is without leaving anything out 5 cm from its priors."""
+    """Fits the same body to everything: as it is without leaving anything out 5 cm from its
+    priors.
+    """
 
     def __init__(self, joints, sigma_m=0.1):
         self.joints, self.sigma_m, self.targets = joints, sigma_m, []
@@ -63,9 +65,11 @@ def test_presets_read_back(name, settings, tmp_path, capsys):
 
 
 def test_a_detection_weighs_its_confidence_in_pixels(five_cameras, two_people):
-    """Eq. 1: w_ij is the confidence, d_2D in pixels, whatever depth and joint; no kernel: a far one counts too.
+    """Eq. 1: w_ij is the confidence, d_2D in pixels, whatever depth and joint; no kernel: a far one
+    counts too.
 
-    Twice the distance from the cameras halves a length in the pictures, and leaves these sigmas alone.
+    Twice the distance from the cameras halves a length in the pictures, and leaves these sigmas
+    alone.
     """
     people = np.concatenate([two_people[:1], two_people[:1] * [2.0, 2.0, 1.0]])
     views, observations = Views.of(five_cameras), seen(five_cameras, people, 1.0)
@@ -75,9 +79,12 @@ def test_a_detection_weighs_its_confidence_in_pixels(five_cameras, two_people):
     weight = 1 / sigmas**2
     np.testing.assert_allclose(weight, confidence * weight[:, -1:, :], rtol=1e-9)
     np.testing.assert_allclose(sigmas[0], sigmas[1], rtol=1e-9)
-    ours = observation_sigmas(observations, people, views, PipelineConfig().observations, BODY_25.joints)
+    ours = observation_sigmas(
+        observations, people, views, PipelineConfig().observations, BODY_25.joints
+    )
     assert np.abs(ours[0] / ours[1] - 1).max() > 0.1
-    # Eq. 2, and no kernel: the information is J^T J over sigma² wherever the distance is under rho_2D.
+    # Eq. 2, and no kernel: the information is J^T J over sigma² wherever the distance is under
+    # rho_2D.
     moved = replace(observations, xy=observations.xy + np.array([8.0, 0.0]))
     there = linearise(moved, sigmas, people, views, PAPER.observations)
     at = linearise(observations, sigmas, people, views, PAPER.observations)
@@ -86,7 +93,9 @@ def test_a_detection_weighs_its_confidence_in_pixels(five_cameras, two_people):
 
 
 def test_e_shape_has_one_weight(five_cameras, two_people):
-    """Eqs. 3 to 5: a doubtful joint is where w_2D E_2D + w_shape E_shape is least, others where views are."""
+    """Eqs. 3 to 5: a doubtful joint is where w_2D E_2D + w_shape E_shape is least, others where
+    views are.
+    """
     observations = seen(five_cameras, two_people)
     observations.confidence[:, WRIST] = 0.2  # under rho_3D
     observations = replace(observations, xy=observations.xy + np.array([3.0, -2.0]))
@@ -95,7 +104,9 @@ def test_e_shape_has_one_weight(five_cameras, two_people):
     config = replace(config, graph=replace(config.graph, max_iterations=100, tolerance=1e-12))
     found = solve_window(observations, Views.of(five_cameras), body, config)
     views = Views.of(five_cameras)
-    sigmas = observation_sigmas(observations, two_people, views, config.observations, BODY_25.joints)
+    sigmas = observation_sigmas(
+        observations, two_people, views, config.observations, BODY_25.joints
+    )
     at = linearise(observations, sigmas, found.joints, views, config.observations)
     pull = (body.joints - found.joints) / config.graph.shape_sigma_m**2
     # The gradient of the whole energy is zero: of 1/cm where each of its halves has hundreds.
@@ -105,8 +116,9 @@ def test_e_shape_has_one_weight(five_cameras, two_people):
 
 
 def test_the_body_is_fitted_to_x_and_its_prior_has_seen_the_joint(five_cameras, two_people):
-    """Algorithm 1: E_shape(X_n, Theta) over all joints alike, and no leave-one-out; a joint that is not there is
-    missing."""
+    """Algorithm 1: E_shape(X_n, Theta) over all joints alike, and no leave-one-out; a joint that is
+    not there is missing.
+    """
     observations = seen(five_cameras, two_people)
     observations.initial[1, KNEE] = np.nan
     moved = observations.initial + 0.01
@@ -126,7 +138,9 @@ def test_the_body_is_fitted_to_x_and_its_prior_has_seen_the_joint(five_cameras, 
     fit = step.fit(targets, nothing)
     np.testing.assert_array_equal(fit.prior_xyz, body.joints)
     expected = (body.sigma_m**2 + MODEL_SIGMA_M**2) * np.eye(3)
-    np.testing.assert_allclose(fit.prior_covariance, np.broadcast_to(expected, fit.prior_covariance.shape))
+    np.testing.assert_allclose(
+        fit.prior_covariance, np.broadcast_to(expected, fit.prior_covariance.shape)
+    )
     ours = BodyStep(body, (), EstimatorConfig())
     np.testing.assert_array_equal(ours.fit(targets, nothing).prior_xyz, body.joints + 0.05)
     np.testing.assert_array_equal(
@@ -136,7 +150,9 @@ def test_the_body_is_fitted_to_x_and_its_prior_has_seen_the_joint(five_cameras, 
 
 
 def test_the_paper_makes_n_rounds_and_starts_from_stage_i_alone(five_cameras, two_people):
-    """N = 10; a joint that stage I did not place is missing from the first body, then where that body has it."""
+    """N = 10; a joint that stage I did not place is missing from the first body, then where that
+    body has it.
+    """
     observations = seen(five_cameras, two_people)
     observations.initial[1, KNEE] = np.nan
     observations.confidence[:, KNEE] = 0.1
@@ -166,17 +182,26 @@ def unseen(detections: Detections, joints: tuple[int, ...], views: tuple[int, ..
     return detections.only(~(np.isin(detections.joint, joints) & np.isin(detections.view, views)))
 
 
-def test_the_paper_proposes_by_three_votes_and_nine_parts_in_ten(five_cameras, two_people, seen_exactly):
-    """Section 3.1: what two views see makes no candidate; who lacks more than a tenth of the parts is nobody."""
+def test_the_paper_proposes_by_three_votes_and_nine_parts_in_ten(
+    five_cameras, two_people, seen_exactly
+):
+    """Section 3.1: what two views see makes no candidate; who lacks more than a tenth of the parts
+    is nobody.
+    """
     exact = seen_exactly(five_cameras, two_people[:1])
     twice = unseen(exact, (WRIST,), (0, 1, 2))
-    ours, theirs = (find_people(twice, five_cameras, BODY_25, config) for config in (PipelineConfig(), PAPER))
+    ours, theirs = (
+        find_people(twice, five_cameras, BODY_25, config) for config in (PipelineConfig(), PAPER)
+    )
     np.testing.assert_allclose(ours.initial[0], two_people[0], atol=0.005)
     assert np.isnan(theirs.initial[0, WRIST]).all()
     others = np.delete(np.arange(25), WRIST)
     np.testing.assert_allclose(theirs.initial[0, others], two_people[0, others], atol=0.005)
     forearm = unseen(exact, (WRIST, WRIST - 1), (0, 1, 2, 3, 4))
-    count = [len(find_people(forearm, five_cameras, BODY_25, config)) for config in (PipelineConfig(), PAPER)]
+    count = [
+        len(find_people(forearm, five_cameras, BODY_25, config))
+        for config in (PipelineConfig(), PAPER)
+    ]
     assert count == [1, 0]
 
 
@@ -201,19 +226,33 @@ def test_the_paper_s_candidate_is_the_mean_of_its_points(five_cameras, two_peopl
 
 
 def test_stage_one_s_settings_of_the_paper():
-    """Section 3.1: three votes, 90 % of the parts; what it does not have is off. Chosen on `tune`: 6 and 60 cm."""
+    """Section 3.1: three votes, 90 % of the parts; what it does not have is off. Chosen on `tune`:
+    6 and 60 cm.
+    """
     c, p = PAPER.candidates, PAPER.proposals
     assert (c.min_votes, c.vote_radius_m, c.weak, c.weighted_centre) == (3, 0.06, False, False)
     assert c.gate_m >= 10 and c.min_angle_deg < 0.01 and c.min_view_fraction < 0.01
-    assert (p.min_parts, p.separation_m, p.min_grown_parts, p.min_observed_parts) == (0.9, 0.6, 0.0, 0.0)
+    assert (p.min_parts, p.separation_m, p.min_grown_parts, p.min_observed_parts) == (
+        0.9,
+        0.6,
+        0.0,
+        0.0,
+    )
     assert (p.weak_anchors, p.growth.bridge_m) == (False, 0.0)
 
 
 def test_stage_two_s_settings_of_the_paper():
-    """Section 3.2: N = 10, rho_3D 0.25; X_0 as stage I has it, the body fitted to X, nothing left out of it."""
+    """Section 3.2: N = 10, rho_3D 0.25; X_0 as stage I has it, the body fitted to X, nothing left
+    out of it.
+    """
     r, w, o = PAPER.refine, PAPER.window_graph, PAPER.observations
     assert (r.alternations, w.rho_3d, o.confidence_power, o.kernel) == (10, 0.25, 1.0, "none")
-    assert (r.complete_start, r.body_from_views, r.settled_m, r.disagreement) == (False, False, 0.0, 0.0)
+    assert (r.complete_start, r.body_from_views, r.settled_m, r.disagreement) == (
+        False,
+        False,
+        0.0,
+        0.0,
+    )
     assert not PAPER.temporal and PAPER.offsets.source == "none"
 
 

@@ -1,4 +1,6 @@
-"""People solved anew from the observations of a result: nothing changes where nobody did, and swaps are mended."""
+"""People solved anew from the observations of a result: nothing changes where nobody did, and swaps
+are mended.
+"""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -52,10 +54,12 @@ def moved_mm(one: Reconstruction, other: Reconstruction) -> np.ndarray:
 
 
 def test_solved_anew_nobody_moves(scene, people):
-    """The same observations, from where the views put them: the alternation settles to the same, but for joints
-    that views hardly see.
+    """The same observations, from where the views put them: the alternation settles to the same,
+    but for joints that views hardly see.
     """
-    again = solve_anew(replace_changed(people, frozenset(people.person.tolist())), lambda rows: solve(rows, scene))
+    again = solve_anew(
+        replace_changed(people, frozenset(people.person.tolist())), lambda rows: solve(rows, scene)
+    )
     assert np.nanmedian(moved_mm(again, people)) < 1.5
     assert np.nanquantile(moved_mm(again, people), 0.9) < 10
     assert (again.observations.gate != people.observations.gate).mean() < 0.02
@@ -64,7 +68,11 @@ def test_solved_anew_nobody_moves(scene, people):
 
 
 def replace_changed(people: Reconstruction, changed: frozenset[int]):
-    return replace(apply(people, Edit(Action.RENAME, int(people.person[0]), 99)), people=people, changed=changed)
+    return replace(
+        apply(people, Edit(Action.RENAME, int(people.person[0]), 99)),
+        people=people,
+        changed=changed,
+    )
 
 
 LONG = PipelineConfig(batch_frames=6, windows=WindowConfig(overlap_s=0.1))
@@ -86,7 +94,9 @@ def solved_frames(work: Callable[[], Reconstruction]) -> tuple[list[list[int]], 
 
 @pytest.mark.slow
 def test_rows_are_solved_anew_in_the_windows_of_the_recording():
-    """22 frames cut before the tenth, windows of six that overlap by three; the last of each part is longer."""
+    """22 frames cut before the tenth, windows of six that overlap by three; the last of each part
+    is longer.
+    """
     scene = built_in_scene(people=2, cameras=4, frames=22)
     windows, people = solved_frames(lambda: reconstruct(simulate(scene), scene.rig, LONG, cuts=[9]))
     spans = [(0, 9), (9, 19), (12, 22)]  # 9 to 15 and 15 to 22, and three frames of the other
@@ -101,7 +111,9 @@ def test_rows_are_solved_anew_in_the_windows_of_the_recording():
 
 @pytest.mark.slow
 def test_a_swap_is_mended_and_only_who_was_in_it_is_solved(scene, people):
-    """Two people who changed places in frame 6 are torn apart by motion; put right, they are where they were."""
+    """Two people who changed places in frame 6 are torn apart by motion; put right, they are where
+    they were.
+    """
     first, second, third = sorted(set(people.person.tolist()))[:3]
     swap = Edit(Action.SWAP, first, second, 6)
     wrong = solve_anew(apply(people, swap), lambda rows: solve(rows, scene))
@@ -175,10 +187,14 @@ def test_the_setup_of_a_result(scene, people, tmp_path):
     assert solver.config == CONFIG
     np.testing.assert_allclose(solver.rig.cTw, scene.rig.cTw)
     offsets = solver.fitter.model.keypoint_offsets
-    np.testing.assert_allclose(offsets.xyz_m, KeypointOffsets.from_dict(people.run["keypoint_offsets"]).xyz_m)
+    np.testing.assert_allclose(
+        offsets.xyz_m, KeypointOffsets.from_dict(people.run["keypoint_offsets"]).xyz_m
+    )
     assert (people.observations.gate == Gate.USED).any()
     write_rig(built_in_scene(cameras=5, frames=1).rig, folder / CAMERAS)
-    with pytest.raises(InputError, match=r"cameras.json: the cameras are not those of observations.npz"):
+    with pytest.raises(
+        InputError, match=r"cameras.json: the cameras are not those of observations.npz"
+    ):
         Solver.read(folder, loaded)
     other = replace(loaded, run=loaded.run | {"configuration": {"speed": 3}})
     write_rig(scene.rig, folder / CAMERAS)
@@ -194,7 +210,9 @@ def test_the_setup_of_a_result(scene, people, tmp_path):
 
 @pytest.mark.slow
 def test_any_damaged_file_of_a_result_is_one_sentence(scene, people, tmp_path, capsys):
-    """Bytes of each file changed at random, then listed and corrected: an answer, or one sentence."""
+    """Bytes of each file changed at random, then listed and corrected: an answer, or one
+    sentence.
+    """
     rng, first = np.random.default_rng(0), int(people.person[0])
     folder = saved(people, scene, tmp_path / "results")
     assert run("tracks", folder, "rename", first, 30) == 0

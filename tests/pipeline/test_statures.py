@@ -1,4 +1,6 @@
-"""How tall people come out: children and the very tall too, though the body's shapes are those of adults."""
+"""How tall people come out: children and the very tall too, though the body's shapes are those of
+adults.
+"""
 
 import numpy as np
 import pytest
@@ -14,7 +16,9 @@ from tests.foreign import Proportions, recast
 
 def fitted_m(scene: Scene) -> np.ndarray:
     """Statures of all people in the reconstruction of a scene, in order."""
-    people = reconstruct(simulate(scene, seed=1), scene.rig, times=FrameTimes.from_fps(25, len(scene)))
+    people = reconstruct(
+        simulate(scene, seed=1), scene.rig, times=FrameTimes.from_fps(25, len(scene))
+    )
     assert people.shapes is not None
     return np.sort(statures_m(people.shapes.betas, read_body()))
 

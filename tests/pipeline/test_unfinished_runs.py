@@ -1,4 +1,6 @@
-"""Runs that are stopped go on, and end as if they had not been; nothing that was done is lost in silence."""
+"""Runs that are stopped go on, and end as if they had not been; nothing that was done is lost in
+silence.
+"""
 
 import hashlib
 import json
@@ -53,8 +55,9 @@ CUTS = (24,)
 
 @pytest.fixture(scope="module", autouse=True)
 def short_blocks(dance):
-    """So that following stands between two windows in the middle of a stretch, too; `dance`, which others share,
-    is made before."""
+    """So that following stands between two windows in the middle of a stretch, too; `dance`, which
+    others share, is made before.
+    """
     before, identities.BLOCK_S = identities.BLOCK_S, 0.2
     yield
     identities.BLOCK_S = before
@@ -89,7 +92,9 @@ def assert_same_files(folder: Path, expected: Path) -> None:
 
 
 class Interrupted(InFolder):
-    """Parts in a folder, until a budget of writes is used up: the run is stopped, before or behind the next."""
+    """Parts in a folder, until a budget of writes is used up: the run is stopped, before or behind
+    the next.
+    """
 
     def __init__(self, folder: Path, writes: int, *, behind: bool) -> None:
         super().__init__(folder)
@@ -106,7 +111,9 @@ class Interrupted(InFolder):
 
 @pytest.mark.slow
 def test_a_run_that_is_stopped_again_and_again_ends_the_same(scene, recording, whole, tmp_path):
-    """Stopped around the writes of windows, of where following stands, and of bodies; a window is two writes."""
+    """Stopped around the writes of windows, of where following stands, and of bodies; a window is
+    two writes.
+    """
     stops, result = 0, None
     while result is None:
         kept = Interrupted(tmp_path / "parts", 3 + stops % 2, behind=stops % 3 == 1)
@@ -133,16 +140,23 @@ def test_what_is_in_memory_and_what_is_in_the_files_is_the_same(dance, tmp_path)
 @pytest.mark.slow
 @pytest.mark.parametrize("chunk_frames", [None, 6])
 def test_who_comes_when_a_run_goes_on_is_nobody_of_before(scene, recording, tmp_path, chunk_frames):
-    """Stopped behind the first of two windows, between which the recording is cut: the same, and new names."""
+    """Stopped behind the first of two windows, between which the recording is cut: the same, and
+    new names.
+    """
     frames, config = range(12), replace(CONFIG, offsets=OffsetConfig(source="none"))
-    task, execution = Task(recording, scene.rig, config, frames, cuts=(6,)), Execution(chunk_frames=chunk_frames)
+    task, execution = (
+        Task(recording, scene.rig, config, frames, cuts=(6,)),
+        Execution(chunk_frames=chunk_frames),
+    )
     with pytest.raises(Stopped):
         reconstruct_parts(Interrupted(tmp_path / "parts", 2, behind=False), task, execution)
     result = reconstruct_parts(InFolder(tmp_path / "parts"), task, execution).reconstruction()
     usual = reconstruct_parts(InMemory(), task, execution).reconstruction()
     for name in result.ROWS:
         assert getattr(result, name).tobytes() == getattr(usual, name).tobytes(), name
-    before, after = (set(result.person[side].tolist()) for side in (result.frame < 6, result.frame >= 6))
+    before, after = (
+        set(result.person[side].tolist()) for side in (result.frame < 6, result.frame >= 6)
+    )
     assert len(before) == len(after) == 2 and not before & after
 
 
@@ -245,7 +259,11 @@ def test_the_command_is_interrupted_killed_and_goes_on(command, tmp_path, capsys
     first.send_signal(signal.SIGINT)
     _, said = first.communicate(timeout=60)
     assert first.returncode == 130
-    assert "frames are stored in" in said and "continue with --resume" in said and said.count("\n") == 1
+    assert (
+        "frames are stored in" in said
+        and "continue with --resume" in said
+        and said.count("\n") == 1
+    )
     left = {file.name: file.read_bytes() for file in (out / "parts").iterdir()}
     assert finished(command, "--output", str(out)) == 2
     said = capsys.readouterr().err
@@ -253,7 +271,9 @@ def test_the_command_is_interrupted_killed_and_goes_on(command, tmp_path, capsys
     assert finished(command, "--output", str(out), "--resume", "--fps", "25") == 2
     said = capsys.readouterr().err
     assert "had another time" in said and said.count("\n") == 1
-    assert left == {file.name: file.read_bytes() for file in (out / "parts").iterdir()}, "asking loses nothing"
+    assert left == {file.name: file.read_bytes() for file in (out / "parts").iterdir()}, (
+        "asking loses nothing"
+    )
     second = start("part-000003", command, "--output", str(out), "--resume")
     wait_for(out / "parts" / "part-000003.safetensors", second)
     second.kill()
@@ -266,8 +286,12 @@ def test_the_command_is_interrupted_killed_and_goes_on(command, tmp_path, capsys
     assert_same_files(out, tmp_path / "whole")
 
 
-@pytest.mark.parametrize(("before", "after"), [((), ("--without", "cam1")), (("--cameras", "cam0,cam2"), ())])
-def test_a_run_does_not_go_on_with_other_cameras(command, tmp_path, capsys, monkeypatch, before, after):
+@pytest.mark.parametrize(
+    ("before", "after"), [((), ("--without", "cam1")), (("--cameras", "cam0,cam2"), ())]
+)
+def test_a_run_does_not_go_on_with_other_cameras(
+    command, tmp_path, capsys, monkeypatch, before, after
+):
     def stop(*_: object, **__: object) -> None:
         raise Stopped(signal.SIGTERM)
 
@@ -276,7 +300,10 @@ def test_a_run_does_not_go_on_with_other_cameras(command, tmp_path, capsys, monk
         assert finished(command, "--output", str(tmp_path), *before) == 143
     monkeypatch.setattr("shapepose_fg.pipeline.runs.manifest.Parts", lambda kept: _Done())
     capsys.readouterr()
-    for more, said in (((), "continue with --resume"), (("--resume",), "had another set of cameras")):
+    for more, said in (
+        ((), "continue with --resume"),
+        (("--resume",), "had another set of cameras"),
+    ):
         assert finished(command, "--output", str(tmp_path), *after, *more) == 2
         assert said in capsys.readouterr().err
 
@@ -298,7 +325,11 @@ begin.main()
 @pytest.mark.skipif(os.name != "posix", reason="stops processes by POSIX signals")
 def test_ctrl_c_while_the_program_is_loaded_leaves_no_traceback():
     done = subprocess.run(
-        [sys.executable, "-c", EARLY], capture_output=True, text=True, timeout=60, preexec_fn=hears_ctrl_c
+        [sys.executable, "-c", EARLY],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        preexec_fn=hears_ctrl_c,
     )
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
 
@@ -306,7 +337,11 @@ def test_ctrl_c_while_the_program_is_loaded_leaves_no_traceback():
 @pytest.fixture
 def begun(tmp_path) -> Iterator[dict]:
     """A run in `tmp_path` that was stopped behind its first window."""
-    values = {"inputs": {"a.json": "1"}, "configuration": {"windows": {"overlap_s": 0.4}}, "program": "x" * 64}
+    values = {
+        "inputs": {"a.json": "1"},
+        "configuration": {"windows": {"overlap_s": 0.4}},
+        "program": "x" * 64,
+    }
     kept = open_run(tmp_path, values)
     kept.keep("followed-000000", {})
     yield values
@@ -323,7 +358,10 @@ def test_a_run_goes_on_with_the_same_only(tmp_path, begun, monkeypatch):
     open_run(tmp_path, begun, resume=True)
     for other, words in (
         ({"inputs": {"a.json": "2"}}, r"another inputs\.a\.json \(1 then, 2 now\)"),
-        ({"configuration": {"windows": {"overlap_s": 0.5}}}, r"windows\.overlap_s \(0\.4 then, 0\.5 now\)"),
+        (
+            {"configuration": {"windows": {"overlap_s": 0.5}}},
+            r"windows\.overlap_s \(0\.4 then, 0\.5 now\)",
+        ),
         ({"program": "y" * 64}, r"another version of this program; start it with the same options"),
     ):
         with pytest.raises(InputError, match=words):
@@ -347,7 +385,9 @@ def test_a_run_goes_on_with_the_people_that_it_began_with(tmp_path):
     kept, file = InFolder(tmp_path / "parts"), tmp_path / "shapes.npz"
     body = "b" * 64
     first = SubjectShapes(np.array(["0"]), np.ones((1, 10)), np.eye(10)[None], body)
-    more = SubjectShapes(np.array(["0", "1"]), np.full((2, 10), 2.0), np.stack([np.eye(10)] * 2), body)
+    more = SubjectShapes(
+        np.array(["0", "1"]), np.full((2, 10), 2.0), np.stack([np.eye(10)] * 2), body
+    )
 
     def must_not_load() -> SubjectShapes:
         raise AssertionError("it was read when the run began")
@@ -370,7 +410,8 @@ def test_a_run_goes_on_with_the_people_that_it_began_with(tmp_path):
         r" again",
     ):
         people_at_start(kept, file, must_not_load)
-    # Stopped right behind its own writing: that is no change by somebody else, and who was known stays known.
+    # Stopped right behind its own writing: that is no change by somebody else, and who was known
+    # stays known.
     write_people(kept, file, more)
     assert file.read_bytes() == stored(more)
     assert people_at_start(kept, file, must_not_load).names.tolist() == ["0"]
@@ -381,7 +422,9 @@ def test_a_run_goes_on_with_the_people_that_it_began_with(tmp_path):
 
 @pytest.mark.parametrize("removed", ["manifest.json", "followed-000000.safetensors"])
 @pytest.mark.parametrize("by", ["restart", "end"])
-def test_a_kill_while_a_run_is_removed_leaves_nothing_to_be_refused(tmp_path, begun, monkeypatch, by, removed):
+def test_a_kill_while_a_run_is_removed_leaves_nothing_to_be_refused(
+    tmp_path, begun, monkeypatch, by, removed
+):
     """Whichever file goes first, the next start finds no half of a run."""
 
     def killed(folder: Path, ignore_errors: bool = False) -> None:
@@ -415,8 +458,12 @@ def test_a_damaged_part_is_named(scene, recording, tmp_path):
     assert kept.names("followed") == ["followed-000000"]
     part = tmp_path / "parts" / "part-000000.safetensors"
     part.write_bytes(part.read_bytes()[:-100])
-    with pytest.raises(InputError, match=r"part-000000\.safetensors: a part of an interrupted run cannot be read"):
-        reconstruct_parts(InFolder(tmp_path / "parts"), Task(recording, scene.rig, CONFIG, cuts=CUTS))
+    with pytest.raises(
+        InputError, match=r"part-000000\.safetensors: a part of an interrupted run cannot be read"
+    ):
+        reconstruct_parts(
+            InFolder(tmp_path / "parts"), Task(recording, scene.rig, CONFIG, cuts=CUTS)
+        )
 
 
 def test_one_run_at_a_time_and_its_leftovers_are_swept(tmp_path):
@@ -426,7 +473,10 @@ def test_one_run_at_a_time_and_its_leftovers_are_swept(tmp_path):
         assert sorted(file.name for file in tmp_path.iterdir()) == [".lock", ".other.part"]
     assert [file.name for file in tmp_path.iterdir()] == [".other.part"]
     (tmp_path / "people.npz").mkdir()
-    with pytest.raises(InputError, match=r"people\.npz: this is a folder"), only_run_in(tmp_path, ["people.npz"]):
+    with (
+        pytest.raises(InputError, match=r"people\.npz: this is a folder"),
+        only_run_in(tmp_path, ["people.npz"]),
+    ):
         pass
 
 
@@ -442,7 +492,9 @@ def test_room_is_asked_for_before_the_work(dance, tmp_path, monkeypatch):
     # As parts and as results. Views miss joints, so that fewer people are expected than there are.
     assert 0.5 < needed / (2 * held) < 1.1
     monkeypatch.setattr("shutil.disk_usage", lambda _: _Usage(needed - 1))
-    with pytest.raises(InputError, match=r"about 2\.\d MB of disk space are needed, and 2\.\d MB are free; free"):
+    with pytest.raises(
+        InputError, match=r"about 2\.\d MB of disk space are needed, and 2\.\d MB are free; free"
+    ):
         check_room(tmp_path, needed)
     monkeypatch.setattr("shutil.disk_usage", lambda _: _Usage(needed))
     check_room(tmp_path, needed)

@@ -1,4 +1,6 @@
-"""Worker processes: work in order, errors that come through, nobody who waits for ever, from any `__main__`."""
+"""Worker processes: work in order, errors that come through, nobody who waits for ever, from any
+`__main__`.
+"""
 
 import os
 import signal
@@ -35,14 +37,22 @@ def test_results_come_in_order_wherever_they_are_made(count):
 
 
 def test_what_cannot_be_sent_is_said_before_anything_starts():
-    with pytest.raises(ValueError, match="cannot be sent to worker processes"), workers(2, threading.Lock()):
+    with (
+        pytest.raises(ValueError, match="cannot be sent to worker processes"),
+        workers(2, threading.Lock()),
+    ):
         pass
     with workers(1, threading.Lock()) as here:
         assert list(here.map(lambda _, item: item, [1])) == [1]
 
 
 def about_itself(_: object, _item: int) -> tuple[int, str, str | None, object]:
-    return os.getpid(), os.environ["OMP_NUM_THREADS"], os.environ.get("MINE"), signal.getsignal(signal.SIGINT)
+    return (
+        os.getpid(),
+        os.environ["OMP_NUM_THREADS"],
+        os.environ.get("MINE"),
+        signal.getsignal(signal.SIGINT),
+    )
 
 
 @pytest.mark.slow
@@ -79,9 +89,13 @@ with workers(2, lambda item: base**item) as pool:
 _RESULT = "[(1, True), (10, True), (100, True), (1000, True)]"
 
 
-@pytest.mark.parametrize("how", ["standard input", *slow("-c", "a cell", "a script without a guard")])
+@pytest.mark.parametrize(
+    "how", ["standard input", *slow("-c", "a cell", "a script without a guard")]
+)
 def test_any_main_will_do(how, tmp_path):
-    """As a notebook's cell does, `exec` runs code in a `__main__` that no other process can import."""
+    """As a notebook's cell does, `exec` runs code in a `__main__` that no other process can
+    import.
+    """
     code, words, given = _TYPED, [], None
     match how:
         case "standard input":
@@ -89,14 +103,17 @@ def test_any_main_will_do(how, tmp_path):
         case "-c":
             words = ["-c", code]
         case "a cell":
-            words = ["-c", f"import __main__\nexec(compile({code!r}, '<cell 1>', 'exec'), vars(__main__))"]
+            words = [
+                "-c",
+                f"import __main__\nexec(compile({code!r}, '<cell 1>', 'exec'), vars(__main__))",
+            ]
         case _:
             (tmp_path / "script.py").write_text(code)
             words = ["script.py"]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     said = subprocess.run(
-        [sys.executable, *words], input=given, cwd=tmp_path, env=environment, capture_output=True, text=True,
-        timeout=120,
+        [sys.executable, *words], input=given, cwd=tmp_path, env=environment, capture_output=True,
+        text=True, timeout=120,
     )  # fmt: skip
     assert said.stdout.split("\n") == ["begins", _RESULT, ""], said.stderr
     assert said.stderr == ""
@@ -112,7 +129,10 @@ def is_killed(_: int, item: int) -> int:
 @pytest.mark.slow
 def test_a_worker_that_is_killed_from_outside_is_told_of():
     """As the system does where memory is short; what was done before it comes through."""
-    with pytest.raises(WorkLost, match="a worker process was killed"), workers(2, 10, ahead=1) as pool:
+    with (
+        pytest.raises(WorkLost, match="a worker process was killed"),
+        workers(2, 10, ahead=1) as pool,
+    ):
         list(pool.map(is_killed, range(9)))
     with workers(2, 10) as pool:
         assert list(pool.map(times, [1])) == [10], "the next ones work"
@@ -133,9 +153,11 @@ with workers(2, None) as pool:
 @pytest.mark.parametrize("how", [signal.SIGKILL, *slow(signal.SIGINT, signal.SIGTERM)])
 def test_workers_end_with_the_process_that_started_them_whatever_ends_it(how):
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    run = subprocess.Popen([sys.executable, "-c", _ENDLESS], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    run = subprocess.Popen([sys.executable, "-c", _ENDLESS], stdout=subprocess.PIPE,
+                           stderr=subprocess.PIPE,
                            env=environment, text=True, start_new_session=True,
-                           preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))  # fmt: skip
+                           preexec_fn=lambda: signal.signal(signal.SIGINT,
+                                                            signal.SIG_DFL))  # fmt: skip
     assert run.stdout is not None
     children = [int(run.stdout.readline()) for _ in range(2)]
     if how == signal.SIGINT:
@@ -144,7 +166,9 @@ def test_workers_end_with_the_process_that_started_them_whatever_ends_it(how):
         run.send_signal(how)
     run.communicate(timeout=60)  # a guard against hanging, not a measure
     patience = time.monotonic() + 30
-    while (left := [child for child in children if is_alive(child)]) and time.monotonic() < patience:
+    while (
+        left := [child for child in children if is_alive(child)]
+    ) and time.monotonic() < patience:
         time.sleep(0.05)
     assert left == []
 

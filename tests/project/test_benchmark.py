@@ -14,7 +14,9 @@ SCRIPT = Path(__file__).parents[2] / "scripts" / "benchmark.py"
 
 @pytest.fixture(scope="module")
 def script():
-    """The script as a module (not called `benchmark`: a plugin of pytest has a fixture of that name)."""
+    """The script as a module (not called `benchmark`: a plugin of pytest has a fixture of that
+    name).
+    """
     spec = importlib.util.spec_from_file_location("benchmark", SCRIPT)
     assert spec is not None and spec.loader is not None
     module = sys.modules["benchmark"] = importlib.util.module_from_spec(spec)
@@ -26,27 +28,53 @@ def script():
 def test_a_long_recording_goes_back_and_forth(script):
     short = simulate(built_in_scene(frames=5))
     long = script.to_and_fro(short, 12)
-    assert [id(long[t]) for t in range(12)] == [id(short[t]) for t in (0, 1, 2, 3, 4, 4, 3, 2, 1, 0, 0, 1)]
+    assert [id(long[t]) for t in range(12)] == [
+        id(short[t]) for t in (0, 1, 2, 3, 4, 4, 3, 2, 1, 0, 0, 1)
+    ]
 
 
 @pytest.mark.slow
 def test_a_command_that_fails_is_shown_with_what_it_said(script, tmp_path):
     with pytest.raises(SystemExit, match=r"(?s)--detections here .*failed.*here"):
-        script.spend(script.HERE, ["--calibration", "no.json", "--detections", "here"], tmp_path / "out")
+        script.spend(
+            script.HERE, ["--calibration", "no.json", "--detections", "here"], tmp_path / "out"
+        )
 
 
 @pytest.mark.slow
 def test_two_commits_are_timed_alternately(script, monkeypatch, capsys, tmp_path):
     """No recording in the folder: the built-in scene is taken."""
-    git = subprocess.run(["git", "-C", str(script.HERE), "rev-parse", "HEAD"], capture_output=True, text=True)
+    git = subprocess.run(
+        ["git", "-C", str(script.HERE), "rev-parse", "HEAD"], capture_output=True, text=True
+    )
     if git.returncode != 0:
         pytest.skip("not a git checkout")
     commit = git.stdout.strip()
-    options = ["--against", commit, "--cases", "one frame", "--rounds", "1", "--data", str(tmp_path)]
+    options = [
+        "--against",
+        commit,
+        "--cases",
+        "one frame",
+        "--rounds",
+        "1",
+        "--data",
+        str(tmp_path),
+    ]
     monkeypatch.setattr(sys, "argv", ["benchmark.py", *options, "--frames", "2"])
     script.main()
     printed = capsys.readouterr().out
-    for part in ("cores", "numpy", "one frame", "here", "processor", "peak memory", "solve", "ratio"):
+    for part in (
+        "cores",
+        "numpy",
+        "one frame",
+        "here",
+        "processor",
+        "peak memory",
+        "solve",
+        "ratio",
+    ):
         assert part in printed
-    left = subprocess.run(["git", "-C", str(script.HERE), "worktree", "list"], capture_output=True, text=True)
+    left = subprocess.run(
+        ["git", "-C", str(script.HERE), "worktree", "list"], capture_output=True, text=True
+    )
     assert "against" not in left.stdout

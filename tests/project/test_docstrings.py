@@ -9,7 +9,8 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 CONTINUES = r"\s*(\([^)]*\)(,? or )?)*[,;:]?\s*(and|of|or(?! \()|so|the same|likewise)\b"
-"""Shapes, "(V,) or (N, V)" say, and the first words of a docstring that is understood only after another one."""
+"""Shapes, "(V,) or (N, V)" say, and the first words of a docstring that is understood only after
+another one."""
 
 
 def stands_alone(docstring: str) -> bool:
@@ -18,7 +19,9 @@ def stands_alone(docstring: str) -> bool:
 
 
 def continuing(text: str) -> Iterator[tuple[int, str]]:
-    """Line and text of the docstrings that continue another one, in Python code; also of constants and fields."""
+    """Line and text of the docstrings that continue another one, in Python code; also of constants
+    and fields.
+    """
     if re.search(rf"^\s*r?[\"']+{CONTINUES}", text, re.IGNORECASE | re.MULTILINE) is None:
         return  # parsing all files takes seconds
     for node in ast.walk(ast.parse(text)):
@@ -55,7 +58,13 @@ def test_docstrings_that_continue_are_noticed(docstring: str) -> None:
 
 @pytest.mark.parametrize(
     "docstring",
-    ["Offsets, s.", "(V,) or (N, V) focal lengths.", "(N,) order of rows.", "Solve.", "Sort; the same."],
+    [
+        "Offsets, s.",
+        "(V,) or (N, V) focal lengths.",
+        "(N,) order of rows.",
+        "Solve.",
+        "Sort; the same.",
+    ],
 )
 def test_other_docstrings_are_not_refused(docstring: str) -> None:
     assert stands_alone(docstring)

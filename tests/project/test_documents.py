@@ -1,4 +1,6 @@
-"""README.md, docs/using.md and docs/extending.md, typed as a reader would type them; and links that lead on."""
+"""README.md, docs/using.md and docs/extending.md, typed as a reader would type them; and links that
+lead on.
+"""
 
 import re
 import shlex
@@ -24,7 +26,9 @@ PAGES = [ROOT / "README.md", ROOT / "SECURITY.md", *sorted((ROOT / "docs").glob(
 
 def blocks(page: Path, language: str) -> list[str]:
     """The code of one language on a page."""
-    return re.findall(rf"```{language}\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    return re.findall(
+        rf"```{language}\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL
+    )
 
 
 def run(*pages: Path) -> dict:
@@ -41,10 +45,16 @@ def association_text(recording: Recording, view: int, image_size: tuple[int, int
     last = np.array(image_size) - 1.0
     lines = [f"4 {len(recording)}"]
     for frame in recording:
-        rows = [np.flatnonzero((frame.view == view) & (frame.joint == joint)) for joint in range(25)]
+        rows = [
+            np.flatnonzero((frame.view == view) & (frame.joint == joint)) for joint in range(25)
+        ]
         for row in rows:
             columns = (*(frame.xy[row] / last).T, frame.confidence[row])
-            lines.append(" ".join([str(len(row)), *(f"{value:.6f}" for column in columns for value in column)]))
+            lines.append(
+                " ".join(
+                    [str(len(row)), *(f"{value:.6f}" for column in columns for value in column)]
+                )
+            )
         lines += [matrix_text(frame, rows[first], rows[second]) for first, second in BODY_25.limbs]
     return "\n".join(lines) + "\n"
 
@@ -58,7 +68,9 @@ def matrix_text(frame: Detections, first: np.ndarray, second: np.ndarray) -> str
 
 @pytest.fixture
 def recording(tmp_path, monkeypatch) -> Scene:
-    """A reader's folder with calibration.json, detections/ of six frames of the scene, and settings.toml."""
+    """A reader's folder with calibration.json, detections/ of six frames of the scene, and
+    settings.toml.
+    """
     monkeypatch.chdir(tmp_path)
     (tmp_path / "settings.toml").write_text(toml_text(PipelineConfig()))
     scene = built_in_scene(frames=6)
@@ -85,7 +97,9 @@ def test_readme_and_using_in_python(recording, tmp_path):
     assert sorted(apart.argmin(axis=1).tolist()) == [0, 1, 2, 3]
     assert apart.min(axis=1).max() < 0.05
     assert wrists_apart(names["people"]) < wrists_apart(saved) - 0.1
-    assert np.unique(names["part"].frame).tolist() == [0, 1, 2, 3] and names["part"].run["cuts"] == [2]
+    assert np.unique(names["part"].frame).tolist() == [0, 1, 2, 3] and names["part"].run[
+        "cuts"
+    ] == [2]
 
 
 def wrists_apart(people: Reconstruction) -> float:
@@ -96,14 +110,20 @@ def wrists_apart(people: Reconstruction) -> float:
 
 @pytest.mark.slow
 def test_readme_in_the_shell(recording, tmp_path, capsys):
-    lines = [line.split("  #")[0] for block in blocks(ROOT / "README.md", "bash") for line in block.splitlines()]
+    lines = [
+        line.split("  #")[0]
+        for block in blocks(ROOT / "README.md", "bash")
+        for line in block.splitlines()
+    ]
     commands = [line for line in lines if line.startswith("shapepose-fg") and "SMPL" not in line]
     assert [command.split()[1] for command in commands] == ["reconstruct", "export"]
     for command in commands:
         with pytest.raises(SystemExit) as end:
             main(shlex.split(command)[1:])
         assert end.value.code == 0
-    assert joint_metrics(Reconstruction.load(tmp_path / "results"), recording.keypoints).everyone_once
+    assert joint_metrics(
+        Reconstruction.load(tmp_path / "results"), recording.keypoints
+    ).everyone_once
     kinds = {path.suffix for path in (tmp_path / "results" / "export").iterdir()}
     assert kinds == {".npz", ".trc", ".c3d", ".bvh", ".glb", ".csv", ".parquet"}
 
@@ -134,14 +154,19 @@ def test_extending(tmp_path, monkeypatch):
     for each in ("standing", "people"):
         after = np.quantile(steps(names[each], names["FEET"]), [0.2, 0.9])
         assert after[0] < 0.5 * before[0] and after[1] > 0.9 * before[1]
-        assert joint_metrics(names[each], truth).mpjpe_mm < 1.05 * joint_metrics(names["loose"], truth).mpjpe_mm
+        assert (
+            joint_metrics(names[each], truth).mpjpe_mm
+            < 1.05 * joint_metrics(names["loose"], truth).mpjpe_mm
+        )
     # The model of motion: as near to the truth as the one that ships, and not the same.
     by_default, damped = (joint_metrics(names[each], truth) for each in ("people", "damped"))
     assert damped.everyone_once and damped.mpjpe_mm < 1.1 * by_default.mpjpe_mm
     assert np.abs(names["damped"].velocity - names["people"].velocity).max() > 1e-3
     # The detector: perfect but for feet, which it does not have; the rest within its sigma of 2 cm.
     assert joint_metrics(names["from_perfect"], truth).everyone_once
-    from_coco = joint_metrics([names["from_perfect"].at(t).joints[:, :19] for t in range(6)], truth[:, :, :19])
+    from_coco = joint_metrics(
+        [names["from_perfect"].at(t).joints[:, :19] for t in range(6)], truth[:, :, :19]
+    )
     assert from_coco.mpjpe_mm < 5
     # The body: children are small, so betas strain towards tall.
     assert names["as_children"].betas[:, 0].mean() > names["people"].betas[:, 0].mean() + 3
@@ -159,7 +184,9 @@ def test_links_lead_to_files_and_headings(page):
     missing = []
     for target, heading in links:
         there = page.parent / target if target != "" else page
-        if "://" not in target and (not there.exists() or (heading != "" and heading not in headings(there))):
+        if "://" not in target and (
+            not there.exists() or (heading != "" and heading not in headings(there))
+        ):
             missing.append(f"{target}#{heading}")
     assert missing == []
 
@@ -174,7 +201,9 @@ def headings(page: Path) -> list[str]:
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_files_that_are_named_exist(page):
     """Names in backticks such as `body/fitter.py` are the ends of paths in the repository."""
-    named = set(re.findall(r"`((?:[\w.]+/)*\w+\.(?:py|md|toml))`", page.read_text(encoding="utf-8")))
+    named = set(
+        re.findall(r"`((?:[\w.]+/)*\w+\.(?:py|md|toml))`", page.read_text(encoding="utf-8"))
+    )
     folders = (ROOT / name for name in ("shapepose_fg", "factors", "scripts", "tests", "docs"))
     there = [f"/{path.relative_to(ROOT)}" for folder in folders for path in folder.rglob("*.*")]
     missing = {name for name in named if not any(path.endswith(f"/{name}") for path in there)}

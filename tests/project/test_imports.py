@@ -61,8 +61,9 @@ LEVELS = (
     "cli.pictures cli.found_cameras cli.setup_table",
     "cli.reconstruct",
     "cli.batch",
-    "cli.demo cli.tracks cli.detect cli.overlay cli.export cli.report cli.view cli.setup cli.simulate"
-    " cli.train_fitter cli.batch.command cli.refine cli.synchronise cli.live cli.calibrate cli.explain",
+    "cli.demo cli.tracks cli.detect cli.overlay cli.export cli.report cli.view cli.setup "
+    "cli.simulate cli.train_fitter cli.batch.command cli.refine cli.synchronise cli.live "
+    "cli.calibrate cli.explain",
     "cli.compile",
     "cli.main",
     "__main__",
@@ -81,7 +82,9 @@ def modules(package: str) -> Iterator[tuple[str, ast.Module]]:
 
 @cache
 def imports(tree: ast.AST) -> set[str]:
-    """Names of all modules that are imported anywhere in a file, those inside functions included."""
+    """Names of all modules that are imported anywhere in a file, those inside functions
+    included.
+    """
     found = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -101,7 +104,9 @@ def imports(tree: ast.AST) -> set[str]:
 
 
 def imported_on_import(tree: ast.Module) -> set[str]:
-    """Modules that importing the file imports: not those in functions, nor those for the type checker alone."""
+    """Modules that importing the file imports: not those in functions, nor those for the type
+    checker alone.
+    """
     waiting, found = list(tree.body), set()
     while waiting:
         node = waiting.pop()
@@ -110,12 +115,16 @@ def imported_on_import(tree: ast.Module) -> set[str]:
         elif isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING"):
             waiting += node.orelse
         elif isinstance(node, ast.If | ast.Try | ast.With):
-            waiting += [child for child in ast.iter_child_nodes(node) if isinstance(child, ast.stmt)]
+            waiting += [
+                child for child in ast.iter_child_nodes(node) if isinstance(child, ast.stmt)
+            ]
     return found
 
 
 def room(module: str) -> str:
-    """The name in `LEVELS` that a module belongs to: `body.model` for shapepose_fg.body.model.rotation."""
+    """The name in `LEVELS` that a module belongs to: `body.model` for
+    shapepose_fg.body.model.rotation.
+    """
     first, *rest = module.split(".")
     if first != "shapepose_fg" or len(rest) == 0:
         return first
@@ -146,7 +155,9 @@ def check_levels(module: str, tree: ast.Module) -> None:
     here = room(module)
     assert here in LEVEL_OF, f"{module} is new: give it a place in LEVELS"
     for other in ours(imports(tree)):
-        assert other != "shapepose_fg", f"{module}: import from the module itself, not from the package's front"
+        assert other != "shapepose_fg", (
+            f"{module}: import from the module itself, not from the package's front"
+        )
         if room(other) != here:
             assert LEVEL_OF[room(other)] < LEVEL_OF[here], f"{module} must not import {other}"
 
@@ -176,7 +187,8 @@ def test_torch_is_imported_for_training_only(library):
 
 
 NOT_UNIQUE = {"eig", "eigh", "svd", "qr", "schur", "multivariate_normal"}
-"""Functions whose vectors have signs, and bases of repeated values, that the processor's kernels choose."""
+"""Functions whose vectors have signs, and bases of repeated values, that the processor's kernels
+choose."""
 WITHOUT_CHOICE = {
     "shapepose_fg.core.decompositions": "removes it",
     "factors.camera_of": "gives signs: depth and focal lengths are positive",
@@ -185,8 +197,8 @@ WITHOUT_CHOICE = {
 
 
 def test_what_a_processor_may_choose_is_left_to_none(library):
-    """Signs of eigenvectors (use `core.decompositions`) and the order of equal values (sort stably): a seed would
-    give another recording on another processor.
+    """Signs of eigenvectors (use `core.decompositions`) and the order of equal values (sort
+    stably): a seed would give another recording on another processor.
     """
     users = set()
     for module, tree in [*library.items(), *modules("factors"), *modules("scripts")]:
@@ -197,13 +209,17 @@ def test_what_a_processor_may_choose_is_left_to_none(library):
                 users.add(module)
             if node.func.attr in ("argsort", "argpartition"):
                 kinds = [ast.unparse(each.value) for each in node.keywords if each.arg == "kind"]
-                assert kinds == ["'stable'"], f"{module}, line {node.lineno}: give argsort kind='stable'"
+                assert kinds == ["'stable'"], (
+                    f"{module}, line {node.lineno}: give argsort kind='stable'"
+                )
     assert users == set(WITHOUT_CHOICE)
 
 
 LIGHT = {
     "the package": "import shapepose_fg; dir(shapepose_fg)",
-    "readers": "from shapepose_fg import InputError, Reconstruction, read_detections, read_rig, write_rig",
+    "readers": (
+        "from shapepose_fg import InputError, Reconstruction, read_detections, read_rig, write_rig"
+    ),
     "stage I": "import shapepose_fg.proposal.association",
     "stage II": "import shapepose_fg.pipeline.solve_window",
     "fits": "from shapepose_fg.body.fitting.fitters import make_fitter; make_fitter()",
@@ -220,7 +236,8 @@ LIGHT = {
 def test_nothing_of_this_loads_torch():
     """One after the other, in one process."""
     lines = [
-        f"{code}\nassert 'torch' not in sys.modules, 'torch was loaded by {name}'" for name, code in LIGHT.items()
+        f"{code}\nassert 'torch' not in sys.modules, 'torch was loaded by {name}'"
+        for name, code in LIGHT.items()
     ]
     run = [sys.executable, "-c", "\n".join(["import sys", *lines])]
     done = subprocess.run(run, capture_output=True, text=True, timeout=120, cwd=ROOT)
@@ -230,7 +247,9 @@ def test_nothing_of_this_loads_torch():
 @pytest.mark.slow
 def test_reconstruct_loads_only_what_every_run_needs():
     code = "import sys\nimport shapepose_fg.cli.reconstruct.run\nprint(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, cwd=ROOT)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, cwd=ROOT
+    )
     loaded = set(done.stdout.split())
     assert {"numpy", "gtsam", "numba"} <= loaded, done.stderr
     assert not loaded & {"torch", "matplotlib", "distributed", "jinja2", "rerun", "PIL"}
@@ -242,7 +261,9 @@ def test_reconstruct_loads_only_what_every_run_needs():
 def test_the_package_s_front_offers_what_it_names():
     import shapepose_fg
 
-    assert {"read_rig", "read_detections", "reconstruct", "Reconstruction"} <= set(dir(shapepose_fg))
+    assert {"read_rig", "read_detections", "reconstruct", "Reconstruction"} <= set(
+        dir(shapepose_fg)
+    )
     for name in ("read_rig", "InputError", "Reconstruction"):
         assert getattr(shapepose_fg, name).__name__ == name
     with pytest.raises(AttributeError, match="no attribute 'no_such_thing'"):

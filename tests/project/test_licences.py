@@ -1,4 +1,6 @@
-"""docs/licences.md names everything that is installed, and every module that is imported is asked for."""
+"""docs/licences.md names everything that is installed, and every module that is imported is asked
+for.
+"""
 
 import ast
 import importlib.util
@@ -28,13 +30,20 @@ def test_every_dependency_and_its_licence_is_listed():
     rows = {name: licence for licence, names in lines for name in names.split(", ")}
     installed = licences.needed(licences.EXTRAS)  # of those, what is installed here
     assert {"numpy", "gtsam"} <= installed.keys()
-    # What only other systems, builds of torch, versions of onnxruntime or extras need may be missing.
+    # What only other systems, builds of torch, versions of onnxruntime or extras need may be
+    # missing.
     others = ("nvidia", "triton", "coloredlogs", "humanfriendly")
     missing = {name for name in installed if name not in rows and not name.startswith(others)}
     assert missing == set(), "run scripts/licences.py"
     # Other versions may spell their licence otherwise.
-    pins = re.findall(r"^(\S+)==(\S+)$", (ROOT / "constraints.txt").read_text(encoding="utf-8"), re.MULTILINE)
-    if all(installed[name].version.partition("+")[0] == version for name, version in pins if name in installed):
+    pins = re.findall(
+        r"^(\S+)==(\S+)$", (ROOT / "constraints.txt").read_text(encoding="utf-8"), re.MULTILINE
+    )
+    if all(
+        installed[name].version.partition("+")[0] == version
+        for name, version in pins
+        if name in installed
+    ):
         for name in rows.keys() & installed.keys():
             assert rows[name] == licences.licence(installed[name]), "run scripts/licences.py"
     assert not any(re.search(r"\bA?GPL", text) for text in rows.values())
@@ -53,7 +62,9 @@ def test_what_is_imported_is_asked_for():
             names = [each.name for each in node.names] if isinstance(node, ast.Import) else []
             names += [node.module] if isinstance(node, ast.ImportFrom) and node.module else []
             for name in (
-                {each.split(".")[0] for each in names} - {"shapepose_fg", "factors"} - sys.stdlib_module_names
+                {each.split(".")[0] for each in names}
+                - {"shapepose_fg", "factors"}
+                - sys.stdlib_module_names
             ):
                 distributions = {each.lower() for each in whose.get(name, [])}
                 assert not distributions or distributions & asked, f"{path}: {name}"

@@ -18,12 +18,16 @@ UP = np.array([0.0, 0.0, 1.0])
 HIP, WRIST, KNEE = (BODY_25.index(name) for name in ("MidHip", "RWrist", "LKnee"))
 
 
-def observe(detections: Detections, rig: Rig, truth: NDArray[np.float64], **settings) -> Observations:
+def observe(
+    detections: Detections, rig: Rig, truth: NDArray[np.float64], **settings
+) -> Observations:
     """Stage I, its people put into the order of the truth (each true person found exactly once)."""
     config = CandidateConfig()
     candidates = vote(triangulate_pairs(detections, rig, config), detections, len(rig), config)
     proposals = propose(candidates, detections, BODY_25, UP, ProposalConfig())
-    found, _ = associate(proposals, candidates, detections, rig, BODY_25, ProposalConfig(**settings))
+    found, _ = associate(
+        proposals, candidates, detections, rig, BODY_25, ProposalConfig(**settings)
+    )
     if len(truth) == 0:
         return found
     distance = np.nanmean(np.linalg.norm(found.initial[:, None] - truth[None], axis=-1), axis=-1)
@@ -33,9 +37,13 @@ def observe(detections: Detections, rig: Rig, truth: NDArray[np.float64], **sett
 
 
 def owners_of(detections: Detections, rig: Rig, truth: NDArray[np.float64]) -> NDArray[np.intp]:
-    """(P, J, V) the detection that lies exactly on each joint's projection; -1 where there is none."""
+    """(P, J, V) the detection that lies exactly on each joint's projection; -1 where there is
+    none.
+    """
     xy, _ = rig.project(truth)
-    distance = np.linalg.norm(xy[detections.view, :, detections.joint] - detections.xy[:, None], axis=-1)
+    distance = np.linalg.norm(
+        xy[detections.view, :, detections.joint] - detections.xy[:, None], axis=-1
+    )
     row, person = np.nonzero(distance < 1e-6)
     owners = np.full((len(truth), len(BODY_25), len(rig)), -1)
     # Written backwards: of a detection that is listed twice, the first counts.
@@ -43,12 +51,18 @@ def owners_of(detections: Detections, rig: Rig, truth: NDArray[np.float64]) -> N
     return owners
 
 
-def assert_each_has_its_own(seen: Observations, detections: Detections, owners: NDArray[np.intp]) -> None:
-    """The observations are the very numbers of the detections; where there is none they are zero."""
+def assert_each_has_its_own(
+    seen: Observations, detections: Detections, owners: NDArray[np.intp]
+) -> None:
+    """The observations are the very numbers of the detections; where there is none they are
+    zero.
+    """
     there = owners >= 0
     np.testing.assert_array_equal(seen.seen, there)
     np.testing.assert_array_equal(seen.xy, np.where(there[..., None], detections.xy[owners], 0.0))
-    np.testing.assert_array_equal(seen.confidence, np.where(there, detections.confidence[owners], 0.0))
+    np.testing.assert_array_equal(
+        seen.confidence, np.where(there, detections.confidence[owners], 0.0)
+    )
 
 
 def add(detections: Detections, view, joint, xy, confidence: float) -> Detections:
@@ -75,7 +89,9 @@ def test_every_detection_goes_to_its_owner(five_cameras, two_people, seen_exactl
 
 
 def test_outliers_are_nobody_s(five_cameras, two_people, seen_exactly):
-    """In every view each joint has a false candidate half a metre beside the first person's true one."""
+    """In every view each joint has a false candidate half a metre beside the first person's true
+    one.
+    """
     exact = seen_exactly(five_cameras, two_people)
     xy, depth = five_cameras.project(two_people[0])
     angle = np.random.default_rng(0).uniform(0, 2 * np.pi, xy.shape[:2])
@@ -89,7 +105,9 @@ def test_outliers_are_nobody_s(five_cameras, two_people, seen_exactly):
     right = np.all(seen.xy == exact.xy[owners], axis=-1)
     # By chance a false candidate lands on the other person's joint; almost all are the own ones.
     assert (taken & right).mean() > 0.98
-    assert not (taken & ~right)[0].any(), "none of the candidates half a metre off is the first person's"
+    assert not (taken & ~right)[0].any(), (
+        "none of the candidates half a metre off is the first person's"
+    )
 
 
 def test_a_missing_view_and_a_view_without_people(five_cameras, two_people, seen_exactly):
@@ -99,11 +117,15 @@ def test_a_missing_view_and_a_view_without_people(five_cameras, two_people, seen
     detections = exact.only((exact.view != 3) & ~(first & (exact.view == 1)))
     seen = observe(detections, five_cameras, two_people)
     assert_each_has_its_own(seen, detections, owners_of(detections, five_cameras, two_people))
-    assert not seen.seen[:, :, 3].any() and not seen.seen[0, :, 1].any() and seen.seen[1, :, 1].all()
+    assert (
+        not seen.seen[:, :, 3].any() and not seen.seen[0, :, 1].any() and seen.seen[1, :, 1].all()
+    )
 
 
 def test_a_duplicate_detection_is_used_once(five_cameras, two_people, seen_exactly):
-    """The detector reports the first person's wrist twice in view 2, the second time 4 px off and unlinked."""
+    """The detector reports the first person's wrist twice in view 2, the second time 4 px off and
+    unlinked.
+    """
     exact = seen_exactly(five_cameras, two_people)
     xy, _ = five_cameras.project(two_people[0])
     detections = add(exact, [2], [WRIST], [xy[2, WRIST] + [4.0, 0.0]], 0.7)
@@ -113,8 +135,12 @@ def test_a_duplicate_detection_is_used_once(five_cameras, two_people, seen_exact
 
 @pytest.mark.parametrize("views", [1, 2])
 @pytest.mark.parametrize("joint", ["RWrist", "LKnee", "Nose"])
-def test_a_joint_that_few_views_see_is_observed_all_the_same(five_cameras, two_people, seen_exactly, views, joint):
-    """Two views are one pair of rays, which is no cluster; one view is no pair. Both must reach stage II."""
+def test_a_joint_that_few_views_see_is_observed_all_the_same(
+    five_cameras, two_people, seen_exactly, views, joint
+):
+    """Two views are one pair of rays, which is no cluster; one view is no pair. Both must reach
+    stage II.
+    """
     joint = BODY_25.index(joint)
     exact = seen_exactly(five_cameras, two_people)
     detections = exact.only((exact.joint != joint) | (exact.view < views))
@@ -122,7 +148,9 @@ def test_a_joint_that_few_views_see_is_observed_all_the_same(five_cameras, two_p
     assert seen.seen[:, joint].sum(axis=-1).tolist() == [views, views]
     owners = owners_of(detections, five_cameras, two_people)
     np.testing.assert_array_equal(seen.seen[:, joint], owners[:, joint] >= 0)
-    np.testing.assert_array_equal(seen.xy[:, joint, :views], detections.xy[owners[:, joint, :views]])
+    np.testing.assert_array_equal(
+        seen.xy[:, joint, :views], detections.xy[owners[:, joint, :views]]
+    )
     if views == 1:
         assert np.isnan(seen.initial[:, joint]).all(), "one view does not say where the joint is"
 
@@ -138,16 +166,20 @@ def test_a_lone_candidate_without_affinity_is_not_taken(five_cameras, two_people
 
 
 def behind(two_people: NDArray[np.float64], centre: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The second one stands behind the first one as seen from `centre`, knee behind knee, 0.4 to 0.5 m off."""
+    """The second one stands behind the first one as seen from `centre`, knee behind knee, 0.4 to
+    0.5 m off.
+    """
     people = two_people.copy()
     people[1] += centre + (people[0, KNEE] - centre) * 1.12 - people[1, KNEE]
     return people
 
 
 def test_where_two_people_overlap_one_detection_serves_both(five_cameras, two_people, seen_exactly):
-    """In view 0 the second one's knee lies on the line through the first one's: the detector sees one joint.
+    """In view 0 the second one's knee lies on the line through the first one's: the detector sees
+    one joint.
 
-    It is linked to both people's hips and ankles, as the part affinities of two overlapping legs are.
+    It is linked to both people's hips and ankles, as the part affinities of two overlapping legs
+    are.
     """
     people = behind(two_people, five_cameras.cameras[0].centre)
     exact = seen_exactly(five_cameras, people)
@@ -162,7 +194,9 @@ def test_where_two_people_overlap_one_detection_serves_both(five_cameras, two_pe
     assert seen.seen.all()
     np.testing.assert_array_equal(seen.xy[0, KNEE, 0], seen.xy[1, KNEE, 0])
     np.testing.assert_allclose(seen.xy[0, KNEE, 0], exact.xy[stays], atol=1e-6)
-    assert (owners[:, KNEE, 1:] >= 0).all() and not np.allclose(seen.xy[0, KNEE, 1], seen.xy[1, KNEE, 1])
+    assert (owners[:, KNEE, 1:] >= 0).all() and not np.allclose(
+        seen.xy[0, KNEE, 1], seen.xy[1, KNEE, 1]
+    )
 
 
 def test_close_people_who_do_not_overlap_share_nothing(five_cameras, two_people, seen_exactly):

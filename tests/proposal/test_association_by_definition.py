@@ -1,4 +1,6 @@
-"""Detections of proposed people on a crowded frame, against what they are defined to be, one thing at a time."""
+"""Detections of proposed people on a crowded frame, against what they are defined to be, one thing
+at a time.
+"""
 
 import numpy as np
 import pytest
@@ -9,15 +11,21 @@ from shapepose_fg.proposal.candidates import CandidateConfig, triangulate_pairs,
 from shapepose_fg.proposal.proposals import ProposalConfig, Proposals, propose
 
 CORE = list(BODY_25.core)
-NEIGHBOURS = [{j for limb in BODY_25.limbs if joint in limb for j in limb if j != joint} for joint in range(25)]
+NEIGHBOURS = [
+    {j for limb in BODY_25.limbs if joint in limb for j in limb if j != joint}
+    for joint in range(25)
+]
 TREE = [
-    {BODY_25.parents[joint], *(j for j in range(25) if BODY_25.parents[j] == joint)} - {-1} for joint in range(25)
+    {BODY_25.parents[joint], *(j for j in range(25) if BODY_25.parents[j] == joint)} - {-1}
+    for joint in range(25)
 ]
 
 
 def owned(chosen: np.ndarray, count: int) -> np.ndarray:
     """(P, D) whether a detection is one of a person's `chosen` (P, J, V)."""
-    return np.array([np.isin(np.arange(count), each[each >= 0]) for each in chosen]).reshape(len(chosen), count)
+    return np.array([np.isin(np.arange(count), each[each >= 0]) for each in chosen]).reshape(
+        len(chosen), count
+    )
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +45,10 @@ def proposed(crowded, five_cameras):
 def chosen_for(places, owns, crowded, rig) -> np.ndarray:
     """(P, J, V) by nearness to the projected joints and mean affinity to what each person owns."""
     xy, depth = rig.project(places)
-    listed = {tuple(pair): value for pair, value in zip(crowded.pairs.tolist(), crowded.affinity, strict=True)}
+    listed = {
+        tuple(pair): value
+        for pair, value in zip(crowded.pairs.tolist(), crowded.affinity, strict=True)
+    }
     chosen = np.full((len(places), 25, len(rig)), -1)
     offers, shared = [], []
     for person, row in np.ndindex(len(places), len(crowded)):
@@ -81,14 +92,20 @@ def chosen_for(places, owns, crowded, rig) -> np.ndarray:
 
 
 @pytest.mark.parametrize("least", [0.0, 0.35, 0.9])
-def test_observations_are_chosen_again_until_nobody_more_is_dropped(least, proposed, crowded, five_cameras):
-    """First by what supports the candidates, then twice by what was chosen; what the dropped had is free."""
+def test_observations_are_chosen_again_until_nobody_more_is_dropped(
+    least, proposed, crowded, five_cameras
+):
+    """First by what supports the candidates, then twice by what was chosen; what the dropped had is
+    free.
+    """
     proposals, candidates = proposed
     owns = np.zeros((len(proposals), len(crowded)), dtype=bool)
     for person, joints in enumerate(proposals.candidate.tolist()):
         for candidate, row in candidates.support.tolist():
             owns[person, row] |= candidate in joints
-    np.testing.assert_array_equal(owned(by_support(proposals, candidates, crowded, 5), len(crowded)), owns)
+    np.testing.assert_array_equal(
+        owned(by_support(proposals, candidates, crowded, 5), len(crowded)), owns
+    )
     left, rounds, chosen = np.arange(len(proposals)), 3, np.zeros((0, 25, 5), dtype=int)
     while rounds > 0:
         chosen = chosen_for(proposals.places[left], owns, crowded, five_cameras)
@@ -104,4 +121,6 @@ def test_observations_are_chosen_again_until_nobody_more_is_dropped(least, propo
     assert dropped > 0 or least < 0.9
     if least == 0:
         unplaced = np.isnan(proposals.places[..., 0])
-        assert (found.candidate[unplaced] >= 0).sum() > 10, "joints without a place are found by their affinities"
+        assert (found.candidate[unplaced] >= 0).sum() > 10, (
+            "joints without a place are found by their affinities"
+        )

@@ -11,7 +11,13 @@ import pytest
 from numpy.typing import NDArray
 
 from shapepose_fg.core.skeleton import BODY_25, Skeleton
-from shapepose_fg.proposal.candidates import CandidateConfig, Candidates, PairPoints, triangulate_pairs, vote
+from shapepose_fg.proposal.candidates import (
+    CandidateConfig,
+    Candidates,
+    PairPoints,
+    triangulate_pairs,
+    vote,
+)
 from shapepose_fg.proposal.growth import GrowthConfig, Links, grow, link
 from shapepose_fg.proposal.nearby import LEAST_AFFINITY, Nearby, Sight, own_affinity
 from shapepose_fg.proposal.proposals import ProposalConfig, Search, standing_apart
@@ -40,13 +46,18 @@ def links(candidates, crowded) -> Links:
 
 @pytest.mark.slow
 def test_points_are_the_pairs_whose_rays_meet(points, crowded, five_cameras):
-    """Least squares of x P_3 - P_1 and y P_3 - P_2; kept within 7 cm of both, in front, 3 degrees apart."""
+    """Least squares of x P_3 - P_1 and y P_3 - P_2; kept within 7 cm of both, in front, 3 degrees
+    apart.
+    """
     normalised = five_cameras.normalise(crowded.view, crowded.xy)
     found = {tuple(sorted(pair)): n for n, pair in enumerate(points.pair.tolist())}
     assert len(found) == len(points.xyz)
     kept = 0
     for first, second in combinations(range(len(crowded)), 2):
-        if crowded.joint[first] != crowded.joint[second] or crowded.view[first] == crowded.view[second]:
+        if (
+            crowded.joint[first] != crowded.joint[second]
+            or crowded.view[first] == crowded.view[second]
+        ):
             continue
         P = five_cameras.cTw[crowded.view[[first, second]]]
         rows = [
@@ -58,7 +69,9 @@ def test_points_are_the_pairs_whose_rays_meet(points, crowded, five_cameras):
         xyz = np.linalg.lstsq(A[:, :3], -A[:, 3], rcond=None)[0]
         at = P[:, :, :3] @ xyz + P[:, :, 3]
         error = np.linalg.norm(at[:, :2] - normalised[[first, second]] * at[:, 2:], axis=1).max()
-        rays = np.einsum("vji,vj->vi", P[:, :, :3], np.column_stack([normalised[[first, second]], np.ones(2)]))
+        rays = np.einsum(
+            "vji,vj->vi", P[:, :, :3], np.column_stack([normalised[[first, second]], np.ones(2)])
+        )
         cosine = rays[0] @ rays[1] / np.prod(np.linalg.norm(rays, axis=1))
         angle = math.degrees(math.acos(min(1.0, abs(cosine))))
         fits = error < GATE_M and (at[:, 2] > 0).all() and angle > ANGLE_DEG
@@ -75,7 +88,9 @@ def test_points_are_the_pairs_whose_rays_meet(points, crowded, five_cameras):
 
 
 def voted(points: PairPoints, crowded, radius_m: float, needed: int, power: int) -> list[tuple]:
-    """The paper's loop; centre, score, votes, strong, and the detections of each cluster that is kept."""
+    """The paper's loop; centre, score, votes, strong, and the detections of each cluster that is
+    kept.
+    """
     seed = np.full(len(points.xyz), -1)
     for pick in np.argsort(-points.score, kind="stable"):
         if seed[pick] < 0:
@@ -89,12 +104,17 @@ def voted(points: PairPoints, crowded, radius_m: float, needed: int, power: int)
         best: dict[int, int] = {}
         for row in count:
             rival = best.get(int(crowded.view[row]))
-            if rival is None or (count[row], crowded.confidence[row]) > (count[rival], crowded.confidence[rival]):
+            if rival is None or (count[row], crowded.confidence[row]) > (
+                count[rival],
+                crowded.confidence[rival],
+            ):
                 best[int(crowded.view[row])] = row
         support = sorted(best.values(), key=lambda row: int(crowded.view[row]))
         centre = (weight[:, None] * points.xyz[members]).sum(axis=0) / weight.sum()
         score = crowded.confidence[support].mean()
-        clusters.append((centre, points.joint[each], score, len(members), len(members) >= needed, support))
+        clusters.append(
+            (centre, points.joint[each], score, len(members), len(members) >= needed, support)
+        )
     explained = {row for *_, strong, support in clusters if strong for row in support}
     return [each for each in clusters if each[4] or not set(each[5]) <= explained]
 
@@ -109,13 +129,19 @@ def test_candidates_are_the_clusters_of_the_papers_loop(points, crowded, weighte
     assert len(candidates) == len(expected) > 100
     for n, (centre, joint, score, votes, strong, support) in enumerate(expected):
         np.testing.assert_allclose(candidates.xyz[n], centre, atol=1e-9)
-        assert (candidates.joint[n], candidates.votes[n], candidates.strong[n]) == (joint, votes, strong)
+        assert (candidates.joint[n], candidates.votes[n], candidates.strong[n]) == (
+            joint,
+            votes,
+            strong,
+        )
         assert candidates.score[n] == pytest.approx(score)
         rows = candidates.support[candidates.support[:, 0] == n, 1]
         assert sorted(rows.tolist(), key=lambda row: int(crowded.view[row])) == support
     if views == 5:
         assert 10 < (~candidates.strong).sum() < len(candidates) - 10
-    strong_only = vote(points, crowded, views, CandidateConfig(weighted_centre=weighted, weak=False))
+    strong_only = vote(
+        points, crowded, views, CandidateConfig(weighted_centre=weighted, weak=False)
+    )
     np.testing.assert_allclose(strong_only.xyz, candidates.xyz[candidates.strong])
 
 
@@ -124,10 +150,13 @@ def test_links_are_the_affinities_of_all_pairs_of_supporting_detections(links, c
     for candidate, row in candidates.support.tolist():
         made_of[row].append(candidate)
     views = [
-        set(crowded.view[candidates.support[candidates.support[:, 0] == n, 1]]) for n in range(len(candidates))
+        set(crowded.view[candidates.support[candidates.support[:, 0] == n, 1]])
+        for n in range(len(candidates))
     ]
     total: dict[tuple[int, int], float] = defaultdict(float)
-    for (head, tail), affinity in zip(crowded.pairs.tolist(), crowded.affinity.tolist(), strict=True):
+    for (head, tail), affinity in zip(
+        crowded.pairs.tolist(), crowded.affinity.tolist(), strict=True
+    ):
         for first in made_of[head]:
             for second in made_of[tail]:
                 total[first, second] += affinity
@@ -136,17 +165,26 @@ def test_links_are_the_affinities_of_all_pairs_of_supporting_detections(links, c
         for ends, value in total.items()
         if np.linalg.norm(candidates.xyz[ends[0]] - candidates.xyz[ends[1]]) < 0.75
     }
-    found = {tuple(ends): score for ends, score in zip(links.ends.tolist(), links.score.tolist(), strict=True)}
+    found = {
+        tuple(ends): score
+        for ends, score in zip(links.ends.tolist(), links.score.tolist(), strict=True)
+    }
     assert len(found) == len(links.ends) > 500
     assert found == pytest.approx(expected)
 
 
-def grown(anchors, candidates: Candidates, links: Links, config: SimpleNamespace) -> NDArray[np.intp]:
-    """Outwards from the hip joint by joint level, then all joints again `sweeps` times, then beyond gaps."""
+def grown(
+    anchors, candidates: Candidates, links: Links, config: SimpleNamespace
+) -> NDArray[np.intp]:
+    """Outwards from the hip joint by joint level, then all joints again `sweeps` times, then beyond
+    gaps.
+    """
     depth, parent = {BODY_25.root: 0}, dict(enumerate(BODY_25.parents))
     for level in range(1, 25):
         depth |= {
-            joint: level for joint, up in parent.items() if depth.get(up) == level - 1 and joint not in depth
+            joint: level
+            for joint, up in parent.items()
+            if depth.get(up) == level - 1 and joint not in depth
         }
     evidence = [
         config.view_weight * candidates.score[n] * (candidates.support[:, 0] == n).sum()
@@ -165,7 +203,9 @@ def grown(anchors, candidates: Candidates, links: Links, config: SimpleNamespace
         return found
 
     def best_first(offers: list[tuple[float, int, int]]) -> bool:
-        """Give candidates to people: the best offer first, each candidate to one and each joint once."""
+        """Give candidates to people: the best offer first, each candidate to one and each joint
+        once.
+        """
         taken, filled = set(), set()
         for _, who, n in sorted(offers, key=lambda offer: -offer[0]):
             joint = int(candidates.joint[n])
@@ -203,7 +243,9 @@ def grown(anchors, candidates: Candidates, links: Links, config: SimpleNamespace
                 if linked[who].get(n, 0.0) > 0:
                     offers.append((linked[who][n] + evidence[n], who, n))
                 elif (
-                    config.bridge_m > 0 and candidates.strong[n] and all(each.get(n, 0.0) <= 0 for each in linked)
+                    config.bridge_m > 0
+                    and candidates.strong[n]
+                    and all(each.get(n, 0.0) <= 0 for each in linked)
                 ):
                     bones, up = 1, parent[joint]
                     while up not in person:
@@ -230,7 +272,9 @@ def test_people_are_grown_level_by_level_then_all_at_once(settings, candidates, 
     hips = np.flatnonzero((candidates.joint == BODY_25.root) & candidates.strong)
     assert len(hips) >= 4
     expected = grown(hips, candidates, links, SimpleNamespace(**GROWTH | settings))
-    np.testing.assert_array_equal(grow(hips, candidates, links, BODY_25, GrowthConfig(**settings)), expected)
+    np.testing.assert_array_equal(
+        grow(hips, candidates, links, BODY_25, GrowthConfig(**settings)), expected
+    )
 
 
 def test_only_what_hangs_on_the_person_is_grown():
@@ -238,7 +282,12 @@ def test_only_what_hangs_on_the_person_is_grown():
     hip, elbow, wrist = (BODY_25.index(name) for name in ("MidHip", "RElbow", "RWrist"))
     none = np.zeros((0, 2), dtype=np.intp)
     three = Candidates(
-        np.zeros((3, 3)), np.array([hip, wrist, elbow]), np.ones(3), np.full(3, 9), np.ones(3, dtype=bool), none
+        np.zeros((3, 3)),
+        np.array([hip, wrist, elbow]),
+        np.ones(3),
+        np.full(3, 9),
+        np.ones(3, dtype=bool),
+        none,
     )
     forearm = Links(np.array([[2, 1]]), np.array([3.0]))
     chosen = grow(np.array([0]), three, forearm, BODY_25, GrowthConfig(bridge_m=0.0))
@@ -246,35 +295,54 @@ def test_only_what_hangs_on_the_person_is_grown():
 
 
 @pytest.mark.parametrize(("height_m", "taken"), [(0.6, True), (0.2, False)])
-def test_a_bridge_begins_at_the_nearest_joint_that_is_known_the_first_candidate_too(height_m, taken):
-    """From the neck, the first of all candidates, an elbow is two bones of 0.55 m away; from the hip it would be
-    three.
+def test_a_bridge_begins_at_the_nearest_joint_that_is_known_the_first_candidate_too(
+    height_m, taken
+):
+    """From the neck, the first of all candidates, an elbow is two bones of 0.55 m away; from the
+    hip it would be three.
     """
     neck, hip, elbow = (BODY_25.index(name) for name in ("Neck", "MidHip", "RElbow"))
     places = np.array([[0.0, 0.0, 1.5], [0.0, 0.0, 1.0], [0.0, 0.0, height_m]])
     none = np.zeros((0, 2), dtype=np.intp)
     three = Candidates(
-        places, np.array([neck, hip, elbow]), np.ones(3), np.full(3, 9), np.ones(3, dtype=bool), none
+        places,
+        np.array([neck, hip, elbow]),
+        np.ones(3),
+        np.full(3, 9),
+        np.ones(3, dtype=bool),
+        none,
     )
-    chosen = grow(np.array([1]), three, Links(np.array([[1, 0]]), np.array([3.0])), BODY_25, GrowthConfig())
+    chosen = grow(
+        np.array([1]), three, Links(np.array([[1, 0]]), np.array([3.0])), BODY_25, GrowthConfig()
+    )
     assert chosen[0, [neck, hip]].tolist() == [0, 1] and (chosen[0, elbow] == 2) == taken
 
 
 def test_the_settings_of_growth_make_a_difference_here(candidates, links):
-    """Or the test above would say little: views, sweeps and bridges each change somebody's joints."""
+    """Or the test above would say little: views, sweeps and bridges each change somebody's
+    joints.
+    """
     hips = np.flatnonzero(candidates.joint == BODY_25.root)
     plain = grow(hips, candidates, links, BODY_25, GrowthConfig())
-    for other in (GrowthConfig(sweeps=0), GrowthConfig(view_weight=0.0), GrowthConfig(bridge_m=0.0)):
+    for other in (
+        GrowthConfig(sweeps=0),
+        GrowthConfig(view_weight=0.0),
+        GrowthConfig(bridge_m=0.0),
+    ):
         assert (grow(hips, candidates, links, BODY_25, other) != plain).any(), other
 
 
 def test_an_overlap_serves_only_joints_that_have_nothing_of_their_own():
-    """Two noses in one view: who has the first of all detections keeps it, who has none gets the nearer one."""
+    """Two noses in one view: who has the first of all detections keeps it, who has none gets the
+    nearer one.
+    """
     nose = BODY_25.index("Nose")
     chosen = np.full((2, 25, 1), -1, dtype=np.intp)
     chosen[0, nose, 0] = 0
     first = np.where(np.arange(26) > nose, 4, 0)
-    near = Nearby(first, np.array([0, 0, 1, 1]), np.array([0, 1, 0, 1]), np.array([0.03, 0.01, 0.02, 0.024]))
+    near = Nearby(
+        first, np.array([0, 0, 1, 1]), np.array([0, 1, 0, 1]), np.array([0.03, 0.01, 0.02, 0.024])
+    )
     near.share(np.full(4, LEAST_AFFINITY), chosen)
     assert chosen[:, nose, 0].tolist() == [0, 0]
     chosen[1] = -1
@@ -283,7 +351,9 @@ def test_an_overlap_serves_only_joints_that_have_nothing_of_their_own():
     assert chosen[:, nose, 0].tolist() == [0, 1] and (np.delete(chosen, nose, axis=1) == -1).all()
 
 
-def test_mean_affinity_is_over_the_neighbours_that_the_person_owns_in_that_view(crowded, five_cameras):
+def test_mean_affinity_is_over_the_neighbours_that_the_person_owns_in_that_view(
+    crowded, five_cameras
+):
     """A pair that is not listed counts 0; without a neighbour there is none, and the mean is 0."""
     rng = np.random.default_rng(0)
     own, owns = np.full((3, 25, 5), -1), np.zeros((3, len(crowded)), dtype=bool)
@@ -293,7 +363,10 @@ def test_mean_affinity_is_over_the_neighbours_that_the_person_owns_in_that_view(
     sight = Sight.of(crowded, five_cameras, BODY_25)
     every = [np.ascontiguousarray(index.ravel()) for index in np.indices(owns.shape)]
     affinity, neighbours = (each.reshape(owns.shape) for each in own_affinity(*every, own, sight))
-    listed = {tuple(pair): value for pair, value in zip(crowded.pairs.tolist(), crowded.affinity, strict=True)}
+    listed = {
+        tuple(pair): value
+        for pair, value in zip(crowded.pairs.tolist(), crowded.affinity, strict=True)
+    }
     for person, row in zip(*(index.ravel() for index in np.indices(owns.shape)), strict=True):
         total, there = 0.0, set()
         for other in np.flatnonzero(owns[person] & (crowded.view == crowded.view[row])).tolist():
@@ -306,13 +379,21 @@ def test_mean_affinity_is_over_the_neighbours_that_the_person_owns_in_that_view(
 
 
 def boxes(roots, candidates: Candidates, config: SimpleNamespace) -> list[tuple[float, float]]:
-    """Share of core joints with a candidate in each root's box, and the mean confidence of the best of each."""
+    """Share of core joints with a candidate in each root's box, and the mean confidence of the best
+    of each.
+    """
     found = []
     for root in roots:
         best: dict[int, float] = {}
-        for xyz, joint, score in zip(candidates.xyz, candidates.joint.tolist(), candidates.score, strict=True):
+        for xyz, joint, score in zip(
+            candidates.xyz, candidates.joint.tolist(), candidates.score, strict=True
+        ):
             x, y, z = np.abs(xyz - candidates.xyz[root])
-            if math.hypot(x, y) < config.box_horizontal_m and z < config.box_vertical_m and joint in BODY_25.core:
+            if (
+                math.hypot(x, y) < config.box_horizontal_m
+                and z < config.box_vertical_m
+                and joint in BODY_25.core
+            ):
                 best[joint] = max(best.get(joint, 0.0), score)
         found.append((len(best) / len(BODY_25.core), sum(best.values()) / max(len(best), 1)))
     return found
@@ -320,7 +401,10 @@ def boxes(roots, candidates: Candidates, config: SimpleNamespace) -> list[tuple[
 
 def apart(anchors, taken, candidates: Candidates, crowded, config: SimpleNamespace) -> list[int]:
     """Anchors by falling confidence of their own detections, without those near a better one."""
-    made_of = {n: set(candidates.support[candidates.support[:, 0] == n, 1].tolist()) for n in [*taken, *anchors]}
+    made_of = {
+        n: set(candidates.support[candidates.support[:, 0] == n, 1].tolist())
+        for n in [*taken, *anchors]
+    }
     kept, waiting, first = [], list(anchors), list(taken)
     while True:
         if first:
@@ -345,7 +429,10 @@ def test_anchors_stand_apart_in_space_and_by_their_detections(candidates, crowde
     taken = expected[1:2]
     others = [n for n in hips.tolist() if n not in taken]
     beside = apart(others, taken, candidates, crowded, stated)
-    assert standing_apart(np.array(others), np.array(taken), candidates, crowded, config).tolist() == beside
+    assert (
+        standing_apart(np.array(others), np.array(taken), candidates, crowded, config).tolist()
+        == beside
+    )
     assert 1 <= len(expected) <= len(hips)
 
 
@@ -366,10 +453,18 @@ def test_boxes_are_as_wide_and_as_high_as_is_said(candidates, links, crowded, se
 def test_reasons_are_counted_once_for_each_anchor(candidates, links, crowded):
     """Two bounds that some of the hips miss; 1 of those that are left is looked for."""
     roots = np.flatnonzero(candidates.joint == BODY_25.root)
-    parts, score = np.array(boxes(roots, candidates, SimpleNamespace(**PROPOSALS | {"box_horizontal_m": 0.3}))).T
+    parts, score = np.array(
+        boxes(roots, candidates, SimpleNamespace(**PROPOSALS | {"box_horizontal_m": 0.3}))
+    ).T
     least, doubt = np.median(parts), np.median(score)
     here = search(
-        candidates, links, crowded, box_horizontal_m=0.3, min_parts=least, min_confidence=doubt, most_people=1
+        candidates,
+        links,
+        crowded,
+        box_horizontal_m=0.3,
+        min_parts=least,
+        min_confidence=doubt,
+        most_people=1,
     )
     kept = here.anchors(roots, roots[:0])
     good = roots[(parts >= least) & (score >= doubt)]
@@ -386,7 +481,9 @@ def test_reasons_are_counted_once_for_each_anchor(candidates, links, crowded):
 
 
 def test_middles_of_two_hips_are_roots_of_last_resort(candidates, links, crowded):
-    """Between a free right and a free left hip at most 40 cm apart, one of them strong; of too many the best."""
+    """Between a free right and a free left hip at most 40 cm apart, one of them strong; of too many
+    the best.
+    """
     free = np.random.default_rng(0).random(len(candidates)) < 0.8
     right, left = BODY_25.hips
     pairs = [
@@ -405,11 +502,16 @@ def test_middles_of_two_hips_are_roots_of_last_resort(candidates, links, crowded
         assert len(added) == count + len(chosen)
         ends = []
         for n, (first, second) in enumerate((pairs[k] for k in chosen), count):
-            np.testing.assert_allclose(added.xyz[n], (candidates.xyz[first] + candidates.xyz[second]) / 2)
+            np.testing.assert_allclose(
+                added.xyz[n], (candidates.xyz[first] + candidates.xyz[second]) / 2
+            )
             assert added.score[n] == pytest.approx(candidates.score[[first, second]].mean())
             assert added.votes[n] == candidates.votes[[first, second]].min()
             assert (added.joint[n], added.strong[n]) == (BODY_25.root, False)
-            rows = [candidates.support[candidates.support[:, 0] == each, 1].tolist() for each in (n, first)]
+            rows = [
+                candidates.support[candidates.support[:, 0] == each, 1].tolist()
+                for each in (n, first)
+            ]
             assert added.support[added.support[:, 0] == n, 1].tolist() == rows[1]
             ends += [(n, first), (n, second)]
         new = more.links.ends[len(links.ends) :]
@@ -434,7 +536,8 @@ def test_unclaimed_are_candidates_with_detections_of_their_own(candidates, links
     share = len(joints) / len(BODY_25.core)
     assert search(candidates, links, crowded, min_grown_parts=share).unclaimed(chosen) is not None
     assert (
-        search(candidates, links, crowded, min_grown_parts=min(1.0, share + 0.01)).unclaimed(chosen) is None
+        search(candidates, links, crowded, min_grown_parts=min(1.0, share + 0.01)).unclaimed(chosen)
+        is None
         or share == 1
     )
 
@@ -445,7 +548,9 @@ def test_the_least_share_of_grown_joints_counts_every_candidate(crowded):
     joint = np.array([BODY_25.index(name) for name in names])
     assert set(joint.tolist()) <= set(BODY_25.core) and len(BODY_25.core) == 15
     none = np.zeros((0, 2), dtype=np.intp)
-    six = Candidates(np.zeros((6, 3)), joint, np.full(6, 0.8), np.full(6, 3), np.ones(6, dtype=bool), none)
+    six = Candidates(
+        np.zeros((6, 3)), joint, np.full(6, 0.8), np.full(6, 3), np.ones(6, dtype=bool), none
+    )
     limbs = Links(np.array([[5, 0], [5, 1], [5, 2], [0, 3], [1, 4]]), np.full(5, 2.0))
     here = search(six, limbs, crowded)
     anchors, chosen = here.linked(np.array([5]))
@@ -455,7 +560,9 @@ def test_the_least_share_of_grown_joints_counts_every_candidate(crowded):
 
 
 def backwards(skeleton: Skeleton) -> Skeleton:
-    """The same with its joints in the other order: the nose, a core joint, is the last of BODY_25's."""
+    """The same with its joints in the other order: the nose, a core joint, is the last of
+    BODY_25's.
+    """
     last = len(skeleton) - 1
     return replace(
         skeleton,
@@ -478,7 +585,10 @@ def test_among_the_free_only_these_count(candidates, links, crowded, skeleton):
     here = whole.among(free)
     left, place = np.flatnonzero(free), np.cumsum(free) - 1
     rows = candidates.support[free[candidates.support[:, 0]]]
-    columns = {name: getattr(candidates, name)[left] for name in ("xyz", "joint", "score", "votes", "strong")}
+    columns = {
+        name: getattr(candidates, name)[left]
+        for name in ("xyz", "joint", "score", "votes", "strong")
+    }
     only = Candidates(**columns, support=np.stack([place[rows[:, 0]], rows[:, 1]], axis=1))
     both = free[links.ends].all(axis=1)
     alone = replace(whole, candidates=only, links=Links(place[links.ends[both]], links.score[both]))

@@ -21,10 +21,14 @@ from shapepose_fg.tracking.identities import FollowState, finish
 
 @pytest.fixture(scope="module")
 def people(two_people, crowded, five_cameras):
-    """Four people around those of a crowded frame, a fifth of whose joints are not placed, and what they have."""
+    """Four people around those of a crowded frame, a fifth of whose joints are not placed, and what
+    they have.
+    """
     rng = np.random.default_rng(5)
     places = np.concatenate([two_people, two_people[::-1] + np.array([0.02, 0.03, 0.0])])
-    places = np.where(rng.random((4, 25, 1)) < 0.2, np.nan, places + rng.normal(0, 0.02, places.shape))
+    places = np.where(
+        rng.random((4, 25, 1)) < 0.2, np.nan, places + rng.normal(0, 0.02, places.shape)
+    )
     frame = Frame(crowded, five_cameras, BODY_25, longest_bones(BODY_25))
     own = _claimed(np.tile(two_people, (2, 1, 1)), np.full((4, 25, 5), -1), frame, exclusive=False)
     return places, own, frame
@@ -48,7 +52,9 @@ def test_what_is_near_and_in_order(people, crowded, five_cameras):
 
 
 def test_whoever_shares_detections_with_nobody_gets_the_same_alone_and_among_all(people):
-    """Who competes for nothing is decided by the nearest alone; with others in the room it comes to the same."""
+    """Who competes for nothing is decided by the nearest alone; with others in the room it comes to
+    the same.
+    """
     places, own, frame = people
     apart = np.concatenate([places[:2], places[2:] + np.array([0.0, 0.0, 50.0])])
     among = _claimed(apart, own, frame, exclusive=True)[:2]
@@ -60,7 +66,9 @@ def test_whoever_shares_detections_with_nobody_gets_the_same_alone_and_among_all
 
 
 def test_without_hips_nobody_is_sought_by_hips(five_cameras, two_people, seen_exactly, monkeypatch):
-    """No pair of rays meets at a mid-hip, nor at both hips: whatever else is there, nobody is found, and fast."""
+    """No pair of rays meets at a mid-hip, nor at both hips: whatever else is there, nobody is
+    found, and fast.
+    """
     every = seen_exactly(five_cameras, two_people)
     hips = [BODY_25.root, BODY_25.hips[0]]
     config = PipelineConfig()
@@ -72,8 +80,12 @@ def test_without_hips_nobody_is_sought_by_hips(five_cameras, two_people, seen_ex
     assert len(search(without, five_cameras)) == 0, "not even asked"
 
 
-def test_what_is_left_out_of_what_evidence_leaves_is_said(five_cameras, two_people, seen_exactly, monkeypatch):
-    """14 people on whom no affinities speak, nobody by evidence: over 100 points of a joint, and 50 candidates."""
+def test_what_is_left_out_of_what_evidence_leaves_is_said(
+    five_cameras, two_people, seen_exactly, monkeypatch
+):
+    """14 people on whom no affinities speak, nobody by evidence: over 100 points of a joint, and 50
+    candidates.
+    """
     monkeypatch.setattr("shapepose_fg.proposal.stage_one._POINTS_OF_FEW", 100)
     beside = np.array([[0.0, 0.3 * n, 0.0] for n in range(7)])
     seen = seen_exactly(five_cameras, (two_people[:, None] + beside[:, None]).reshape(-1, 25, 3))
@@ -81,12 +93,18 @@ def test_what_is_left_out_of_what_evidence_leaves_is_said(five_cameras, two_peop
     config, book = PipelineConfig(), Notebook()
     fitter = make_fitter(config.body, BodyModel.default().with_keypoints(BODY_25.joints))
     tracker = Setup(five_cameras, BODY_25, config, fitter).engine(book).tracker
-    finish(tracker, FollowState(tracker.nobody(), pending=(Input(7, np.zeros(5), seen, five_cameras),)))
+    finish(
+        tracker, FollowState(tracker.nobody(), pending=(Input(7, np.zeros(5), seen, five_cameras),))
+    )
     assert book.flush().thinned_frames == {"points": [7], "candidates": [7]}
 
 
-def test_the_surest_of_many_people_are_taken_and_that_is_said(five_cameras, two_people, seen_exactly):
-    """Of two people, where one may be found, the one whom all views see: the other one is seen by two."""
+def test_the_surest_of_many_people_are_taken_and_that_is_said(
+    five_cameras, two_people, seen_exactly
+):
+    """Of two people, where one may be found, the one whom all views see: the other one is seen by
+    two.
+    """
     config, book = PipelineConfig(), Notebook()
     xy, _ = five_cameras.project(two_people)
     seen = seen_exactly(five_cameras, two_people)

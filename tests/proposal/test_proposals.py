@@ -43,7 +43,9 @@ def made(joint: list[int], xyz: NDArray[np.float64] | None = None, support=()) -
     )
 
 
-def with_hip(candidates: Candidates, xyz: NDArray[np.float64], votes: int, support: list[int]) -> Candidates:
+def with_hip(
+    candidates: Candidates, xyz: NDArray[np.float64], votes: int, support: list[int]
+) -> Candidates:
     """One more hip candidate, at `xyz`, made from the detections `support`."""
     rows = np.array([[len(candidates), detection] for detection in support])
     return Candidates(
@@ -57,16 +59,23 @@ def with_hip(candidates: Candidates, xyz: NDArray[np.float64], votes: int, suppo
 
 
 def assert_joints(
-    proposals: Proposals, candidates: Candidates, people: NDArray[np.float64], within_m: float = 0.005
+    proposals: Proposals,
+    candidates: Candidates,
+    people: NDArray[np.float64],
+    within_m: float = 0.005,
 ) -> None:
-    """Everybody is found once, each joint where it is: exact detections leave millimetres of clustering."""
+    """Everybody is found once, each joint where it is: exact detections leave millimetres of
+    clustering.
+    """
     assert len(proposals) == len(people)
     assert (proposals.candidate >= 0).all()
     found = candidates.xyz[proposals.candidate]
     distance = np.linalg.norm(found[:, None] - people[None], axis=-1).max(axis=-1)
     assert sorted(distance.argmin(axis=1)) == list(range(len(people)))
     assert distance.min(axis=1).max() < within_m
-    np.testing.assert_array_equal(candidates.joint[proposals.candidate], np.tile(np.arange(25), (len(people), 1)))
+    np.testing.assert_array_equal(
+        candidates.joint[proposals.candidate], np.tile(np.arange(25), (len(people), 1))
+    )
 
 
 def one_edge_at_a_time(left, right, score) -> list[int]:
@@ -79,7 +88,9 @@ def one_edge_at_a_time(left, right, score) -> list[int]:
     return sorted(picked)
 
 
-@pytest.mark.parametrize(("edges", "ends", "levels"), [(0, 5, 9), (1, 1, 9), (60, 8, 10**6), (400, 30, 4)])
+@pytest.mark.parametrize(
+    ("edges", "ends", "levels"), [(0, 5, 9), (1, 1, 9), (60, 8, 10**6), (400, 30, 4)]
+)
 def test_matching_equals_picking_one_edge_at_a_time(edges, ends, levels):
     """With 4 levels most scores are equal: ties go to the edge that comes first."""
     rng = np.random.default_rng(0)
@@ -93,8 +104,9 @@ def test_matching_equals_picking_one_edge_at_a_time(edges, ends, levels):
 def test_links_are_the_sums_of_affinity_less_doubt_over_the_views_that_see_both():
     """Candidates: neck A; hips B (with A in views 0 1 2), C (views 0 2) and D (view 1).
 
-    A-B: 0.9 + 0.8 and view 2 silent: 1.7 - 3 x 0.2. A-C: 0.1 and view 2 silent: 0.1 - 2 x 0.2. A-D: D is made from
-    the same detection in view 1 as B: 0.8 - 0.2. B and D are two hips, which no limb joins.
+    A-B: 0.9 + 0.8 and view 2 silent: 1.7 - 3 x 0.2. A-C: 0.1 and view 2 silent: 0.1 - 2 x 0.2. A-D:
+    D is made from the same detection in view 1 as B: 0.8 - 0.2. B and D are two hips, which no limb
+    joins.
     """
     view = np.array([0, 1, 2, 0, 1, 2, 0, 2])
     joint = np.array([NECK] * 3 + [HIP] * 5)
@@ -104,7 +116,10 @@ def test_links_are_the_sums_of_affinity_less_doubt_over_the_views_that_see_both(
     support = [[A, 0], [A, 1], [A, 2], [B, 3], [B, 4], [B, 5], [C, 6], [C, 7], [D, 4]]
     candidates = made([NECK, HIP, HIP, HIP], support=support)
     links = link(candidates, detections, GrowthConfig(doubt=0.2))
-    found = {tuple(ends): score for ends, score in zip(links.ends.tolist(), links.score.tolist(), strict=True)}
+    found = {
+        tuple(ends): score
+        for ends, score in zip(links.ends.tolist(), links.score.tolist(), strict=True)
+    }
     assert found == pytest.approx({(A, B): 1.1, (A, C): -0.3, (A, D): 0.6})
     far = replace(candidates, xyz=np.array([[0, 0, 0], [0, 0, 0.8], [0, 0, 0.5], [0, 0, 0.5]]))
     assert [A, B] not in link(far, detections, GrowthConfig(max_limb_m=0.75)).ends.tolist()
@@ -112,7 +127,9 @@ def test_links_are_the_sums_of_affinity_less_doubt_over_the_views_that_see_both(
 
 
 def arms(wrist_links: list[float]) -> tuple[Candidates, Links]:
-    """Two people's hip, neck, shoulder, elbow, and two wrists; scores elbow-wrist as 00 01 10 11."""
+    """Two people's hip, neck, shoulder, elbow, and two wrists; scores elbow-wrist as 00 01 10
+    11.
+    """
     chain = [HIP, NECK, BODY_25.index("RShoulder"), ELBOW]
     candidates = made([*chain, *chain, WRIST, WRIST])
     ends = [[1, 0], [1, 2], [2, 3], [5, 4], [5, 6], [6, 7], [3, 8], [3, 9], [7, 8], [7, 9]]
@@ -159,8 +176,8 @@ def test_crossed_arms_do_not_change_hands(five_cameras, two_people, seen_exactly
     reach = np.linalg.norm(people[:, None, WRIST] - people[None, :, ELBOW], axis=-1)
     assert (np.diag(reach) > 2 * np.diag(reach[::-1])).all()
     proposals, candidates = find(seen_exactly(five_cameras, people), five_cameras)
-    # Points from one's ray and the other's lie in the clusters too; a wrist of the other is 24 cm away,
-    # the own one less than half as far.
+    # Points from one's ray and the other's lie in the clusters too; a wrist of the other is 24 cm
+    # away, the own one less than half as far.
     assert_joints(proposals, candidates, people, within_m=0.12)
 
 
@@ -181,7 +198,9 @@ def test_an_embrace_is_two_people(five_cameras, two_people, seen_exactly):
 @pytest.mark.parametrize(
     ("unseen", "beyond"), [("LKnee", "LAnkle"), ("RElbow", "RWrist"), ("RShoulder", "RWrist")]
 )
-def test_a_limb_goes_on_beyond_a_joint_that_nobody_saw(five_cameras, two_people, seen_exactly, unseen, beyond):
+def test_a_limb_goes_on_beyond_a_joint_that_nobody_saw(
+    five_cameras, two_people, seen_exactly, unseen, beyond
+):
     detections = without(seen_exactly(five_cameras, two_people), BODY_25.index(unseen))
     proposals, candidates = find(detections, five_cameras)
     far = BODY_25.index(beyond)
@@ -200,7 +219,9 @@ def test_a_hidden_forearm_does_not_hide_the_person(five_cameras, two_people, see
     assert len(find(detections, five_cameras, min_parts=0.9)[0]) == 0, "the paper's 90 % would"
 
 
-def test_a_person_whose_hip_nobody_saw_is_anchored_between_the_hips(five_cameras, two_people, seen_exactly):
+def test_a_person_whose_hip_nobody_saw_is_anchored_between_the_hips(
+    five_cameras, two_people, seen_exactly
+):
     xy, _ = five_cameras.project(two_people[1, HIP])
     everything = seen_exactly(five_cameras, two_people)
     of_second = np.linalg.norm(everything.xy - xy[everything.view], axis=1) < 1e-6
@@ -208,9 +229,13 @@ def test_a_person_whose_hip_nobody_saw_is_anchored_between_the_hips(five_cameras
         hidden = of_second & (everything.joint == HIP) & (everything.view >= views)
         proposals, candidates = find(everything.only(~hidden), five_cameras)
         assert len(proposals) == 2, f"MidHip seen by {views} views"
-        places = proposals.places[np.linalg.norm(proposals.places[:, HIP] - two_people[1, HIP], axis=1).argmin()]
+        places = proposals.places[
+            np.linalg.norm(proposals.places[:, HIP] - two_people[1, HIP], axis=1).argmin()
+        ]
         np.testing.assert_allclose(places, two_people[1], atol=0.01)
-        assert candidates.joint[proposals.candidate[proposals.candidate >= 0]].shape == (50 - (views < 2),)
+        assert candidates.joint[proposals.candidate[proposals.candidate >= 0]].shape == (
+            50 - (views < 2),
+        )
 
 
 def without(detections: Detections, *joints: int) -> Detections:
@@ -218,7 +243,9 @@ def without(detections: Detections, *joints: int) -> Detections:
     return detections.only(~np.isin(detections.joint, joints))
 
 
-def test_a_person_whom_the_detector_doubts_is_dropped_with_a_reason(five_cameras, two_people, seen_exactly):
+def test_a_person_whom_the_detector_doubts_is_dropped_with_a_reason(
+    five_cameras, two_people, seen_exactly
+):
     apart = two_people + np.array([[-0.8, 0.0, 0.0], [0.8, 0.0, 0.0]])[:, None]
     detections = seen_exactly(five_cameras, apart)
     xy, _ = five_cameras.project(apart[1])
@@ -226,12 +253,16 @@ def test_a_person_whom_the_detector_doubts_is_dropped_with_a_reason(five_cameras
     detections = replace(detections, confidence=np.where(doubted, 0.15, detections.confidence))
     proposals, candidates = find(detections, five_cameras, min_confidence=0.3)
     assert_joints(proposals, candidates, apart[:1])
-    assert {reason for reason, count in proposals.dropped.items() if count > 0} == {"low confidence"}
+    assert {reason for reason, count in proposals.dropped.items() if count > 0} == {
+        "low confidence"
+    }
     assert_joints(*find(detections, five_cameras, min_confidence=0.1), apart)
 
 
 def test_a_hip_without_a_body_is_nobody(five_cameras, two_people, seen_exactly):
-    detections = seen_exactly(five_cameras, np.stack([two_people[0], two_people[1] + [2.0, 0.0, 0.0]]))
+    detections = seen_exactly(
+        five_cameras, np.stack([two_people[0], two_people[1] + [2.0, 0.0, 0.0]])
+    )
     candidates = candidates_of(detections, five_cameras)
     of_second = candidates.xyz[:, 0] > 1.2
     joint = np.where(of_second & (candidates.joint != HIP), BODY_25.index("Nose"), candidates.joint)
@@ -245,15 +276,20 @@ def test_the_same_hip_twice_is_one_person(five_cameras, two_people, seen_exactly
     detections = seen_exactly(five_cameras, two_people)
     candidates = candidates_of(detections, five_cameras)
     hips = np.flatnonzero((detections.joint == HIP) & (detections.view < 3))
-    twice = with_hip(candidates, two_people[0, HIP] + [0, beside_m, 0], votes=3, support=hips.tolist())
+    twice = with_hip(
+        candidates, two_people[0, HIP] + [0, beside_m, 0], votes=3, support=hips.tolist()
+    )
     proposals = propose(twice, detections, BODY_25, UP, ProposalConfig())
     assert_joints(proposals, twice, two_people)
     assert sum(proposals.dropped.values()) >= 1
 
 
-def test_a_phantom_where_rays_of_different_people_cross_is_dropped(five_cameras, two_people, seen_exactly):
-    """A hip between the two, made from one's detection in two views and the other's in a third: its box is full
-    of their joints, and the affinities link it to both."""
+def test_a_phantom_where_rays_of_different_people_cross_is_dropped(
+    five_cameras, two_people, seen_exactly
+):
+    """A hip between the two, made from one's detection in two views and the other's in a third: its
+    box is full of their joints, and the affinities link it to both.
+    """
     detections = seen_exactly(five_cameras, two_people)
     candidates = candidates_of(detections, five_cameras)
     xy, _ = five_cameras.project(two_people[:, HIP])
@@ -264,7 +300,9 @@ def test_a_phantom_where_rays_of_different_people_cross_is_dropped(five_cameras,
     assert (detections.joint[rows] == HIP).all()
     ghost = with_hip(candidates, two_people[:, HIP].mean(axis=0), votes=3, support=rows)
     proposals = propose(ghost, detections, BODY_25, UP, ProposalConfig())
-    people, unclaimed = associate(proposals, ghost, detections, five_cameras, BODY_25, ProposalConfig())
+    people, unclaimed = associate(
+        proposals, ghost, detections, five_cameras, BODY_25, ProposalConfig()
+    )
     hips = people.initial[:, HIP]
     np.testing.assert_allclose(hips[hips[:, 0].argsort()], two_people[:, HIP], atol=0.005)
     assert unclaimed + sum(proposals.dropped.values()) >= 1
@@ -317,8 +355,10 @@ def crowd(people: NDArray[np.float64], count: int) -> NDArray[np.float64]:
 def test_from_two_cameras_to_thirty_and_up_to_a_dozen_people(
     two_people, seen_exactly, cameras, people, found, most
 ):
-    """Many views make chance crossings, most of which end as nobody. A dozen people before two views cross in many
-    more places than they stand: nobody shares a joint, and somebody is right."""
+    """Many views make chance crossings, most of which end as nobody. A dozen people before two
+    views cross in many more places than they stand: nobody shares a joint, and somebody is
+    right.
+    """
     rig = ring_of_cameras(cameras, np.random.default_rng(0))
     truth = crowd(two_people, people)
     detections = seen_exactly(rig, truth)
@@ -334,7 +374,10 @@ def test_from_two_cameras_to_thirty_and_up_to_a_dozen_people(
 
 @pytest.mark.parametrize(
     ("settings", "message"),
-    [({"separation_m": 0.0}, "separation_m must be positive"), ({"min_parts": 1.1}, "min_parts must be between")],
+    [
+        ({"separation_m": 0.0}, "separation_m must be positive"),
+        ({"min_parts": 1.1}, "min_parts must be between"),
+    ],
 )
 def test_refuses_settings_that_make_no_sense(settings, message):
     with pytest.raises(ValueError, match=message):

@@ -1,4 +1,6 @@
-"""Who is there by evidence: people of few views, halves, crossings of rays, and what may not matter."""
+"""Who is there by evidence: people of few views, halves, crossings of rays, and what may not
+matter.
+"""
 
 from dataclasses import replace
 
@@ -12,7 +14,13 @@ from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.pipeline.pipeline import PipelineConfig, find_people
 from shapepose_fg.proposal.candidates import CandidateConfig, triangulate_pairs
 from shapepose_fg.proposal.people_2d import without_repeats
-from shapepose_fg.proposal.possible_people import Frame, PossiblePeople, connected, settled, triangulated
+from shapepose_fg.proposal.possible_people import (
+    Frame,
+    PossiblePeople,
+    connected,
+    settled,
+    triangulated,
+)
 from shapepose_fg.proposal.selection import Evidence, choose, existence
 from shapepose_fg.simulation import built_in_scene, simulate
 
@@ -42,7 +50,9 @@ def every_detection(detections: Detections, views: int) -> np.ndarray:
 
 @pytest.mark.parametrize("joints", [list(range(25)), UPPER_BODY])
 def test_two_of_three_cameras_are_enough(five_cameras, two_people, seen_exactly, joints):
-    """Cameras 0 and 1 see one, 1 and 2 the other, whole or from the hips up: no joint has three votes."""
+    """Cameras 0 and 1 see one, 1 and 2 the other, whole or from the hips up: no joint has three
+    votes.
+    """
     rig = three(five_cameras)
     parts = [
         (seen := seen_exactly(rig, two_people[[who]])).only(
@@ -51,9 +61,12 @@ def test_two_of_three_cameras_are_enough(five_cameras, two_people, seen_exactly,
         for who, views in ((0, (0, 1)), (1, (1, 2)))
     ]
     view, joint, confidence = (
-        np.concatenate([getattr(part, name) for part in parts]) for name in ("view", "joint", "confidence")
+        np.concatenate([getattr(part, name) for part in parts])
+        for name in ("view", "joint", "confidence")
     )
-    xy, affinity = (np.concatenate([getattr(part, name) for part in parts]) for name in ("xy", "affinity"))
+    xy, affinity = (
+        np.concatenate([getattr(part, name) for part in parts]) for name in ("xy", "affinity")
+    )
     pairs = np.concatenate([parts[0].pairs, parts[1].pairs + len(parts[0])])
     both = Detections(view, joint, xy, confidence, pairs, affinity)
     people, sure = chosen(both, rig)
@@ -81,15 +94,17 @@ def test_legs_without_hips_are_the_same_person(five_cameras, two_people, seen_ex
 
 
 def test_neither_cameras_nor_detections_have_an_order():
-    """Six people before three cameras, as a detector sees them: the same joints, however all is listed."""
+    """Six people before three cameras, as a detector sees them: the same joints, however all is
+    listed.
+    """
     scene = built_in_scene(3, people=6, cameras=3, frames=2)
     rng = np.random.default_rng(0)
     for seen in simulate(scene, seed=3):
         cameras, rows = rng.permutation(3), rng.permutation(len(seen))
         edges = rng.permutation(len(seen.affinity))
         listed = Detections(
-            np.argsort(cameras)[seen.view[rows]], seen.joint[rows], seen.xy[rows], seen.confidence[rows],
-            np.argsort(rows)[seen.pairs][edges], seen.affinity[edges],
+            np.argsort(cameras)[seen.view[rows]], seen.joint[rows], seen.xy[rows],
+            seen.confidence[rows], np.argsort(rows)[seen.pairs][edges], seen.affinity[edges],
         )  # fmt: skip
         turned = replace(scene.rig, cameras=tuple(scene.rig.cameras[camera] for camera in cameras))
         found = [find_people(seen, scene.rig, BODY_25, PipelineConfig()).initial]
@@ -117,7 +132,9 @@ def test_who_is_listed_twice_is_there_once(five_cameras, two_people, seen_exactl
 
 
 def test_a_ray_that_misses_hardly_moves_the_joint(five_cameras, two_people, seen_exactly):
-    """One of five views is 30 px off, 10 cm at the joint: a detector's error at most is left of it."""
+    """One of five views is 30 px off, 10 cm at the joint: a detector's error at most is left of
+    it.
+    """
     detections = seen_exactly(five_cameras, two_people[:1])
     frame = frame_of(detections, five_cameras)
     hypothesis = settled(two_people[:1], every_detection(detections, 5), frame, 1)
@@ -125,7 +142,9 @@ def test_a_ray_that_misses_hardly_moves_the_joint(five_cameras, two_people, seen
     assert np.nanmax(hypothesis.gap_m) < 1e-6
     xy = detections.xy.copy()
     xy[hypothesis.chosen[0, 4, 0]] += [30.0, 0.0]
-    places, gap_m = triangulated(hypothesis.chosen, frame_of(replace(detections, xy=xy), five_cameras))
+    places, gap_m = triangulated(
+        hypothesis.chosen, frame_of(replace(detections, xy=xy), five_cameras)
+    )
     off_m = np.linalg.norm(places[0] - two_people[0], axis=1)
     assert 0 < off_m[4] < 0.03 and np.delete(off_m, 4).max() < 1e-6
     assert gap_m[0, 4, 0] > 3 * np.delete(gap_m[0, 4], 0).max()
@@ -142,7 +161,9 @@ def test_joints_hang_together_as_far_as_bones_reach(five_cameras, two_people, se
 
 
 def test_what_others_explain_is_no_evidence(five_cameras, two_people, seen_exactly):
-    """All detections agree: confidence times affinity each, and what bones count. A double has nothing."""
+    """All detections agree: confidence times affinity each, and what bones count. A double has
+    nothing.
+    """
     detections = seen_exactly(five_cameras, two_people[:1])
     frame = frame_of(detections, five_cameras)
     one = settled(two_people[:1], every_detection(detections, 5), frame, 1)
@@ -150,21 +171,28 @@ def test_what_others_explain_is_no_evidence(five_cameras, two_people, seen_exact
     nobody_else = np.zeros(len(detections), dtype=bool)
     expected = (detections.confidence * detections.affinity[0]).sum() + evidence.bones[0]
     np.testing.assert_allclose(evidence.score(nobody_else), expected, rtol=1e-6)
-    # 125 places without a detection of one's own, in views that see nothing else of the person: 0.07 each, twice.
-    np.testing.assert_allclose(evidence.score(~nobody_else), -125 * (0.07 + 0.07) + evidence.bones[0], rtol=1e-9)
+    # 125 places without a detection of one's own, in views that see nothing else of the person:
+    # 0.07 each, twice.
+    np.testing.assert_allclose(
+        evidence.score(~nobody_else), -125 * (0.07 + 0.07) + evidence.bones[0], rtol=1e-9
+    )
     assert existence(one, frame)[0] > 0.99
     assert existence(type(one).concatenate([one, one]), frame).max() < 0.01
 
 
 def test_bones_of_usual_length_speak_for_a_person(five_cameras, two_people, seen_exactly):
-    """The same pose half again as large, or two thirds as large, is nobody's, though all detections agree."""
+    """The same pose half again as large, or two thirds as large, is nobody's, though all detections
+    agree.
+    """
 
     def bones(size, keep=lambda detections: detections.view >= 0):
         places = two_people[:1] * size
         detections = seen_exactly(five_cameras, places)
         detections = detections.only(keep(detections))
         frame = frame_of(detections, five_cameras)
-        return Evidence.of(settled(places, every_detection(detections, 5), frame, 1), frame).bones[0]
+        return Evidence.of(settled(places, every_detection(detections, 5), frame, 1), frame).bones[
+            0
+        ]
 
     assert bones(1.0) - bones(1.5) > 2
     assert bones(1.0) - bones(2 / 3) > 1
@@ -173,8 +201,12 @@ def test_bones_of_usual_length_speak_for_a_person(five_cameras, two_people, seen
     assert 0 < bones(1.0) - one_view < 0.3
 
 
-def test_a_view_that_misses_a_joint_and_sees_the_rest_speaks_against_it(five_cameras, two_people, seen_exactly):
-    """Six joints that one view misses cost more than the same view missing altogether costs for them."""
+def test_a_view_that_misses_a_joint_and_sees_the_rest_speaks_against_it(
+    five_cameras, two_people, seen_exactly
+):
+    """Six joints that one view misses cost more than the same view missing altogether costs for
+    them.
+    """
     every = seen_exactly(five_cameras, two_people[:1])
 
     def score(keep):
@@ -194,4 +226,6 @@ def test_a_view_that_misses_a_joint_and_sees_the_rest_speaks_against_it(five_cam
 
 def test_nobody_is_there_where_nothing_is_seen(five_cameras, nothing=Detections.empty()):
     people, sure = chosen(nothing, five_cameras)
-    assert len(people) == len(sure) == 0 == len(PossiblePeople.none(frame_of(nothing, five_cameras)))
+    assert (
+        len(people) == len(sure) == 0 == len(PossiblePeople.none(frame_of(nothing, five_cameras)))
+    )

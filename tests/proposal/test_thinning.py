@@ -1,4 +1,6 @@
-"""Frames with more detections than people can make: what stays, that it is said, and clusters as before."""
+"""Frames with more detections than people can make: what stays, that it is said, and clusters as
+before.
+"""
 
 import time
 from dataclasses import replace
@@ -19,12 +21,19 @@ from shapepose_fg.proposal.candidates import (
     triangulate_pairs,
     vote,
 )
-from shapepose_fg.proposal.thinning import ThinnedFrames, kept_detections, thinned_candidates, thinned_points
+from shapepose_fg.proposal.thinning import (
+    ThinnedFrames,
+    kept_detections,
+    thinned_candidates,
+    thinned_points,
+)
 from shapepose_fg.simulation.scene import ring_of_cameras
 
 
 def crowd(rig: Rig, people: int, seed: int = 0) -> Detections:
-    """So many people at random places of each picture, different ones in each; affinity 0.9 within each."""
+    """So many people at random places of each picture, different ones in each; affinity 0.9 within
+    each.
+    """
     rng, views = np.random.default_rng(seed), len(rig)
     centre = rng.uniform(0, 1, (views, people, 1, 2)) * rig.image_sizes[:, None, None]
     xy = (centre + rng.normal(0, 60, (views, people, 25, 2))).transpose(0, 2, 1, 3).reshape(-1, 2)
@@ -61,7 +70,9 @@ def test_the_most_confident_detections_stay(rig):
     for view, joint in ((0, 0), (3, 8), (4, 24)):
         group = (detections.view == view) & (detections.joint == joint)
         assert (group & keep).sum() == 10
-        assert detections.confidence[group & keep].min() > detections.confidence[group & ~keep].max()
+        assert (
+            detections.confidence[group & keep].min() > detections.confidence[group & ~keep].max()
+        )
     frames = ThinnedFrames(Recording(BODY_25, [detections]), rig, config)
     assert frames.is_thinned(0)
     for view in range(len(rig)):  # what is left knows its place in the recording
@@ -80,13 +91,19 @@ def test_the_most_confident_points_of_each_joint_stay(rig):
 
 
 def test_of_candidates_with_too_many_links_half_stay(rig):
-    """250 candidates for each joint, all made of the same two detections: 3 million links, where 2 are allowed."""
+    """250 candidates for each joint, all made of the same two detections: 3 million links, where 2
+    are allowed.
+    """
     view, joint = (index.ravel() for index in np.indices((2, 25)))
     first, second = np.array(BODY_25.limbs).T
     pairs = np.concatenate([np.column_stack([25 * v + first, 25 * v + second]) for v in range(2)])
-    detections = Detections(view, joint, np.zeros((50, 2)), np.full(50, 0.8), pairs, np.full(len(pairs), 0.9))
+    detections = Detections(
+        view, joint, np.zeros((50, 2)), np.full(50, 0.8), pairs, np.full(len(pairs), 0.9)
+    )
     of_joint = np.arange(25).repeat(250)
-    support = np.concatenate([np.column_stack([np.arange(len(of_joint)), 25 * v + of_joint]) for v in range(2)])
+    support = np.concatenate(
+        [np.column_stack([np.arange(len(of_joint)), 25 * v + of_joint]) for v in range(2)]
+    )
     rng = np.random.default_rng(0)
     every = Candidates(
         rng.normal(size=(len(of_joint), 3)), of_joint, rng.uniform(size=len(of_joint)),
@@ -126,14 +143,18 @@ def test_many_points_are_clustered_as_if_one_by_one():
     expected = np.full(count, -1)
     for pick in np.argsort(-points.score, kind="stable"):
         if expected[pick] < 0:
-            near = (np.linalg.norm(points.xyz - points.xyz[pick], axis=1) <= radius) & (expected < 0)
+            near = (np.linalg.norm(points.xyz - points.xyz[pick], axis=1) <= radius) & (
+                expected < 0
+            )
             expected[near & (points.joint == points.joint[pick])] = pick
     np.testing.assert_array_equal(greedy_seeds(points, radius), expected)
 
 
 @pytest.mark.slow
 def test_a_crowd_of_strangers_ends():
-    """120 people a view, none of whom two views share: 3.6 million pairs, and once a frame without end."""
+    """120 people a view, none of whom two views share: 3.6 million pairs, and once a frame without
+    end.
+    """
     rig = ring_of_cameras(5, np.random.default_rng(0))
     detections, start = crowd(rig, 120), time.process_time()
     people = find_people(detections, rig, BODY_25, PipelineConfig())
@@ -145,21 +166,26 @@ def among_strangers(people: Detections, strangers: Detections) -> Detections:
     """Both, as a reader lists them; of the strangers the detector is less sure."""
     first = len(people)
     view, joint = (
-        np.concatenate([getattr(each, name) for each in (people, strangers)]) for name in ("view", "joint")
+        np.concatenate([getattr(each, name) for each in (people, strangers)])
+        for name in ("view", "joint")
     )
     order = np.lexsort((joint, view))
     pairs = np.concatenate([people.pairs, strangers.pairs + first])
     confidence = np.concatenate([people.confidence, strangers.confidence / 3])
     xy = np.concatenate([people.xy, strangers.xy])
     affinity = np.concatenate([people.affinity, strangers.affinity])
-    return Detections(view[order], joint[order], xy[order], confidence[order], np.argsort(order)[pairs], affinity)
+    return Detections(
+        view[order], joint[order], xy[order], confidence[order], np.argsort(order)[pairs], affinity
+    )
 
 
 def test_what_was_left_out_is_said(five_cameras, two_people, seen_exactly):
     rig, seen = five_cameras, seen_exactly(five_cameras, two_people)
     config = PipelineConfig(people=PeopleConfig(most_pairs=1000), batch_frames=2)
     config = replace(config, offsets=replace(config.offsets, source="none"))
-    frames = [among_strangers(seen, crowd(rig, count, seed)) for seed, count in enumerate((16, 1, 16))]
+    frames = [
+        among_strangers(seen, crowd(rig, count, seed)) for seed, count in enumerate((16, 1, 16))
+    ]
     people = reconstruct(Recording(BODY_25, frames), rig, config)
     assert people.run["thinned_frames"]["detections"] == [[0, 1], [2, 3]]
     table = people.observations

@@ -1,4 +1,6 @@
-"""What one view shows to be wrong of its own detections: people found twice, joints on the picture's border."""
+"""What one view shows to be wrong of its own detections: people found twice, joints on the
+picture's border.
+"""
 
 from dataclasses import replace
 
@@ -13,7 +15,9 @@ from shapepose_fg.proposal.view_faults import clipped, doubled, without_faults
 def joined(first: Detections, second: Detections) -> Detections:
     """The detections of both, the second ones last."""
     names = ("view", "joint", "xy", "confidence", "affinity")
-    columns = {name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in names}
+    columns = {
+        name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in names
+    }
     return Detections(**columns, pairs=np.concatenate([first.pairs, second.pairs + len(first)]))
 
 
@@ -28,7 +32,9 @@ def test_what_is_right_stays(seen, five_cameras):
 
 @pytest.mark.parametrize("away_px", [0.0, 2.0, 5.0])
 def test_who_is_found_twice_in_some_views_is_found_once(seen, five_cameras, away_px):
-    """A second box around a person: joints a few pixels off, a little less certain, some of them missing."""
+    """A second box around a person: joints a few pixels off, a little less certain, some of them
+    missing.
+    """
     rng = np.random.default_rng(0)
     ends = np.isin(seen.joint, [4, 7, *range(15, 25)])
     twice = seen.only((seen.view < 3) & ((rng.random(len(seen)) < 0.6) | ~ends))
@@ -58,7 +64,9 @@ def on_the_line(seen: Detections, view: int, height: float) -> tuple[Detections,
 
 
 def between(y, share):
-    """A height that about a `share` of joints at `y` (N,) are below: in a gap, where no joint is by chance."""
+    """A height that about a `share` of joints at `y` (N,) are below: in a gap, where no joint is by
+    chance.
+    """
     least, most = (np.quantile(y, min(max(1 - share + shift, 0), 1)) for shift in (-0.1, 0.1))
     near = np.sort(y[(least <= y) & (y <= most)])
     widest = int(np.argmax(np.diff(near)))
@@ -68,7 +76,9 @@ def between(y, share):
 @pytest.mark.parametrize("share", [0.3, 0.6])
 def test_joints_on_the_border_of_a_part_of_the_picture_say_nothing(seen, five_cameras, share):
     found, below = on_the_line(seen, 2, between(seen.xy[seen.view == 2, 1], share))
-    np.testing.assert_array_equal(clipped(found, five_cameras)[seen.view == 2], below[seen.view == 2])
+    np.testing.assert_array_equal(
+        clipped(found, five_cameras)[seen.view == 2], below[seen.view == 2]
+    )
 
 
 def test_joints_on_the_edge_of_the_picture_say_nothing_even_alone(seen, five_cameras):
@@ -82,11 +92,18 @@ def test_joints_on_the_edge_of_the_picture_say_nothing_even_alone(seen, five_cam
 
 def test_the_border_is_one_of_the_picture_as_the_lens_gives_it(seen, five_cameras):
     """The line is straight before the lens is taken out of the detections, and bent after it."""
-    cameras = [replace(each, distortion=np.array([-0.2, 0.05, 0.0, 0.0, 0.0])) for each in five_cameras.cameras]
+    cameras = [
+        replace(each, distortion=np.array([-0.2, 0.05, 0.0, 0.0, 0.0]))
+        for each in five_cameras.cameras
+    ]
     rig = Rig(tuple(cameras), five_cameras.up)
-    raw = np.stack([cameras[v].distort(xy[None])[0] for v, xy in zip(seen.view, seen.xy, strict=True)])
+    raw = np.stack(
+        [cameras[v].distort(xy[None])[0] for v, xy in zip(seen.view, seen.xy, strict=True)]
+    )
     cut, below = on_the_line(replace(seen, xy=raw), 2, between(raw[seen.view == 2, 1], 0.4))
-    straight = np.stack([cameras[v].undistort(xy[None])[0] for v, xy in zip(cut.view, cut.xy, strict=True)])
+    straight = np.stack(
+        [cameras[v].undistort(xy[None])[0] for v, xy in zip(cut.view, cut.xy, strict=True)]
+    )
     # Of this view: in another the two highest of a hundred joints may be equally high by chance.
     found = clipped(replace(cut, xy=straight), rig)
     np.testing.assert_array_equal(found[cut.view == 2], below[cut.view == 2])

@@ -1,4 +1,6 @@
-"""Three people who walk and wave before five cameras, seen by a detector that errs by two pixels."""
+"""Three people who walk and wave before five cameras, seen by a detector that errs by two
+pixels.
+"""
 
 import numpy as np
 import pytest
@@ -12,7 +14,9 @@ FRAMES = 60
 
 
 def walkers(standing: np.ndarray, frames: int = FRAMES) -> np.ndarray:
-    """(T, 3, 25, 3) people who walk on circles of their own at 1 m/s and wave one arm, 25 frames a second."""
+    """(T, 3, 25, 3) people who walk on circles of their own at 1 m/s and wave one arm, 25 frames a
+    second.
+    """
     times = np.arange(frames) / 25.0
     people = []
     for number, (radius, start) in enumerate(((0.9, 0.0), (1.1, 2.1), (0.7, 4.2))):
@@ -42,7 +46,9 @@ def seen_by(rig: Rig, people: np.ndarray, sigma_px: float = 2.0, seed: int = 0) 
         pairs = np.stack([place[:, :, first], place[:, :, second]], axis=-1).reshape(-1, 2)
         pairs = pairs[(pairs >= 0).all(axis=1)]
         frames.append(
-            Detections(view, joint, xy[inside], np.full(len(view), 0.8), pairs, np.full(len(pairs), 0.9))
+            Detections(
+                view, joint, xy[inside], np.full(len(view), 0.8), pairs, np.full(len(pairs), 0.9)
+            )
         )
     return Recording(BODY_25, frames)
 

@@ -1,4 +1,6 @@
-"""Recordings with one mistake in their set-up, made on purpose: does the check name it, and nothing else?"""
+"""Recordings with one mistake in their set-up, made on purpose: does the check name it, and nothing
+else?
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -45,7 +47,13 @@ def spoiled(detections: DetectionSequence, rig: Rig, seed: int = 0) -> Iterator[
     for view in everybody:
         for degrees in (1, 5, 30, 180):
             axis = rng.normal(size=3)
-            yield Spoiled(f"turned {degrees}", detections, turned(rig, view, degrees, axis), Kind.TURNED, (view,))
+            yield Spoiled(
+                f"turned {degrees}",
+                detections,
+                turned(rig, view, degrees, axis),
+                Kind.TURNED,
+                (view,),
+            )
         for frames in (6, 10, -8):
             late = delayed(detections, view, frames)
             yield Spoiled("late 6 to 10 frames", late, rig, Kind.LATE, (view,), frames)
@@ -53,7 +61,9 @@ def spoiled(detections: DetectionSequence, rig: Rig, seed: int = 0) -> Iterator[
         pair = (min(view, other), max(view, other))
         yield Spoiled("exchanged", detections, exchanged(rig, view, other), Kind.EXCHANGED, pair)
         yield Spoiled("focal length x 2", detections, zoomed(rig, view, 2.0), Kind.FOCAL, (view,))
-        yield Spoiled("detections x 0.5", resized(detections, (view,), 0.5), rig, Kind.RESIZED, (view,))
+        yield Spoiled(
+            "detections x 0.5", resized(detections, (view,), 0.5), rig, Kind.RESIZED, (view,)
+        )
         yield Spoiled("inverse pose", detections, inverted(rig, (view,)), Kind.INVERTED, (view,))
         mirror = mirrored(detections, rig, view)
         yield Spoiled("mirrored", mirror, rig, Kind.MIRRORED, (view,))
@@ -65,9 +75,15 @@ def spoiled(detections: DetectionSequence, rig: Rig, seed: int = 0) -> Iterator[
         yield Spoiled("drifting by 8", slowly, rig, Kind.DRIFTING, (view,))
         twice, copy = listed_twice(detections, rig, view)
         yield Spoiled("listed twice", twice, copy, Kind.DUPLICATE, (view, len(rig)))
-        yield Spoiled("another's file", detections, same_pose(rig, view, other), Kind.DUPLICATE, pair)
-    yield Spoiled("detections x 0.5, all", resized(detections, everybody, 0.5), rig, Kind.RESIZED, everybody)
-    yield Spoiled("inverse poses, all", detections, inverted(rig, everybody), Kind.INVERTED, everybody)
+        yield Spoiled(
+            "another's file", detections, same_pose(rig, view, other), Kind.DUPLICATE, pair
+        )
+    yield Spoiled(
+        "detections x 0.5, all", resized(detections, everybody, 0.5), rig, Kind.RESIZED, everybody
+    )
+    yield Spoiled(
+        "inverse poses, all", detections, inverted(rig, everybody), Kind.INVERTED, everybody
+    )
     yield Spoiled("metres read as mm", detections, scaled(rig, 0.001), Kind.UNIT, ())
     yield Spoiled("mm read as metres", detections, scaled(rig, 1000.0), Kind.UNIT, ())
     for name in get_args(Axis):
@@ -85,12 +101,16 @@ def mirrored(detections: DetectionSequence, rig: Rig, view: int) -> Recording:
     return seen_as(detections, view, change)
 
 
-def turning(detections: DetectionSequence, rig: Rig, view: int, degrees: Callable[[int], float]) -> Recording:
+def turning(
+    detections: DetectionSequence, rig: Rig, view: int, degrees: Callable[[int], float]
+) -> Recording:
     """What a camera sees that is turned sideways by `degrees` of each frame."""
     K = rig.K[view]
 
     def change(frame: int, xy: Array) -> Array:
-        turn = Rotation.from_rotvec(np.deg2rad(degrees(frame)) * np.array([0.3, 0.95, 0.1])).as_matrix()
+        turn = Rotation.from_rotvec(
+            np.deg2rad(degrees(frame)) * np.array([0.3, 0.95, 0.1])
+        ).as_matrix()
         h = np.column_stack([xy, np.ones(len(xy))]) @ (K @ turn @ np.linalg.inv(K)).T
         return h[:, :2] / h[:, 2:]
 
@@ -98,7 +118,9 @@ def turning(detections: DetectionSequence, rig: Rig, view: int, degrees: Callabl
 
 
 def shifted(rig: Rig, view: int, right_px: float, down_px: float) -> Rig:
-    """One camera whose principal point is calibrated so many pixels right and down of where it is."""
+    """One camera whose principal point is calibrated so many pixels right and down of where it
+    is.
+    """
     by = np.zeros((3, 3))
     by[:2, 2] = right_px, down_px
     return _changed(rig, (view,), lambda camera: replace(camera, K=camera.K + by))
@@ -107,7 +129,8 @@ def shifted(rig: Rig, view: int, right_px: float, down_px: float) -> Rig:
 def biased(
     detections: DetectionSequence, rig: Rig, people: Array, bias: Array, larger: Array | float = 0.0
 ) -> Recording:
-    """People (T, P, J, 3) seen beside where they are by `bias` (P, J, V, 2), and `larger` (P, 1, V, 1).
+    """People (T, P, J, 3) seen beside where they are by `bias` (P, J, V, 2), and `larger` (P, 1, V,
+    1).
 
     Both are parts of their height in the picture, and last.
     """
@@ -127,7 +150,9 @@ def lasting(rng: np.random.Generator, low: float, high: float, *shape: int) -> A
     return size[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
-def seen_as(detections: DetectionSequence, view: int, change: Callable[[int, Array], Array]) -> Recording:
+def seen_as(
+    detections: DetectionSequence, view: int, change: Callable[[int, Array], Array]
+) -> Recording:
     """One camera's pixels after a `change` of frame and pixels (N, 2)."""
     frames = []
     for number in range(len(detections)):
@@ -141,7 +166,9 @@ def seen_as(detections: DetectionSequence, view: int, change: Callable[[int, Arr
 def turned(rig: Rig, view: int, degrees: float, axis: Array) -> Rig:
     """One camera turned about an axis (3,) of its own, where it stands."""
     turn = np.eye(4)
-    turn[:3, :3] = Rotation.from_rotvec(np.deg2rad(degrees) * axis / np.linalg.norm(axis)).as_matrix()
+    turn[:3, :3] = Rotation.from_rotvec(
+        np.deg2rad(degrees) * axis / np.linalg.norm(axis)
+    ).as_matrix()
     return _changed(rig, (view,), lambda camera: replace(camera, wTc=camera.wTc @ turn))
 
 
@@ -184,7 +211,9 @@ def scaled(rig: Rig, factor: float) -> Rig:
     """The rig in another unit."""
     unit = np.ones((4, 4))
     unit[:3, 3] = factor
-    return _changed(rig, tuple(range(len(rig))), lambda camera: replace(camera, wTc=camera.wTc * unit))
+    return _changed(
+        rig, tuple(range(len(rig))), lambda camera: replace(camera, wTc=camera.wTc * unit)
+    )
 
 
 def resized(detections: DetectionSequence, views: tuple[int, ...], factor: float) -> Recording:
@@ -239,8 +268,12 @@ def _together(first: Detections, second: Detections) -> Detections:
 
 
 def _each(detections: DetectionSequence, change: Callable[[Detections], Detections]) -> Recording:
-    return Recording(detections.skeleton, [change(detections[frame]) for frame in range(len(detections))])
+    return Recording(
+        detections.skeleton, [change(detections[frame]) for frame in range(len(detections))]
+    )
 
 
 def _changed(rig: Rig, views: tuple[int, ...], change: Callable[[Camera], Camera]) -> Rig:
-    return Rig(tuple(change(each) if v in views else each for v, each in enumerate(rig.cameras)), rig.up)
+    return Rig(
+        tuple(change(each) if v in views else each for v, each in enumerate(rig.cameras)), rig.up
+    )

@@ -1,4 +1,6 @@
-"""Every mistake that is made on purpose is named, with its camera; and nothing where there is none."""
+"""Every mistake that is made on purpose is named, with its camera; and nothing where there is
+none.
+"""
 
 from dataclasses import replace
 
@@ -45,13 +47,16 @@ def some_cameras(recording, rig, views):
     """The same recording by fewer cameras."""
     frames = [recording[t].only(np.isin(recording[t].view, views)) for t in range(len(recording))]
     frames = [replace(each, view=np.searchsorted(views, each.view)) for each in frames]
-    return Recording(recording.skeleton, frames), Rig(tuple(rig.cameras[view] for view in views), rig.up)
+    return Recording(recording.skeleton, frames), Rig(
+        tuple(rig.cameras[view] for view in views), rig.up
+    )
 
 
 def test_nothing_is_said_where_nothing_is_wrong(recording, room):
     diagnosis = diagnose(recording, room)
     assert diagnosis.findings == ()
-    # Bones of the three are 0.94, 0.99 and 1.04 times those of a figure of 1.7 m; ratios of bones vary by 10 %.
+    # Bones of the three are 0.94, 0.99 and 1.04 times those of a figure of 1.7 m; ratios of bones
+    # vary by 10 %.
     assert diagnosis.build.stature == pytest.approx(1.7, abs=0.17)
     np.testing.assert_allclose(diagnosis.build.up, [0, 0, 1], atol=0.03)
 
@@ -67,7 +72,9 @@ def test_nothing_is_said_of_fewer_cameras(recording, room, views):
 def test_a_turned_camera_is_named_with_its_angle(recording, room, degrees):
     found = only_finding(recording, turned(room, 2, degrees, np.array([0.3, 1.0, 0.2])))
     # A degree is hardly told from a shift of the principal point, and the sentence says both.
-    assert found.kind in (Kind.TURNED, Kind.PRINCIPAL_POINT)[: 1 + (degrees == 1)] and found.cameras == (2,)
+    assert found.kind in (Kind.TURNED, Kind.PRINCIPAL_POINT)[
+        : 1 + (degrees == 1)
+    ] and found.cameras == (2,)
     # 2 px of noise on 1000s of joints; the sparse prior takes up to a third of a turn of a degree.
     assert found.amount == pytest.approx(degrees, rel=0.05, abs=0.35)
 
@@ -148,30 +155,45 @@ def test_one_camera_s_principal_point_is_not_taken_for_a_turn(recording, room, p
 @pytest.mark.slow
 @pytest.mark.parametrize("of", ["turned", "shifted"])
 def test_a_small_turn_and_a_shift_are_both_said_with_their_probabilities(recording, room, of):
-    # 0.6 degrees are 10 px here. A turn sideways is a shift of the picture, but for its perspective.
-    rig = turned(room, 2, 0.6, np.array([0.0, 1.0, 0.0])) if of == "turned" else shifted(room, 2, 10.0, 0.0)
+    # 0.6 degrees are 10 px here. A turn sideways is a shift of the picture, but for its
+    # perspective.
+    rig = (
+        turned(room, 2, 0.6, np.array([0.0, 1.0, 0.0]))
+        if of == "turned"
+        else shifted(room, 2, 10.0, 0.0)
+    )
     found = only_finding(recording, rig)
     told = {each.kind: each.sure for each in (found, *found.instead) if each.cameras == (2,)}
     assert {Kind.TURNED, Kind.PRINCIPAL_POINT} <= set(told)
-    assert max(told.values()) == found.sure and min(told.values()) > 0.05 and sum(told.values()) <= 1 + 1e-9
+    assert (
+        max(told.values()) == found.sure
+        and min(told.values()) > 0.05
+        and sum(told.values()) <= 1 + 1e-9
+    )
     words = sentence(found, rig)
     for each in found.instead:
         assert f"({each.sure:.2f})" in words and "; or " in words
 
 
 @pytest.mark.slow
-def test_of_one_person_alone_a_camera_is_not_accused_but_said_beside_the_detector(room, people, look_at):
+def test_of_one_person_alone_a_camera_is_not_accused_but_said_beside_the_detector(
+    room, people, look_at
+):
     diagnosis = diagnose(look_at(room, people[:, :1]), shifted(room, 2, 15.0, 0.0))
     assert diagnosis.findings == ()
     (noted,) = diagnosis.biased
     assert (noted.kind, noted.cameras) == (Kind.BIASED, (2,))
     camera = {each.kind: each.sure for each in noted.instead}
     assert Kind.PRINCIPAL_POINT in camera
-    assert noted.sure + sum(camera.values()) == pytest.approx(1, abs=0.06)  # those under 0.05 are not said
+    assert noted.sure + sum(camera.values()) == pytest.approx(
+        1, abs=0.06
+    )  # those under 0.05 are not said
 
 
 def test_who_is_near_by_chance_at_an_offset_makes_no_camera_late():
-    """As in a simulated crowd before three cameras in time, and in one whose camera was late by 7 frames."""
+    """As in a simulated crowd before three cameras in time, and in one whose camera was late by 7
+    frames.
+    """
     assert not Lag(frames=2, gain=0.0068, likely=21.4, agreement=0.164, followed=-0.008).is_offset
     assert Lag(frames=7, gain=0.0224, likely=59.0, agreement=0.261, followed=0.351).is_offset
 
@@ -214,7 +236,8 @@ def test_mistakes_of_all_cameras_are_named(recording, room):
 
 
 @pytest.mark.parametrize(
-    ("factor", "words"), [(0.001, "in m, but was read as mm"), *slow((100, "in cm, but was read as m"))]
+    ("factor", "words"),
+    [(0.001, "in m, but was read as mm"), *slow((100, "in cm, but was read as m"))],
 )
 def test_a_wrong_unit_is_named(recording, room, factor, words):
     rig = scaled(room, factor)
@@ -232,7 +255,9 @@ def test_a_wrong_up_axis_is_named(recording, room, axis):
 
 @pytest.mark.slow
 def test_cameras_that_see_nobody_are_named(recording, room):
-    blind = Recording(BODY_25, [recording[t].only(recording[t].view != 1) for t in range(len(recording))])
+    blind = Recording(
+        BODY_25, [recording[t].only(recording[t].view != 1) for t in range(len(recording))]
+    )
     found = only_finding(blind, room)
     assert (found.kind, found.cameras) == (Kind.NOBODY, (1,))
     found = only_finding(Recording(BODY_25, [Detections.empty()] * 30), room)
@@ -255,16 +280,20 @@ def test_cameras_that_never_see_people_at_once_are_named(recording, room):
 
 
 def test_of_a_crowded_picture_the_surest_people_are_compared():
-    """Time grows with their square: of 80 ghosts a view and two people, of whom the detector is surer, 24 stay."""
+    """Time grows with their square: of 80 ghosts a view and two people, of whom the detector is
+    surer, 24 stay.
+    """
     rng, joints, limbs = np.random.default_rng(0), len(BODY_25), np.array(BODY_25.limbs)
     people = [
-        (view, rng.uniform(0, 1000, (joints, 2)), 0.2 + 0.6 * (n < 2)) for view in range(3) for n in range(82)
+        (view, rng.uniform(0, 1000, (joints, 2)), 0.2 + 0.6 * (n < 2))
+        for view in range(3)
+        for n in range(82)
     ]
     view, xy, sure = zip(*(people[n] for n in rng.permutation(len(people))), strict=True)
     pairs = np.concatenate([limbs + joints * n for n in range(len(xy))])
     found = Detections(
-        np.repeat(view, joints), np.tile(np.arange(joints), len(xy)), np.concatenate(xy), np.repeat(sure, joints),
-        pairs, np.ones(len(pairs)),
+        np.repeat(view, joints), np.tile(np.arange(joints), len(xy)), np.concatenate(xy),
+        np.repeat(sure, joints), pairs, np.ones(len(pairs)),
     )  # fmt: skip
     kept = Sightings.of(Recording(BODY_25, [found]), [0])
     assert np.bincount(kept.view).tolist() == [24, 24, 24]
@@ -310,11 +339,16 @@ def test_groups_of_frames_below_zero_are_those_of_any_others():
 @pytest.mark.slow
 @pytest.mark.parametrize("part", [0.4, 0.6])
 def test_children_are_no_mistake_of_the_calibration(people, room, look_at, part):
-    """Joints of 0.7 to 1 m tall people fit children, and adults in a rig that is too small: both are said."""
+    """Joints of 0.7 to 1 m tall people fit children, and adults in a rig that is too small: both
+    are said.
+    """
     report = check_setup(look_at(room, people * part), room)
     assert report.findings == () and report.stature_m == pytest.approx(1.7 * part, rel=0.12)
     assert len(report.notes) == 1
-    assert "m, as of children; if they are adults" in report.notes[0] and f"{part:.1f} times" in report.notes[0]
+    assert (
+        "m, as of children; if they are adults" in report.notes[0]
+        and f"{part:.1f} times" in report.notes[0]
+    )
 
 
 @pytest.mark.slow

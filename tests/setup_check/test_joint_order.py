@@ -22,7 +22,9 @@ def called_otherwise(recording, pairs) -> Recording:
     for one, other in pairs:
         i, j = (recording.skeleton.index(each) for each in (one, other))
         name[[i, j]] = name[[j, i]]
-    return Recording(recording.skeleton, [replace(frame, joint=name[frame.joint]) for frame in recording])
+    return Recording(
+        recording.skeleton, [replace(frame, joint=name[frame.joint]) for frame in recording]
+    )
 
 
 def both(*parts: str) -> list[tuple[str, str]]:
@@ -48,7 +50,13 @@ WRONG = {
     "wrists": (both("Wrist"), "left and right wrist appear to be exchanged"),
     "elbow and wrist": ([("RElbow", "RWrist")], "RElbow and RWrist appear to be exchanged"),
     "many": (
-        [("RElbow", "LKnee"), ("LWrist", "RHip"), ("Nose", "LAnkle"), ("RShoulder", "LHip"), ("RWrist", "LElbow")],
+        [
+            ("RElbow", "LKnee"),
+            ("LWrist", "RHip"),
+            ("Nose", "LAnkle"),
+            ("RShoulder", "LHip"),
+            ("RWrist", "LElbow"),
+        ],
         "the joints are in another order",
     ),
 }
@@ -73,9 +81,13 @@ def test_a_known_layout_that_fits_is_named(shared_cases):
     detections = read_detections(shared_cases / "body25b" / "detections", rig, "BODY_25")
     (words,) = order_findings(detections, rig)
     assert "in that of BODY_25B; give --skeleton BODY_25B" in words
-    detections = read_detections(shared_cases / "h36m_coco" / "detections_end_to_end", rig, "COCO_17")
+    detections = read_detections(
+        shared_cases / "h36m_coco" / "detections_end_to_end", rig, "COCO_17"
+    )
     (words,) = order_findings(detections, rig)
-    assert "do not look like a body in the joint order of COCO_17, but do in that of H36M_17" in words
+    assert (
+        "do not look like a body in the joint order of COCO_17, but do in that of H36M_17" in words
+    )
 
 
 @pytest.mark.slow

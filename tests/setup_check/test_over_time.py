@@ -1,4 +1,6 @@
-"""Cameras that fit in one part of a recording only, mirrored ones, and what a reconstruction makes of them."""
+"""Cameras that fit in one part of a recording only, mirrored ones, and what a reconstruction makes
+of them.
+"""
 
 from dataclasses import replace
 
@@ -35,7 +37,9 @@ def test_a_camera_that_is_bumped_is_named_with_the_frame_and_left_out_from_there
 
 @pytest.mark.slow
 def test_before_the_bump_it_may_be_that_it_does_not_fit(recording, room):
-    found = only_finding(check_setup(turning(recording, room, 0, lambda t: 0.0 if t >= 40 else 6.0), room))
+    found = only_finding(
+        check_setup(turning(recording, room, 0, lambda t: 0.0 if t >= 40 else 6.0), room)
+    )
     assert (found.kind, found.cameras, found.frames[0]) == (Kind.BUMPED, (0,), None)
     assert found.frames[1] == pytest.approx(40, abs=1)
 
@@ -118,24 +122,31 @@ def test_people_who_move_as_nobody_does_are_named_with_the_rate(recording, room)
     assert np.isfinite(people.time_s).all()
     none = np.zeros((0, 2), dtype=np.intp), np.zeros(0)
     crowd = [
-        Detections(*(np.repeat(each, 12, axis=0) for each in (f.view, f.joint, f.xy, f.confidence)), *none)
+        Detections(
+            *(np.repeat(each, 12, axis=0) for each in (f.view, f.joint, f.xy, f.confidence)), *none
+        )
         for f in recording
     ]
     crowd = Recording(recording.skeleton, crowd)
-    (said,) = result_check(report, people, crowd, room, range(60)).warnings  # detections beside those of people
+    (said,) = result_check(
+        report, people, crowd, room, range(60)
+    ).warnings  # detections beside those of people
     assert "people explain 8" in said and "surer ones" in said
 
 
 @pytest.mark.slow
 def test_a_camera_that_is_mostly_left_out_is_named_with_the_reason(recording, room):
-    """Turned by 25 degrees, it is left out by the check; without that nobody is given what it saw."""
+    """Turned by 25 degrees, it is left out by the check; without that nobody is given what it
+    saw.
+    """
     turned = turning(recording, room, 2, lambda t: 25.0)
     report = check_setup(turned, room)
     name = room.names[2]
     people = reconstruct(Trusted(turned, report.trust), room, frames=range(20))
     checked = result_check(report, people, Trusted(turned, report.trust), room, range(20))
     assert any(
-        each.startswith(f"{name}: 0 of ") and "left out with the camera" in each for each in checked.warnings
+        each.startswith(f"{name}: 0 of ") and "left out with the camera" in each
+        for each in checked.warnings
     )
     alone = reconstruct(turned, room, frames=range(20))
     checked = result_check(
@@ -146,13 +157,19 @@ def test_a_camera_that_is_mostly_left_out_is_named_with_the_reason(recording, ro
     use = checked.cameras[2]
     assert use.used + sum(use.unused.values()) == use.offered
     others = [each for view, each in enumerate(checked.cameras) if view != 2]
-    assert not any(each.camera in warning.split(":")[0] for each in others for warning in checked.warnings)
+    assert not any(
+        each.camera in warning.split(":")[0] for each in others for warning in checked.warnings
+    )
 
 
 @pytest.mark.slow
 def test_people_whom_two_cameras_see_and_who_are_not_found_are_counted(recording, room):
-    """Somebody is left out of the result: the sentence is among the warnings, which run.json and stderr have."""
-    people = reconstruct(recording, room, frames=range(20), times=FrameTimes.from_fps(10, len(recording)))
+    """Somebody is left out of the result: the sentence is among the warnings, which run.json and
+    stderr have.
+    """
+    people = reconstruct(
+        recording, room, frames=range(20), times=FrameTimes.from_fps(10, len(recording))
+    )
     first = np.unique(people.person)[0]
     fewer = people.rows(people.person != first)
     report = check_setup(recording, room)

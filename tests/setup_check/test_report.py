@@ -1,4 +1,6 @@
-"""What is printed and stored of a check: figures by camera and pair, sentences, the command, run.json."""
+"""What is printed and stored of a check: figures by camera and pair, sentences, the command,
+run.json.
+"""
 
 import json
 
@@ -40,7 +42,8 @@ def test_figures_of_a_good_set_up(recording, room):
     report = check_setup(recording, room)
     assert report.findings == () and report.warnings == ()
     for each in report.cameras:
-        # 2 px along each axis are 2.35 px in the median; triangulation takes a part, leaving out adds one.
+        # 2 px along each axis are 2.35 px in the median; triangulation takes a part, leaving out
+        # adds one.
         assert 1.5 < each.median_px < 2.4 < each.left_out_px < 4.5
         # At 4 to 5 m and 900 px a pixel is 4 to 6 mm.
         assert 4 < each.median_mm / each.median_px < 6.5
@@ -59,7 +62,9 @@ def test_the_bad_camera_stands_out_in_the_figures(recording, room):
     # Two cameras whose rays stay in one plane agree whatever the turn.
     assert np.median(with_it) < 0.3 < 0.9 < min(without)
     stored = json.loads(json.dumps(report.as_dict(), allow_nan=False))
-    assert stored["findings"][0]["kind"] == "turned" and stored["findings"][0]["cameras"] == ["cam2"]
+    assert stored["findings"][0]["kind"] == "turned" and stored["findings"][0]["cameras"] == [
+        "cam2"
+    ]
 
 
 @pytest.mark.parametrize("kind", list(Kind))
@@ -77,9 +82,13 @@ def test_the_command_says_it_in_words(files, room, capsys):
     assert code == 0 and "No problems were found" in out
     assert all(len(line) <= 80 for line in out.splitlines())
     write_rig(zoomed(room, 1, 2.0), files / "zoomed.json")
-    code, out, _ = run(["check-calibration", "--calibration", files / "zoomed.json", *options], capsys)
-    assert code == 1 and "cam1 has a focal length in the calibration that appears to be 2 times" in " ".join(
-        out.split()
+    code, out, _ = run(
+        ["check-calibration", "--calibration", files / "zoomed.json", *options], capsys
+    )
+    assert (
+        code == 1
+        and "cam1 has a focal length in the calibration that appears to be 2 times"
+        in " ".join(out.split())
     )
     options = ["--calibration", files / "zoomed.json", *options, "--json"]
     code, out, _ = run(["check-calibration", *options], capsys)
@@ -89,7 +98,16 @@ def test_the_command_says_it_in_words(files, room, capsys):
 @pytest.mark.slow
 def test_reconstruct_warns_and_stores_it(files, room, tmp_path, capsys):
     write_rig(Rig(room.cameras, "y"), files / "up.json")
-    options = ["--detections", files / "openpose", "--frames", "0:8", "--output", tmp_path / "out", "--workers", 1]
+    options = [
+        "--detections",
+        files / "openpose",
+        "--frames",
+        "0:8",
+        "--output",
+        tmp_path / "out",
+        "--workers",
+        1,
+    ]
     code, out, err = run(["reconstruct", "--calibration", files / "up.json", *options], capsys)
     assert code == 0 and "--up z" in err.replace("\n", " ")
     stored = json.loads((tmp_path / "out" / "run.json").read_text())
@@ -99,7 +117,8 @@ def test_reconstruct_warns_and_stores_it(files, room, tmp_path, capsys):
         assert each["given"]["median_px"] < 3 and each["left_out"]["median_px"] < 5
     assert "left out px" in out
     code, out, err = run(
-        ["reconstruct", "--calibration", files / "up.json", *options, "--no-check", "--overwrite"], capsys
+        ["reconstruct", "--calibration", files / "up.json", *options, "--no-check", "--overwrite"],
+        capsys,
     )
     assert (
         code == 0
@@ -165,7 +184,9 @@ def test_frames_as_spans():
 @pytest.mark.slow
 @pytest.mark.parametrize("temporal", [True, False])
 def test_speeds_need_identities(recording, room, temporal):
-    """Frame by frame numbers of people are no identities: whoever is number 0 next may stand anywhere."""
+    """Frame by frame numbers of people are no identities: whoever is number 0 next may stand
+    anywhere.
+    """
     N = 80
     joints = np.zeros((N, 25, 3))
     joints[::2, :, 0] = 1.3  # 1.3 m and back in a thirtieth of a second
@@ -185,5 +206,7 @@ def test_speeds_need_identities(recording, room, temporal):
         time_s=np.arange(N) / 30,
         run={"configuration": {"temporal": temporal}, "time": FrameTimes.from_fps(30, N).as_dict()},
     )
-    warnings = result_check(check_setup(recording, room), people, recording, room, range(len(recording))).warnings
+    warnings = result_check(
+        check_setup(recording, room), people, recording, room, range(len(recording))
+    ).warnings
     assert any("people move at 39 m/s" in each for each in warnings) == temporal

@@ -24,7 +24,9 @@ def real_mocap(shared_data: Path) -> Mocap:
 
 @pytest.fixture(scope="session")
 def tiny_arrays() -> dict[str, NDArray]:
-    """Two pairs who hold hands and sway (takes 1 and 9), one who walks 3.4 m, one who stands and waves."""
+    """Two pairs who hold hands and sway (takes 1 and 9), one who walks 3.4 m, one who stands and
+    waves.
+    """
     clips = [
         ("60_01", "60", "salsa dance", *dancer(90, 0.0)),
         ("61_01", "61", "salsa dance", *dancer(90, np.pi)),
@@ -57,7 +59,9 @@ def tiny_arrays() -> dict[str, NDArray]:
 
 
 @pytest.fixture(scope="session")
-def tiny_mocap_file(tiny_arrays: dict[str, NDArray], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def tiny_mocap_file(
+    tiny_arrays: dict[str, NDArray], tmp_path_factory: pytest.TempPathFactory
+) -> Path:
     """The tiny file."""
     path = tmp_path_factory.mktemp("mocap") / "tiny.npz"
     np.savez(path, **tiny_arrays)
@@ -79,7 +83,9 @@ def standing(count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def dancer(count: int, facing: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """One of two who face each other 0.5 m apart, sway together, both arms forward and up and down."""
+    """One of two who face each other 0.5 m apart, sway together, both arms forward and up and
+    down.
+    """
     poses, places = standing(count)
     time = np.arange(count) / 30.0
     poses[:, 0, 1] = facing

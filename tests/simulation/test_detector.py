@@ -13,7 +13,12 @@ from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.simulation import DetectorConfig, Scene, built_in_scene, simulate
 from shapepose_fg.simulation.detector import Detector
-from shapepose_fg.simulation.detector_statistics import JOINT_GROUP, LIMB_GROUP, DetectorStatistics, measured
+from shapepose_fg.simulation.detector_statistics import (
+    JOINT_GROUP,
+    LIMB_GROUP,
+    DetectorStatistics,
+    measured,
+)
 from shapepose_fg.simulation.visibility import FACE, Visibility, facing
 from shapepose_fg.viz.rendering import look_at
 
@@ -37,7 +42,9 @@ def crowd(count: int) -> tuple[Rig, np.ndarray]:
     """`count` point-like people far from each other, all seen by two cameras of a large image."""
     K = np.array([[900.0, 0, 2000], [0, 900.0, 2000], [0, 0, 1]])
     eyes = np.array([[0.0, -6, 1], [0.5, -6, 1]])
-    cameras = [Camera(f"c{i}", K, look_at(eye, eye + 6 * Y, Z), (4000, 4000)) for i, eye in enumerate(eyes)]
+    cameras = [
+        Camera(f"c{i}", K, look_at(eye, eye + 6 * Y, Z), (4000, 4000)) for i, eye in enumerate(eyes)
+    ]
     spots = np.arange(count)[:, None] % 12 * np.array([1.0, 0, 0]) - (5.5, 0, 0)
     joints = spots[:, None] + np.random.default_rng(0).uniform(-0.3, 0.3, (count, 25, 3))
     return Rig(tuple(cameras), up="z"), joints
@@ -49,16 +56,22 @@ def everything_seen(rig: Rig, people: int, seen: float = 1.0) -> Visibility:
 
 
 def nearest(found: Detections, rig: Rig, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Error (D, 2) px of each candidate against the nearest true joint of its label, and that person (D,)."""
+    """Error (D, 2) px of each candidate against the nearest true joint of its label, and that
+    person (D,).
+    """
     truth = rig.project(joints)[0].transpose(0, 2, 1, 3)[found.view, found.joint]  # (D, P, 2)
     error = found.xy[:, None] - truth
     person = np.linalg.norm(error, axis=-1).argmin(axis=1)
     return error[np.arange(len(person)), person], person
 
 
-def looks(rig: Rig, joints: np.ndarray, seen: Visibility, config: DetectorConfig, count: int) -> list[Detections]:
+def looks(
+    rig: Rig, joints: np.ndarray, seen: Visibility, config: DetectorConfig, count: int
+) -> list[Detections]:
     """First frames of `count` seeds: independent of each other."""
-    return [Detector(rig, len(joints), 25.0, config, seed).detect(joints, seen) for seed in range(count)]
+    return [
+        Detector(rig, len(joints), 25.0, config, seed).detect(joints, seen) for seed in range(count)
+    ]
 
 
 def drawing(**tables: object) -> DetectorStatistics:
@@ -77,7 +90,9 @@ def test_without_noise_the_candidates_are_the_truth(scene: Scene):
         error, person = nearest(found, scene.rig, joints)
         assert np.abs(error).max() < 1e-6 and (found.confidence == 1).all()
         first, second = found.pairs.T
-        limbs = {(int(a), int(b)) for a, b in zip(found.joint[first], found.joint[second], strict=True)}
+        limbs = {
+            (int(a), int(b)) for a, b in zip(found.joint[first], found.joint[second], strict=True)
+        }
         assert limbs == set(BODY_25.limbs)
         assert (found.view[first] == found.view[second]).all()
         assert (person[first] == person[second]).all() and (found.affinity == 1).all()
@@ -104,7 +119,8 @@ def test_some_frames_come_out_as_in_the_whole_recording(scene: Scene):
 def test_candidates_come_in_no_order_that_tells_people_apart(scene: Scene):
     found = simulate(scene, DetectorConfig.perfect(), frames=[0])[0]
     _, person = nearest(found, scene.rig, scene.truth_at(0))
-    # In order of persons there would be 3 changes a view and joint; shuffled, three in four neighbours differ.
+    # In order of persons there would be 3 changes a view and joint; shuffled, three in four
+    # neighbours differ.
     assert 0.6 < np.mean(person[1:] != person[:-1]) < 0.9
 
 
@@ -119,7 +135,8 @@ def test_misses_and_confidences_are_as_measured(seen: float, state: int):
     expected = 60 * 2 * 12
     for k in BODY:
         miss = table.miss[JOINT_GROUP[k], state]
-        # Joints of one kind are independent of each other: five standard errors, 23 * 2 of which are tried.
+        # Joints of one kind are independent of each other: five standard errors, 23 * 2 of which
+        # are tried.
         share = (joint == k).sum() / expected
         assert abs(1 - share - miss) < 5 * np.sqrt(miss * (1 - miss) / expected), BODY_25.joints[k]
         if (joint == k).sum() > 300:
@@ -146,13 +163,17 @@ def test_errors_are_as_large_as_their_confidence_says():
     for k, knot in enumerate(table.knots[3:], start=3):
         near = np.abs(confidence - knot) < 0.03
         assert near.sum() > 300
-        # Half of the errors of sigma are below sigma * 1.1774, whatever the tail's scale does about 1.
+        # Half of the errors of sigma are below sigma * 1.1774, whatever the tail's scale does about
+        # 1.
         median = np.median(np.linalg.norm(error_m[near], axis=1)) / 1.1774
         np.testing.assert_allclose(median, table.sigma_m[0, k], rtol=0.12)
     # Tails: the 90 % quantile of a Gaussian's length is 1.82 times its median.
-    size = np.linalg.norm(error_m, axis=1) / np.exp(np.interp(confidence, table.knots, np.log(table.sigma_m[0])))
+    size = np.linalg.norm(error_m, axis=1) / np.exp(
+        np.interp(confidence, table.knots, np.log(table.sigma_m[0]))
+    )
     assert 1.9 < np.quantile(size, 0.9) / np.median(size) < 2.4
-    # As often to the left as to the right; errors of one person and view go together, hence not much nearer 0.
+    # As often to the left as to the right; errors of one person and view go together, hence not
+    # much nearer 0.
     assert np.abs(error_m.mean(axis=0)).max() < 0.002
 
 
@@ -178,8 +199,8 @@ def test_errors_last_as_long_as_measured():
         for lag in (1, 5, 25):
             found_there = (values[lag:] * values[:-lag]).mean() / (values**2).mean()
             expected = (memory[:, 0] * np.exp(-lag / 25.0 / memory[:, 1])).sum()
-            # 24 views of people, each about 3 independent spells long: 0.1. Ranks hold joints of unlike
-            # confidence, which stay unlike: more correlated, never less.
+            # 24 views of people, each about 3 independent spells long: 0.1. Ranks hold joints of
+            # unlike confidence, which stay unlike: more correlated, never less.
             assert expected - 0.1 < found_there < expected + (0.1 if values.ndim == 5 else 0.5)
     assert 0.5 < (error[1:] * error[:-1]).mean() / (error**2).mean() < 0.95
 
@@ -217,7 +238,9 @@ def test_joints_are_found_under_both_names_as_often_as_configured():
         extra += twice.sum()
     total = 20 * apart.sum()
     assert abs(extra / total - 0.1) < 5 * np.sqrt(0.1 * 0.9 / total)
-    assert np.isclose(np.median(np.concatenate(gaps)), 0.02 * 1.1774, rtol=0.15)  # some 600 lengths: 5 % each way
+    assert np.isclose(
+        np.median(np.concatenate(gaps)), 0.02 * 1.1774, rtol=0.15
+    )  # some 600 lengths: 5 % each way
     # The share was measured on joints of which half or more is seen: the others are found once.
     hidden = looks(rig, joints, everything_seen(rig, 12, 0.4), config, 5)
     assert [len(found) for found in hidden] == [2 * 12 * 25] * 5
@@ -226,9 +249,13 @@ def test_joints_are_found_under_both_names_as_often_as_configured():
 @pytest.mark.slow
 @pytest.mark.parametrize(("seen", "hidden_by"), [(1.0, -1), (0.0, 0)])
 def test_whom_others_hide_is_missed_as_a_whole(seen: float, hidden_by: int):
-    """Joint 4 of every person, seen or hidden by another, where others hide nobody else, or 14 further joints."""
+    """Joint 4 of every person, seen or hidden by another, where others hide nobody else, or 14
+    further joints.
+    """
     rig, joints = crowd(12)
-    table = drawing(miss=np.full((14, 3), 0.2), buried_share=np.array([0.04, 0.6]), buried=np.array([0.0, 1.5]))
+    table = drawing(
+        miss=np.full((14, 3), 0.2), buried_share=np.array([0.04, 0.6]), buried=np.array([0.0, 1.5])
+    )
     shares = []
     for count in (0, 14):
         visibility = everything_seen(rig, 12)
@@ -246,24 +273,33 @@ def test_whom_others_hide_is_missed_as_a_whole(seen: float, hidden_by: int):
 def test_people_are_lost_as_wholes():
     rig, joints = crowd(12)
     table = drawing(
-        miss=np.full((14, 3), 0.025), lost=np.array([0.2, 0.1]), lost_correlation=np.full((25, 25), 1.0)
+        miss=np.full((14, 3), 0.025),
+        lost=np.array([0.2, 0.1]),
+        lost_correlation=np.full((25, 25), 1.0),
     )
     missed = []
-    for found in looks(rig, joints, everything_seen(rig, 12), replace(PLAIN, noise=0.0, statistics=table), 40):
+    for found in looks(
+        rig, joints, everything_seen(rig, 12), replace(PLAIN, noise=0.0, statistics=table), 40
+    ):
         count = np.zeros((2, 12))
         np.add.at(count, (found.view, nearest(found, rig, joints)[1]), 1)
         missed.append(1 - count.ravel() / 25)
     missed = np.concatenate(missed)
-    # 960 people in views: four standard errors, and as much again since single joints are missed by chance too.
+    # 960 people in views: four standard errors, and as much again since single joints are missed by
+    # chance too.
     assert abs((missed > 0.5).mean() - 0.2) < 0.1
     assert abs((missed > 0.8).mean() - 0.1) < 0.08
-    assert np.median(missed) < missed.mean() / 2  # joints that are lost one by one would make them equal
+    assert (
+        np.median(missed) < missed.mean() / 2
+    )  # joints that are lost one by one would make them equal
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
 def test_a_missed_joint_is_captured_by_who_hides_it(share: float):
-    """Person 1's right wrist is behind person 0: his elbow is joined to the wrist in front, or to none."""
+    """Person 1's right wrist is behind person 0: his elbow is joined to the wrist in front, or to
+    none.
+    """
     rig, joints = crowd(2)
     elbow, wrist = 3, 4
     visibility = everything_seen(rig, 2)
@@ -271,13 +307,17 @@ def test_a_missed_joint_is_captured_by_who_hides_it(share: float):
     miss = np.zeros((14, 3))
     miss[JOINT_GROUP[wrist], 2] = 1.0
     table = drawing(miss=miss, capture=np.full(len(measured().capture), share))
-    config = replace(DetectorConfig.perfect(), misses=1.0, captures=1.0, wrong_affinities=1.0, statistics=table)
+    config = replace(
+        DetectorConfig.perfect(), misses=1.0, captures=1.0, wrong_affinities=1.0, statistics=table
+    )
     taken = []
     for found in looks(rig, joints, visibility, config, 100):
         assert len(found) == 2 * 2 * 25 - 2
         _, person = nearest(found, rig, joints)
         first, second = found.pairs.T
-        of_arm = (found.joint[first] == elbow) & (found.joint[second] == wrist) & (person[first] == 1)
+        of_arm = (
+            (found.joint[first] == elbow) & (found.joint[second] == wrist) & (person[first] == 1)
+        )
         assert (person[second[of_arm]] == 0).all()
         taken.append(of_arm.sum() / 2)
     assert abs(np.mean(taken) - share) <= 5 * np.sqrt(share * (1 - share) / 200)
@@ -297,7 +337,9 @@ def test_near_candidates_of_one_joint_merge_into_one_that_belongs_to_both():
     expected[[4, 10]] = 1
     np.testing.assert_array_equal(count, np.tile(expected, (2, 1)))
     wrist = np.flatnonzero((found.joint == 4) & (found.view == 0))
-    assert len(found.affinity[(found.pairs[:, 1] == wrist) & (found.affinity > 0.5)]) == 2  # both elbows
+    assert (
+        len(found.affinity[(found.pairs[:, 1] == wrist) & (found.affinity > 0.5)]) == 2
+    )  # both elbows
 
 
 @pytest.mark.slow
@@ -308,7 +350,11 @@ def test_false_candidates_are_as_many_as_measured_and_belong_to_nobody():
     extra = [len(found) - 50 for found in looks(rig, joints, everything_seen(rig, 1), config, 300)]
     rate = 3.0 * 2 * (table.false_near + table.false_far)
     # Of those in the background, the few behind the person are covered.
-    assert rate - 0.05 * rate - 4 * np.sqrt(rate / 300) < np.mean(extra) < rate + 4 * np.sqrt(rate / 300)
+    assert (
+        rate - 0.05 * rate - 4 * np.sqrt(rate / 300)
+        < np.mean(extra)
+        < rate + 4 * np.sqrt(rate / 300)
+    )
     nobody = looks(rig, np.zeros((0, 25, 3)), everything_seen(rig, 0), config, 20)
     assert sum(map(len, nobody)) > 0 and all(len(found.affinity) == 0 for found in nobody)
 
@@ -318,7 +364,9 @@ def test_false_candidates_stay_a_while():
     config = replace(DetectorConfig.perfect(), false_candidates=400.0)
     detector = Detector(rig, 0, 25.0, config, seed=1)
     places = [detector.detect(joints[:0], everything_seen(rig, 0)).xy[:, 0] for _ in range(60)]
-    stay = sum(np.isin(now, later).sum() for now, later in pairwise(places)) / sum(map(len, places[:-1]))
+    stay = sum(np.isin(now, later).sum() for now, later in pairwise(places)) / sum(
+        map(len, places[:-1])
+    )
     memory = measured().false_memory
     expected = (memory[:, 0] * np.exp(-1 / 25.0 / memory[:, 1])).sum()
     assert abs(stay - expected) < 0.04  # some 70 at a time, 60 times, each there for a few frames
@@ -326,8 +374,8 @@ def test_false_candidates_stay_a_while():
 
 def test_affinities_are_as_measured():
     rig, joints = crowd(12)
-    # People who stand free are found with higher confidences than those on whom affinities were measured: here
-    # the affinities of right pairs do not go with them.
+    # People who stand free are found with higher confidences than those on whom affinities were
+    # measured: here the affinities of right pairs do not go with them.
     table = drawing(affinity_correlation=0.0)
     config = replace(PLAIN, noise=0.0, statistics=table)
     right = {group: [] for group in range(14)}
@@ -369,13 +417,18 @@ def test_faces_are_not_found_from_behind():
     head = joints.copy()
     nose, right_eye, left_eye, right_ear, left_ear = FACE
     head[0, [right_ear, left_ear]] = [[-0.07, 0, 1.6], [0.07, 0, 1.6]]
-    head[0, [nose, right_eye, left_eye]] = [[0.0, -0.11, 1.6], [-0.03, -0.1, 1.63], [0.03, -0.1, 1.63]]
+    head[0, [nose, right_eye, left_eye]] = [
+        [0.0, -0.11, 1.6],
+        [-0.03, -0.1, 1.63],
+        [0.03, -0.1, 1.63],
+    ]
     cosine = facing(head, rig.centres)
     assert (cosine[:, 0, 0] > 0.9).all() and np.abs(cosine[:, 0, 3:]).max() < 0.2
     away = head * (1, -1, 1)
     seen = everything_seen(rig, 1)
     count = [
-        sum(np.isin(f.joint, FACE[:3]).sum() for f in looks(rig, who, seen, PLAIN, 40)) for who in (head, away)
+        sum(np.isin(f.joint, FACE[:3]).sum() for f in looks(rig, who, seen, PLAIN, 40))
+        for who in (head, away)
     ]
     assert count[0] > 0.85 * 240 and count[1] < 0.2 * 240
 
@@ -387,7 +440,10 @@ def test_larger_and_smaller_knobs_err_more_and_less(scene: Scene):
         return float(np.linalg.norm(nearest(found, scene.rig, scene.truth_at(0))[0], axis=1).mean())
 
     assert mean_error(0.5) < mean_error(1.0) < mean_error(1.5)
-    counts = [len(simulate(scene, replace(PLAIN, misses=misses), frames=[0])[0]) for misses in (0.0, 1.0, 2.0)]
+    counts = [
+        len(simulate(scene, replace(PLAIN, misses=misses), frames=[0])[0])
+        for misses in (0.0, 1.0, 2.0)
+    ]
     assert counts[0] > counts[1] > counts[2] > 0
 
 
@@ -414,18 +470,33 @@ def test_settings_out_of_range_are_refused():
 def test_the_shipped_statistics_are_whole():
     table = measured()
     for field in fields(table):
-        assert field.name == "provenance" or np.isfinite(getattr(table, field.name)).all(), field.name
-    for name in ("confidence", "affinity_right", "affinity_right_confidence", "affinity_wrong", "affinity_nobody"):
+        assert field.name == "provenance" or np.isfinite(getattr(table, field.name)).all(), (
+            field.name
+        )
+    for name in (
+        "confidence",
+        "affinity_right",
+        "affinity_right_confidence",
+        "affinity_wrong",
+        "affinity_nobody",
+    ):
         assert (np.diff(getattr(table, name), axis=-1) >= 0).all(), name
     for name in ("miss", "capture", "affinity_wrong_share", "affinity_nobody_share"):
         assert ((getattr(table, name) >= 0) & (getattr(table, name) <= 1)).all(), name
     assert (np.diff(table.buried) >= 0).all() and (np.diff(table.buried_share) > 0).all()
     assert 0 <= table.lost[1] < table.lost[0] < 1
-    for memory in (table.error_memory, table.confidence_memory, table.false_memory, table.lost_memory):
+    for memory in (
+        table.error_memory,
+        table.confidence_memory,
+        table.false_memory,
+        table.lost_memory,
+    ):
         assert memory[:, 0].sum() <= 1 and (memory[:, 1] > 0).all()
     # What everybody knows of detectors: surer is nearer, hidden is missed more.
     assert (np.diff(table.sigma_m[0, ::2]) < 0).all()
     assert (table.miss[:, 2] > table.miss[:, 0]).all()
     probability = np.array([0.03, 0.3, 0.97])
     rows = np.broadcast_to(table.confidence[0, 0], (3, len(table.levels)))
-    np.testing.assert_allclose(table.probability(rows, table.quantile(rows, probability)), probability, atol=1e-9)
+    np.testing.assert_allclose(
+        table.probability(rows, table.quantile(rows, probability)), probability, atol=1e-9
+    )

@@ -1,4 +1,6 @@
-"""The same seed gives the same recording, whatever kernels linear algebra and compiled functions take."""
+"""The same seed gives the same recording, whatever kernels linear algebra and compiled functions
+take.
+"""
 
 import os
 import platform
@@ -25,7 +27,9 @@ PROCESSORS = [
 
 
 def recordings(mocap: Path) -> dict[str, np.ndarray]:
-    """Truth and detections of the built-in scene and of two pairs who dance, some frames of two seeds each."""
+    """Truth and detections of the built-in scene and of two pairs who dance, some frames of two
+    seeds each.
+    """
     found = {}
     for seed in (0, 1):
         demo = built_in_scene(seed, people=5, cameras=4, frames=4)
@@ -40,7 +44,10 @@ def parts(scene: Scene, seed: int) -> dict[str, np.ndarray]:
     recording = simulate(scene, seed=seed)
     names = vars(recording[0])
     made = {name: np.concatenate([vars(frame)[name] for frame in recording]) for name in names}
-    return made | {"count": np.array([len(frame) for frame in recording]), "joints": scene.keypoints}
+    return made | {
+        "count": np.array([len(frame) for frame in recording]),
+        "joints": scene.keypoints,
+    }
 
 
 def save(mocap: str, output: str) -> None:

@@ -26,13 +26,17 @@ def run(*arguments: str) -> int:
 
 @pytest.mark.slow
 def test_what_is_simulated_can_be_reconstructed_and_compared(tmp_path: Path, capsys):
-    assert run("simulate", "demo", "--output", str(tmp_path), "--frames", "40:43", "--seed", "5") == 0
+    assert (
+        run("simulate", "demo", "--output", str(tmp_path), "--frames", "40:43", "--seed", "5") == 0
+    )
     printed = capsys.readouterr()
     assert "3 frames of 4 people before 6 cameras" in printed.out and printed.err == ""
     truth = Reconstruction.load(tmp_path / "truth")
     scene = built_in_scene(5)
     np.testing.assert_array_equal(truth.joints.reshape(3, 4, 25, 3), scene.keypoints[40:43])
-    np.testing.assert_array_equal(truth.body_pose.reshape(3, 4, 23, 3), scene.motion.body_pose[40:43])
+    np.testing.assert_array_equal(
+        truth.body_pose.reshape(3, 4, 23, 3), scene.motion.body_pose[40:43]
+    )
     np.testing.assert_array_equal(truth.frame, np.repeat([0, 1, 2], 4))
     assert (truth.covariance == 0).all() and (truth.status == Status.OK).all()
     assert truth.run["simulated"]["name"] == "demo" and truth.run["simulated"]["first_frame"] == 40
@@ -47,7 +51,18 @@ def test_what_is_simulated_can_be_reconstructed_and_compared(tmp_path: Path, cap
 
 @pytest.mark.parametrize("format", ["association", "openpose"])
 def test_the_same_seed_gives_the_same_files(tmp_path: Path, format: str):
-    options = ["simulate", "demo", "--frames", ":2", "--cameras", "2", "--people", "2", "--format", format]
+    options = [
+        "simulate",
+        "demo",
+        "--frames",
+        ":2",
+        "--cameras",
+        "2",
+        "--people",
+        "2",
+        "--format",
+        format,
+    ]
     for folder, seed in (("one", "1"), ("same", "1"), ("other", "2")):
         assert run(*options, "--output", str(tmp_path / folder), "--seed", seed) == 0
     files = [
@@ -59,7 +74,9 @@ def test_the_same_seed_gives_the_same_files(tmp_path: Path, format: str):
     assert sum(files[0][name] != files[2][name] for name in files[0]) > 3
 
 
-@pytest.mark.parametrize(("people", "cameras"), [(1, 2), (4, 3), (0, 6), *slow((12, 6), (4, 12), (12, 12))])
+@pytest.mark.parametrize(
+    ("people", "cameras"), [(1, 2), (4, 3), (0, 6), *slow((12, 6), (4, 12), (12, 12))]
+)
 def test_any_number_of_people_and_cameras(tmp_path: Path, people: int, cameras: int):
     scene = named_scene("demo", people=people, cameras=cameras).part(range(2))
     written = write_simulated(scene, simulate(scene), tmp_path, "association")
@@ -101,7 +118,17 @@ def test_errors_are_one_sentence(tmp_path: Path, monkeypatch, capsys, arguments,
 
 
 def test_frames_of_an_earlier_run_are_not_mixed_with_new_ones(tmp_path: Path, capsys):
-    options = ["simulate", "demo", "--people", "1", "--cameras", "2", "--format", "openpose", "--output"]
+    options = [
+        "simulate",
+        "demo",
+        "--people",
+        "1",
+        "--cameras",
+        "2",
+        "--format",
+        "openpose",
+        "--output",
+    ]
     assert run(*options, str(tmp_path), "--frames", ":2") == 0
     assert run(*options, str(tmp_path), "--frames", ":1") == 2
     assert "frames of another recording" in capsys.readouterr().err
@@ -115,7 +142,12 @@ def test_a_sequence_of_recorded_motions(shared_data: Path, tmp_path: Path, monke
     assert run(*options, "--output", str(tmp_path)) == 0
     assert len(Reconstruction.load(tmp_path / "truth")) == 2 * 8
     about = json.loads((tmp_path / "truth" / "run.json").read_text())["simulated"]
-    assert about["split"] == "tune" and about["frames"] == 2 and about["fps"] == 30 and about["cuts"] == []
+    assert (
+        about["split"] == "tune"
+        and about["frames"] == 2
+        and about["fps"] == 30
+        and about["cuts"] == []
+    )
     assert len(read_detections(tmp_path, read_rig(tmp_path / "rig.json"))[1]) > 100
 
 
@@ -126,7 +158,9 @@ def test_cuts_are_listed_counted_from_the_first_frame_that_is_written(tmp_path: 
     part = whole.part(range(2, 8))
     assert part.cuts == (3,) and part.clips == names[1:3] and len(part) == 6
     np.testing.assert_array_equal(part.keypoints, scene.keypoints[2:8])
-    written = write_simulated(whole.part(range(4, 9)), simulate(scene.part(range(4, 9))), tmp_path, "association")
+    written = write_simulated(
+        whole.part(range(4, 9)), simulate(scene.part(range(4, 9))), tmp_path, "association"
+    )
     truth = Reconstruction.load(written["truth"])
     assert truth.run["simulated"]["cuts"] == [1, 4] and truth.run["simulated"]["fps"] == 25.0
     np.testing.assert_allclose(truth.time_s, truth.frame / 25.0)

@@ -1,4 +1,6 @@
-"""Recorded motions: what is read, and that a body of any shape does what was recorded, on the floor."""
+"""Recorded motions: what is read, and that a body of any shape does what was recorded, on the
+floor.
+"""
 
 from pathlib import Path
 
@@ -31,19 +33,31 @@ def chained(rotations: NDArray[np.float64], chain: tuple[int, ...]) -> NDArray[n
     return turned
 
 
-def lowest(body: BodyModel, betas: NDArray[np.float64], performed: Performance, every: int) -> NDArray[np.float64]:
+def lowest(
+    body: BodyModel, betas: NDArray[np.float64], performed: Performance, every: int
+) -> NDArray[np.float64]:
     """Lowest vertex of some frames: of the whole mesh, which the code itself never looks at."""
     motion = together(betas[None], [performed], len(performed))
     scene = Scene(ring_of_cameras(2, np.random.default_rng(0)), body, motion, 30.0)
-    return np.array([scene.vertices_at(frame)[0, :, 2].min() for frame in range(0, len(performed), every)])
+    return np.array(
+        [scene.vertices_at(frame)[0, :, 2].min() for frame in range(0, len(performed), every)]
+    )
 
 
 def test_a_file_is_read(tiny_mocap: Mocap):
     assert len(tiny_mocap) == 6 and tiny_mocap.pairs == ((0, 1), (2, 3))
     clip = tiny_mocap.clip(4)
-    assert (clip.name, clip.subject, clip.action, len(clip), clip.fps) == ("05_01", "05", "walk", 80, 30.0)
+    assert (clip.name, clip.subject, clip.action, len(clip), clip.fps) == (
+        "05_01",
+        "05",
+        "walk",
+        80,
+        30.0,
+    )
     np.testing.assert_allclose(clip.pelvis[30], [0.0, 0.95, 1.3], atol=1e-5)
-    np.testing.assert_allclose(Rotation.from_matrix(clip.rotations[:, 1]).as_rotvec()[0], [-0.1, 0, 0], atol=1e-3)
+    np.testing.assert_allclose(
+        Rotation.from_matrix(clip.rotations[:, 1]).as_rotvec()[0], [-0.1, 0, 0], atol=1e-3
+    )
 
 
 @pytest.mark.parametrize(
@@ -60,7 +74,9 @@ def test_a_file_is_read(tiny_mocap: Mocap):
         ({"names": np.array([{}] * 6, dtype=object)}, "cannot be read"),
     ],
 )
-def test_wrong_files_are_refused(tiny_arrays: dict[str, NDArray], tmp_path: Path, change: dict, message: str):
+def test_wrong_files_are_refused(
+    tiny_arrays: dict[str, NDArray], tmp_path: Path, change: dict, message: str
+):
     arrays = {name: value for name, value in (tiny_arrays | change).items() if value is not None}
     assert len(tiny_arrays["poses"]) == 510
     path = tmp_path / "wrong.npz"
@@ -72,7 +88,11 @@ def test_wrong_files_are_refused(tiny_arrays: dict[str, NDArray], tmp_path: Path
 def test_what_is_no_archive_is_refused(tmp_path: Path):
     with pytest.raises(InputError, match="no such file"):
         Mocap.load(tmp_path / "none.npz")
-    for name, content in (("text.npz", b"hello"), ("cut.npz", b"PK\x03\x04 cut short"), ("empty.npz", b"")):
+    for name, content in (
+        ("text.npz", b"hello"),
+        ("cut.npz", b"PK\x03\x04 cut short"),
+        ("empty.npz", b""),
+    ):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(InputError, match="cannot be read"):
             Mocap.load(tmp_path / name)
@@ -94,7 +114,9 @@ def test_shoulders_keep_the_upper_arm_where_it_was():
 
 def test_collars_rise_with_the_arm_after_the_first_thirty_degrees():
     def collar(elevation_deg: float, side: int) -> NDArray[np.float64]:
-        """Where the collar's outer end goes, from that of the hanging arm; the arm is in the frontal plane."""
+        """Where the collar's outer end goes, from that of the hanging arm; the arm is in the
+        frontal plane.
+        """
         local = np.tile(np.eye(3), (2, 24, 1, 1))
         for row, angle in enumerate((0.0, elevation_deg)):
             turn = np.radians(angle - 90.0) * (1, -1)[side]
@@ -104,7 +126,8 @@ def test_collars_rise_with_the_arm_after_the_first_thirty_degrees():
 
     for side in (0, 1):
         assert abs(collar(20.0, side)) < 0.5  # the dead zone, whose corner is rounded
-        # A fifth of the rest: half of the third that is not the shoulder's own (the rest turns in place).
+        # A fifth of the rest: half of the third that is not the shoulder's own (the rest turns in
+        # place).
         assert collar(90.0, side) == pytest.approx(12.0, abs=1.0)
         assert collar(170.0, side) == pytest.approx(28.0, abs=2.0)
 
@@ -117,7 +140,8 @@ def test_arms_point_in_the_room_as_they_did_in_the_recording(tiny_mocap: Mocap, 
         np.testing.assert_allclose(
             chained(performed.rotations, chain), turn @ chained(clip.rotations, chain), atol=1e-9
         )
-    # And with them the joints: the arm's bone has the recorded direction but for the rest pose's own slope.
+    # And with them the joints: the arm's bone has the recorded direction but for the rest pose's
+    # own slope.
     bone = performed.joints[:, 19] - performed.joints[:, 17]
     rest = performed.rest[19] - performed.rest[17]
     expected = np.einsum("tij,j->ti", turn @ chained(clip.rotations, UPPER_ARMS[1]), rest)
@@ -125,7 +149,9 @@ def test_arms_point_in_the_room_as_they_did_in_the_recording(tiny_mocap: Mocap, 
 
 
 def test_parameters_pose_the_body_that_was_planned(tiny_mocap: Mocap, body: BodyModel):
-    """SMPL's `transl` is not the pelvis: the joints of the parameters are those of the performance."""
+    """SMPL's `transl` is not the pelvis: the joints of the parameters are those of the
+    performance.
+    """
     double = BodyModel(body.arrays)
     performed = perform(double, SHAPES[1], tiny_mocap.clip(0)).moved(np.array([0.4, -0.3]), 1.1)
     motion = together(SHAPES[1:2], [performed], len(performed))
@@ -148,7 +174,9 @@ def test_ways_are_longer_by_the_ratio_of_the_legs(tiny_mocap: Mocap, body: BodyM
 @pytest.mark.parametrize("shape", [0, 1, 2])
 def test_synthetic_people_stand_on_the_floor(tiny_mocap: Mocap, body: BodyModel, shape: int):
     for index in (0, 4, 5):
-        heights = lowest(body, SHAPES[shape], perform(body, SHAPES[shape], tiny_mocap.clip(index)), 7)
+        heights = lowest(
+            body, SHAPES[shape], perform(body, SHAPES[shape], tiny_mocap.clip(index)), 7
+        )
         assert (np.abs(heights) < 0.03).mean() > 0.9
         assert heights.min() > -0.06
 
@@ -163,7 +191,9 @@ def test_another_rate_is_the_same_motion(tiny_mocap: Mocap):
     back = Rotation.from_matrix(
         np.swapaxes(fast.rotations[0:-2:2, 1], -1, -2) @ fast.rotations[1::2, 1]
     ).magnitude()
-    on = Rotation.from_matrix(np.swapaxes(fast.rotations[1::2, 1], -1, -2) @ fast.rotations[2::2, 1]).magnitude()
+    on = Rotation.from_matrix(
+        np.swapaxes(fast.rotations[1::2, 1], -1, -2) @ fast.rotations[2::2, 1]
+    ).magnitude()
     np.testing.assert_allclose(back, on, atol=1e-7)
     slow = clip.resampled(25.0)
     assert len(slow) == 66 and slow.fps == 25.0
@@ -178,7 +208,9 @@ def test_a_marker_that_jumps_is_bridged(tiny_arrays: dict[str, NDArray], tmp_pat
     np.savez(tmp_path / "jump.npz", **arrays)
     clip = Mocap.load(tmp_path / "jump.npz").clip(0)
     angle = Rotation.from_matrix(clip.rotations[:, 1]).magnitude()
-    assert angle.max() < 0.01  # the dancer's hip does not turn; the first frames after the jump go with it
+    assert (
+        angle.max() < 0.01
+    )  # the dancer's hip does not turn; the first frames after the jump go with it
 
 
 def test_a_clip_without_end_has_no_jump(tiny_mocap: Mocap, body: BodyModel):
@@ -197,14 +229,17 @@ def test_a_walk_follows_a_path(tiny_mocap: Mocap, body: BodyModel):
     time = np.linspace(0.0, 2 * np.pi, 240)
     path, heading = 1.4 * np.stack([np.cos(time), np.sin(time)], axis=1), time + np.pi / 2
     performed = walk_along(body, SHAPES[2], tiny_mocap.clip(4), path, heading, fps=30.0)
-    assert np.linalg.norm(performed.joints[:, 0, :2] - path, axis=1).max() < 0.05  # but for the hips' swing
+    assert (
+        np.linalg.norm(performed.joints[:, 0, :2] - path, axis=1).max() < 0.05
+    )  # but for the hips' swing
     forward = performed.rotations[:, 0, :2, 2]  # where the pelvis faces
     ahead = np.stack([np.cos(heading), np.sin(heading)], axis=1)
     assert (forward * ahead).sum(axis=1).min() > 0.95
     assert np.linalg.norm(np.diff(performed.joints, axis=0), axis=-1).max() * 30 < 8.0
     heights = lowest(body, SHAPES[2], performed, 9)
     assert np.abs(heights).max() < 0.06
-    # Both legs take about as many steps as the way is long: 8.8 m at 1.3 m a double step of the recorded leg.
+    # Both legs take about as many steps as the way is long: 8.8 m at 1.3 m a double step of the
+    # recorded leg.
     step = (performed.joints[:, 7] - performed.joints[:, 8])[:, :2]
     crossings = np.diff(np.sign((step * ahead).sum(axis=1))) != 0
     expected = 2 * 8.8 / (1.3 * Figure(body, SHAPES[2]).leg_m / 0.8)
@@ -233,7 +268,10 @@ def test_hands_that_are_near_are_brought_together(body: BodyModel):
         np.testing.assert_allclose(held(*together_), 0.07, atol=0.01)
         for before, after in zip((lead, follow), together_, strict=True):
             for first, second in ((16, 18), (18, 20), (17, 19), (19, 21)):
-                bones = [np.linalg.norm(p.joints[:, first] - p.joints[:, second], axis=1) for p in (before, after)]
+                bones = [
+                    np.linalg.norm(p.joints[:, first] - p.joints[:, second], axis=1)
+                    for p in (before, after)
+                ]
                 np.testing.assert_allclose(*bones, atol=1e-9)
             np.testing.assert_array_equal(after.joints[:, :16], before.joints[:, :16])
     away = lead.moved(np.array([0.0, -2 * reach - 0.5]), np.pi)
@@ -247,11 +285,16 @@ def test_real_people_stand_on_the_floor(real_mocap: Mocap, body: BodyModel):
         heights = lowest(body, SHAPES[shape], performed, 23)
         assert (np.abs(heights) < 0.03).mean() > 0.85, real_mocap.names[index]
         assert heights.min() > -0.06, real_mocap.names[index]
-        keypoints = keypoints_of(body, together(SHAPES[shape : shape + 1], [performed], len(performed)))
+        keypoints = keypoints_of(
+            body, together(SHAPES[shape : shape + 1], [performed], len(performed))
+        )
         assert np.linalg.norm(np.diff(keypoints, axis=0), axis=-1).max() * 30 < 12.0
-        # No jitter from frame to frame that the recording does not have: accelerations of the pelvis.
+        # No jitter from frame to frame that the recording does not have: accelerations of the
+        # pelvis.
         height = performed.joints[:, 0, 2]
-        assert np.abs(np.diff(height, 2)).max() * 900 < 40.0  # m/s^2: a stamp, not a jump of centimetres
+        assert (
+            np.abs(np.diff(height, 2)).max() * 900 < 40.0
+        )  # m/s^2: a stamp, not a jump of centimetres
 
 
 @pytest.mark.slow
@@ -265,4 +308,6 @@ def test_real_pairs_hold_hands(real_mocap: Mocap, body: BodyModel):
         raw.append(held(*two)[near])
         gaps.append(held(*hold_hands(two[0], two[1], 30.0))[near])
     assert np.median(np.concatenate(gaps)) < 0.09
-    assert np.median(np.concatenate(raw)) > 0.1  # what the recordings' limbs leave between hands that touched
+    assert (
+        np.median(np.concatenate(raw)) > 0.1
+    )  # what the recordings' limbs leave between hands that touched

@@ -26,7 +26,8 @@ def test_shapes_and_truth(scene: Scene):
 
 def test_feet_are_on_the_floor_and_heads_above(scene: Scene):
     lowest = np.array([scene.vertices_at(frame)[..., 2].min(axis=1) for frame in range(0, 60, 6)])
-    # A flat sole is at 0 by construction; a foot that rolls over its toes may dip by a few millimetres more.
+    # A flat sole is at 0 by construction; a foot that rolls over its toes may dip by a few
+    # millimetres more.
     assert np.abs(lowest).max() < 0.05
     assert np.median(np.abs(lowest)) < 0.015
     assert (scene.keypoints[..., 2] > 0).all()
@@ -45,7 +46,10 @@ def test_motion_is_close_and_human(scene: Scene):
     assert couple.min() > 0.4 and couple.max() < 0.75
     others = np.linalg.norm(hips[:, 2:3] - hips[:, [0, 1, 3]], axis=-1)
     assert others.min() < 0.65  # the walker passes close by
-    assert np.linalg.norm(hips[:, :, None] - hips[:, None], axis=-1)[:, *np.triu_indices(4, 1)].min() > 0.35
+    assert (
+        np.linalg.norm(hips[:, :, None] - hips[:, None], axis=-1)[:, *np.triu_indices(4, 1)].min()
+        > 0.35
+    )
     assert np.linalg.norm(hips[-1, 2] - hips[0, 2]) > 1.5  # and really walks
     # The couple turns about each other by more than a right angle.
     direction = hips[:, 0, :2] - hips[:, 1, :2]
@@ -96,7 +100,8 @@ def test_cameras_look_inward_from_different_sides(scene: Scene):
 
 
 @pytest.mark.parametrize(
-    ("people", "cameras", "frames"), [(0, 2, 3), (1, 2, 3), (2, 3, 1), (3, 4, 2), (12, 12, 2), (4, 6, 0)]
+    ("people", "cameras", "frames"),
+    [(0, 2, 3), (1, 2, 3), (2, 3, 1), (3, 4, 2), (12, 12, 2), (4, 6, 0)],
 )
 def test_any_number_of_people_cameras_and_frames(people: int, cameras: int, frames: int):
     scene = built_in_scene(1, people=people, cameras=cameras, frames=frames)

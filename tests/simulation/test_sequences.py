@@ -40,7 +40,12 @@ def hip_gaps(scene: Scene) -> NDArray[np.float64]:
 
 def unrelated(scene: Scene, pairs: int) -> NDArray[np.float64]:
     """(T, K) distances between the hips of people who do not dance together."""
-    dyads = [(a, b) for a in range(scene.people) for b in range(a) if not (a < 2 * pairs and a // 2 == b // 2)]
+    dyads = [
+        (a, b)
+        for a in range(scene.people)
+        for b in range(a)
+        if not (a < 2 * pairs and a // 2 == b // 2)
+    ]
     return hip_gaps(scene)[:, *np.array(dyads).T]
 
 
@@ -53,7 +58,11 @@ def speeds(scene: Scene) -> NDArray[np.float64]:
 @pytest.fixture(scope="module")
 def real(real_mocap: Mocap) -> dict[tuple[str, Split], Scene]:
     """The beginning of every sequence: two or three segments each."""
-    return {(name, split): sequence(name, split, real_mocap, frames=500) for name in SEQUENCES for split in SPLITS}
+    return {
+        (name, split): sequence(name, split, real_mocap, frames=500)
+        for name in SEQUENCES
+        for split in SPLITS
+    }
 
 
 @pytest.mark.parametrize("split", ["report", *slow("tune")])
@@ -73,11 +82,17 @@ def test_tiny_sequences(tiny_mocap: Mocap, name: str, split: Split):
 
 def test_each_split_uses_its_own_takes_only(real_mocap: Mocap):
     assert TAKES["tune"] == range(1, 8) and TAKES["report"] == range(9, 16)
-    used = {split: {name for pair in salsa_takes(real_mocap, split) for name in pair} for split in SPLITS}
+    used = {
+        split: {name for pair in salsa_takes(real_mocap, split) for name in pair}
+        for split in SPLITS
+    }
     assert used["tune"].isdisjoint(used["report"])
-    assert len(used["tune"]) + len(used["report"]) == 2 * len(real_mocap.pairs)  # every pair is in one split
+    assert len(used["tune"]) + len(used["report"]) == 2 * len(
+        real_mocap.pairs
+    )  # every pair is in one split
     frames = {
-        split: sum(real_mocap.lengths[lead] for lead, _ in salsa_takes(real_mocap, split)) for split in SPLITS
+        split: sum(real_mocap.lengths[lead] for lead, _ in salsa_takes(real_mocap, split))
+        for split in SPLITS
     }
     assert min(frames.values()) > 5000
 
@@ -95,7 +110,8 @@ def test_dancers_are_the_pairs_and_nobody_else(real: dict[tuple[str, Split], Sce
                 else:
                     assert subject not in DANCERS
             pairs = [
-                {clip.partition("_")[2] for clip in clips[first : first + 2]} for first in range(0, dancing, 2)
+                {clip.partition("_")[2] for clip in clips[first : first + 2]}
+                for first in range(0, dancing, 2)
             ]
             assert all(len(trials) == 1 for trials in pairs)  # two of a pair: the same trial
         assert len(scene.clips) == len(scene.cuts) + 1
@@ -111,8 +127,8 @@ def test_pairs_are_close_and_others_keep_their_distance(real: dict[tuple[str, Sp
         others = unrelated(scene, pairs)
         assert others.min() >= 0.35
         assert np.median(others.min(axis=1)) < 1.0  # and yet somebody is within arm's reach
-    # As recorded: 0.2 to 0.8 m but for a turn away or an open hold. Two who do not dance together: 1.3 m and more,
-    # a fifth of the time within 1 m.
+    # As recorded: 0.2 to 0.8 m but for a turn away or an open hold. Two who do not dance together:
+    # 1.3 m and more, a fifth of the time within 1 m.
     assert all(gaps.min() > 0.12 and gaps.max() < 2.0 for gaps in together)
     assert 0.3 < np.median(together) < 0.8 and np.less(together, 1.0).mean() > 0.8
 
@@ -124,7 +140,8 @@ def test_nobody_walks_through_a_body(real: dict[tuple[str, Split], Scene]):
         for a in range(scene.people):
             for b in range(a):
                 if not (a < 2 * pairs and a // 2 == b // 2):
-                    # Spine to spine, as capsules would be tested: two trunks are about 0.25 m thick each.
+                    # Spine to spine, as capsules would be tested: two trunks are about 0.25 m thick
+                    # each.
                     lines = [points[:, p][:, [1, 8]].mean(axis=1) for p in (a, b)]
                     assert np.linalg.norm(lines[0] - lines[1], axis=1).min() > 0.3
 
@@ -134,14 +151,18 @@ def test_people_stay_in_the_room_and_nobody_jumps(real: dict[tuple[str, Split], 
     for scene in real.values():
         assert np.abs(scene.keypoints[:, :, HIP, :2]).max() < 2.0
         assert speeds(scene).max() < 12.0
-        assert np.linalg.norm(np.diff(scene.keypoints[..., HIP, :], axis=0), axis=-1).max() > 0  # they do move
+        assert (
+            np.linalg.norm(np.diff(scene.keypoints[..., HIP, :], axis=0), axis=-1).max() > 0
+        )  # they do move
 
 
 @pytest.mark.slow
 @pytest.mark.slow
 def test_feet_are_on_the_floor(real: dict[tuple[str, Split], Scene]):
     for scene in real.values():
-        lowest = np.array([scene.vertices_at(frame)[..., 2].min(axis=1) for frame in range(5, len(scene), 80)])
+        lowest = np.array(
+            [scene.vertices_at(frame)[..., 2].min(axis=1) for frame in range(5, len(scene), 80)]
+        )
         assert (np.abs(lowest) < 0.03).mean() > 0.85
         assert lowest.min() > -0.07  # a hand on the floor may be deeper in it than a foot
 
@@ -150,7 +171,8 @@ def test_feet_are_on_the_floor(real: dict[tuple[str, Split], Scene]):
 def test_the_same_seed_gives_the_same_bytes(tiny_mocap: Mocap):
     config = SEQUENCES["salsa"]
     first, again, other = (
-        sequence("salsa", "tune", tiny_mocap, frames=40, config=replace(config, seed=seed)) for seed in (3, 3, 4)
+        sequence("salsa", "tune", tiny_mocap, frames=40, config=replace(config, seed=seed))
+        for seed in (3, 3, 4)
     )
     for name in ("betas", "global_orient", "body_pose", "transl"):
         assert getattr(first.motion, name).tobytes() == getattr(again.motion, name).tobytes()
@@ -162,7 +184,9 @@ def test_the_same_seed_gives_the_same_bytes(tiny_mocap: Mocap):
 def test_the_beginning_of_a_sequence_is_as_in_the_whole_one(tiny_mocap: Mocap):
     whole = sequence("salsa", "tune", tiny_mocap, frames=190)
     some = sequence("salsa", "tune", tiny_mocap, frames=190, until=whole.cuts[0] + 1)
-    assert len(some) == whole.cuts[1] and some.cuts == whole.cuts[:1] and some.clips == whole.clips[:2]
+    assert (
+        len(some) == whole.cuts[1] and some.cuts == whole.cuts[:1] and some.clips == whole.clips[:2]
+    )
     for name in ("global_orient", "body_pose", "transl"):
         assert np.array_equal(getattr(some.motion, name), getattr(whole.motion, name)[: len(some)])
     assert len(sequence("salsa", "tune", tiny_mocap, frames=190, until=5000)) == 190
@@ -177,7 +201,8 @@ def test_difficulty_is_in_the_configuration(tiny_mocap: Mocap):
     distance = np.linalg.norm(scene.rig.centres[:, :2], axis=1)
     assert distance.min() >= 4.0 and distance.max() <= 4.1
     assert scene.rig.centres[:, 2].min() >= 1.4 and scene.rig.centres[:, 2].max() <= 1.8
-    # The betas of two who dance together are nearer to each other than to those of the others, on average.
+    # The betas of two who dance together are nearer to each other than to those of the others, on
+    # average.
     gaps = np.linalg.norm(scene.motion.betas[:, None] - scene.motion.betas[None], axis=-1)
     assert gaps[[0, 2], [1, 3]].mean() < gaps[4:, :4].mean()
 

@@ -30,17 +30,24 @@ def scene() -> Scene:
 
 
 def rig_of(*views: tuple[NDArray, NDArray]) -> Rig:
-    cameras = (Camera(f"c{i}", K, look_at(eye, target, Z), (1280, 720)) for i, (eye, target) in enumerate(views))
+    cameras = (
+        Camera(f"c{i}", K, look_at(eye, target, Z), (1280, 720))
+        for i, (eye, target) in enumerate(views)
+    )
     return Rig(tuple(cameras), up="z")
 
 
-def look(rig: Rig, joints: NDArray, meshes: NDArray, scene: Scene, config: VisibilityConfig) -> Visibility:
+def look(
+    rig: Rig, joints: NDArray, meshes: NDArray, scene: Scene, config: VisibilityConfig
+) -> Visibility:
     skin = Skin.of(scene.body, config.cell_m)
     return see(rig, joints, meshes[:, skin.vertices], skin, config)
 
 
 def standing(scene: Scene) -> tuple[NDArray, NDArray]:
-    """Joints (25, 3) and mesh (Nv, 3) of the mean body in its T-pose: z up, facing -y, left is +x."""
+    """Joints (25, 3) and mesh (Nv, 3) of the mean body in its T-pose: z up, facing -y, left is
+    +x.
+    """
     turn = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     return (
         scene.body.arrays.keypoint_regressor @ scene.body.arrays.template @ turn,
@@ -49,7 +56,8 @@ def standing(scene: Scene) -> tuple[NDArray, NDArray]:
 
 
 def first_met(origin: NDArray, target: NDArray, mesh: NDArray, faces: NDArray) -> tuple[float, int]:
-    """Share of the way from `origin` to `target` at which a face turned to the ray is met first, and that face.
+    """Share of the way from `origin` to `target` at which a face turned to the ray is met first,
+    and that face.
 
     Moeller and Trumbore 1997; inf and -1 where none is.
     """
@@ -77,14 +85,18 @@ def bones_near(scene: Scene, own: str) -> NDArray:
 
 @pytest.mark.slow
 def test_it_decides_as_rays_through_the_whole_mesh_do(scene: Scene):
-    """The rule, worked out anew for joints that lie inside limbs: whose skin does a ray meet first."""
+    """The rule, worked out anew for joints that lie inside limbs: whose skin does a ray meet
+    first.
+    """
     owns = {"RElbow": "right_elbow", "LWrist": "left_wrist", "MidHip": "pelvis", "LHip": "left_hip"}
     owns |= {"RKnee": "right_knee", "LAnkle": "left_ankle", "Neck": "neck left_collar right_collar"}
     frame, faces = 3, scene.body.faces
     meshes, joints = scene.vertices_at(frame).astype(np.float64), scene.truth_at(frame)
     flat = (faces[None] + np.arange(4)[:, None, None] * meshes.shape[1]).reshape(-1, 3)
     weights = scene.body.arrays.weights[faces].mean(axis=1)
-    exact = look(scene.rig, joints, meshes, scene, VisibilityConfig(image_scale=1.0, cell_m=0.0, probe_m=0.0))
+    exact = look(
+        scene.rig, joints, meshes, scene, VisibilityConfig(image_scale=1.0, cell_m=0.0, probe_m=0.0)
+    )
     quick = look(scene.rig, joints, meshes, scene, VisibilityConfig())
     wrong_exact, wrong_quick, seen = [], [], []
     for view in (0, 3):
@@ -104,7 +116,8 @@ def test_it_decides_as_rays_through_the_whole_mesh_do(scene: Scene):
                 wrong_exact.append(exact.hidden_by[view, person, joint] != hidden_by)
                 wrong_quick.append(quick.hidden_by[view, person, joint] != hidden_by)
     assert 0.4 < np.mean(seen) < 0.9
-    # What is left: rays through a pixel's centre instead of the joint, and skin that is half one bone's.
+    # What is left: rays through a pixel's centre instead of the joint, and skin that is half one
+    # bone's.
     assert np.mean(wrong_exact) <= 0.04
     assert np.mean(wrong_quick) <= 0.08
 
@@ -118,7 +131,8 @@ def test_the_coarse_surface_decides_as_the_full_one_does(scene: Scene):
         full = look(scene.rig, joints, meshes, scene, VisibilityConfig(image_scale=1.0, cell_m=0.0))
         differs.append(quick.hidden_by != full.hidden_by)
         share.append(np.abs(quick.seen - full.seen).mean())
-    # 2.5 % over 20 frames of two scenes; 1,800 joints here, of which most stay as they were from frame to frame.
+    # 2.5 % over 20 frames of two scenes; 1,800 joints here, of which most stay as they were from
+    # frame to frame.
     assert np.mean(differs) < 0.04
     assert np.mean(share) < 0.04
 
@@ -132,12 +146,15 @@ def test_who_stands_behind_is_hidden_and_who_hides_is_named(scene: Scene):
         found = look(rig, points, meshes, scene, VisibilityConfig(cell_m=cell_m))
         front, back, side, away = range(4)
         assert (found.hidden_by[front, 0] == NOBODY).all() and (found.seen[front, 0] > 0.5).all()
-        assert (found.hidden_by[front, 1, trunk] == 0).all() and (found.seen[front, 1, trunk] == 0).all()
+        assert (found.hidden_by[front, 1, trunk] == 0).all() and (
+            found.seen[front, 1, trunk] == 0
+        ).all()
         assert (found.hidden_by[back, 0, trunk] == 1).all()
         # From behind nobody sees a face; the body itself is in front.
         assert (found.hidden_by[back, 1, FACE[:3]] == ITSELF).all()
         assert (found.hidden_by[back, 1, trunk] == NOBODY).all()
-        # From the left the right arm is behind the trunk; the other person stands beside, hiding nothing.
+        # From the left the right arm is behind the trunk; the other person stands beside, hiding
+        # nothing.
         assert (found.hidden_by[side] < 0).all()
         assert (found.hidden_by[side][:, [2, 3, 4, FACE[3]]] == ITSELF).all()
         assert (found.hidden_by[side][:, [7, 8, FACE[4]]] == NOBODY).all()
@@ -157,7 +174,9 @@ def test_the_hider_is_who_stops_most_rays_and_half_seen_is_seen(scene: Scene):
 
 def test_a_joint_that_no_surface_covers_is_seen(scene: Scene):
     joints, mesh = standing(scene)
-    joints = joints + 0.4 * Z  # above the head, beside the arms: rays meet nothing, or what is behind
+    joints = (
+        joints + 0.4 * Z
+    )  # above the head, beside the arms: rays meet nothing, or what is behind
     rig = rig_of((-4 * Y, 0 * Y), (-4 * Y + X, 0 * Y))
     behind = np.stack([mesh, mesh + 1.5 * Y + 0.4 * Z])
     found = look(rig, np.stack([joints, joints + 1.5 * Y]), behind, scene, VisibilityConfig())
@@ -166,7 +185,9 @@ def test_a_joint_that_no_surface_covers_is_seen(scene: Scene):
 
 
 def test_nobody_is_seen_where_nobody_is(scene: Scene):
-    found = look(scene.rig, np.zeros((0, 25, 3)), np.zeros((0, 12488, 3)), scene, VisibilityConfig())
+    found = look(
+        scene.rig, np.zeros((0, 25, 3)), np.zeros((0, 12488, 3)), scene, VisibilityConfig()
+    )
     assert found.seen.shape == found.in_image.shape == found.hidden_by.shape == (6, 0, 25)
 
 
@@ -187,4 +208,6 @@ def test_a_coarse_surface_is_a_surface(scene: Scene):
 
 def test_some_vertices_are_those_of_the_whole_surface(scene: Scene):
     only = np.array([5, 12000, 7])
-    np.testing.assert_allclose(scene.vertices_at(2, only), scene.vertices_at(2)[:, only], atol=1e-6)  # float32
+    np.testing.assert_allclose(
+        scene.vertices_at(2, only), scene.vertices_at(2)[:, only], atol=1e-6
+    )  # float32

@@ -1,4 +1,6 @@
-"""Worker processes that find what is visible: same bytes, in order, a bounded way ahead, none left behind."""
+"""Worker processes that find what is visible: same bytes, in order, a bounded way ahead, none left
+behind.
+"""
 
 import multiprocessing
 import os
@@ -31,7 +33,10 @@ def worker(scene: Scene) -> VisibilityWorker:
 
 @pytest.fixture(scope="module")
 def people(scene: Scene, worker: VisibilityWorker) -> list[FramePeople]:
-    return [(scene.truth_at(frame), scene.vertices_at(frame, worker.skin.vertices)) for frame in range(9)]
+    return [
+        (scene.truth_at(frame), scene.vertices_at(frame, worker.skin.vertices))
+        for frame in range(9)
+    ]
 
 
 def same_bytes(one: object, two: object) -> bool:
@@ -46,7 +51,9 @@ def test_workers_and_the_choice_of_frames_change_no_byte(scene: Scene):
     some = simulate(scene, seed=2, frames=[1, 4, 5, 8], workers=3)
     assert len(alone) == len(helped) == 9 and told == [(done, 9) for done in range(1, 10)]
     assert all(same_bytes(one, two) for one, two in zip(alone, helped, strict=True))
-    assert all(same_bytes(alone[frame], found) for frame, found in zip([1, 4, 5, 8], some, strict=True))
+    assert all(
+        same_bytes(alone[frame], found) for frame, found in zip([1, 4, 5, 8], some, strict=True)
+    )
     assert not same_bytes(alone[0], alone[1])  # or the comparison would say nothing
 
 
@@ -72,7 +79,9 @@ def test_frames_are_taken_as_they_are_needed_and_closing_ends_the_processes(
     with closing(worker.all(endless(), 2)) as seen:
         first, second = next(seen), next(seen)
         assert len(multiprocessing.active_children()) == 2
-        assert same_bytes(first, worker.one(people[1])) and same_bytes(second, worker.one(people[2]))
+        assert same_bytes(first, worker.one(people[1])) and same_bytes(
+            second, worker.one(people[2])
+        )
         assert len(taken) == 2 * AHEAD + 1
     assert multiprocessing.active_children() == []
 
@@ -112,10 +121,13 @@ signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
 @contextmanager
 def tell(what):
-    yield lambda done, total: print(done, *(child.pid for child in multiprocessing.active_children()), flush=True)
+    def tell(done, total):
+        print(done, *(child.pid for child in multiprocessing.active_children()), flush=True)
+    yield tell
 
 simulate.progress_bar = tell
-main.main(["simulate", "demo", "--people", "2", "--cameras", "2", "--frames", ":2000", "--workers", "2",
+main.main(["simulate", "demo", "--people", "2", "--cameras", "2", "--frames", ":2000",
+           "--workers", "2",
           "--output", sys.argv[1]])
 """
 
@@ -124,7 +136,8 @@ main.main(["simulate", "demo", "--people", "2", "--cameras", "2", "--frames", ":
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="asks Linux which processes run")
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
 def test_ctrl_c_and_the_end_of_the_parent_end_everybody(how: signal.Signals, tmp_path: Path):
-    run = subprocess.Popen([sys.executable, "-c", INTERRUPTED, str(tmp_path)], stdout=subprocess.PIPE,
+    run = subprocess.Popen([sys.executable, "-c", INTERRUPTED, str(tmp_path)],
+                           stdout=subprocess.PIPE,
                            stderr=subprocess.PIPE, text=True, start_new_session=True)  # fmt: skip
     assert run.stdout is not None
     children = [int(word) for word in run.stdout.readline().split()[1:]]
@@ -153,7 +166,9 @@ def alive(process: int) -> bool:
     return state.rsplit(")", 1)[1].split()[0] != "Z"
 
 
-def test_a_worker_uses_the_settings_that_it_is_given(worker: VisibilityWorker, people: list[FramePeople]):
+def test_a_worker_uses_the_settings_that_it_is_given(
+    worker: VisibilityWorker, people: list[FramePeople]
+):
     strict = VisibilityWorker(worker.rig, worker.skin, replace(CONFIG, probe_m=0.0))
     (rays,), (ray,) = worker.all(people[:1]), strict.all(people[:1])
     assert set(np.unique(ray.seen)) <= {0.0, 1.0}  # one ray arrives or not

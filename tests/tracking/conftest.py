@@ -49,11 +49,15 @@ def followed(tracker):
 
 @pytest.fixture(scope="session")
 def walking(five_cameras, two_people, seen_exactly):
-    """Two people walk past each other at 0.35 m: (frames of Detections, (T, 2, 25, 3) truth); 45 frames."""
+    """Two people walk past each other at 0.35 m: (frames of Detections, (T, 2, 25, 3) truth); 45
+    frames.
+    """
     steps = np.linspace(-0.9, 0.9, 45)
     first = two_people[0] - two_people[0].mean(axis=0) * [1, 1, 0]
     second = two_people[1] - two_people[1].mean(axis=0) * [1, 1, 0]
-    truth = np.stack([np.stack([np.add(first, (s, -0.18, 0)), np.add(second, (-s, 0.17, 0))]) for s in steps])
+    truth = np.stack(
+        [np.stack([np.add(first, (s, -0.18, 0)), np.add(second, (-s, 0.17, 0))]) for s in steps]
+    )
     return [seen_exactly(five_cameras, people) for people in truth], truth
 
 

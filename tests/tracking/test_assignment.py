@@ -1,4 +1,6 @@
-"""Detections of predicted joints, joints that cannot be a person's own, and detections given out again."""
+"""Detections of predicted joints, joints that cannot be a person's own, and detections given out
+again.
+"""
 
 import itertools
 from dataclasses import replace
@@ -22,13 +24,35 @@ WRIST, ELBOW = BODY_25.index("RWrist"), BODY_25.index("RElbow")
 @njit
 def _torn(places, trusted, views, longest, parents, reach, above, way, count, too_long, torn):
     for a in range(len(places)):
-        tear(places[a], trusted[a], views[a], longest, parents, reach, above, way, count, too_long, torn[a])
+        tear(
+            places[a],
+            trusted[a],
+            views[a],
+            longest,
+            parents,
+            reach,
+            above,
+            way,
+            count,
+            too_long,
+            torn[a],
+        )
 
 
 def torn_joints(places, trusted, views, longest_m, reach_m):
     """(A, J) by `tear`."""
     torn, parents = np.ones(trusted.shape, dtype=bool), np.array(BODY_25.parents)
-    _torn(places, trusted, views, longest_m, parents, reach_m, np.empty(25, np.intp), *np.empty((3, 25)), torn)
+    _torn(
+        places,
+        trusted,
+        views,
+        longest_m,
+        parents,
+        reach_m,
+        np.empty(25, np.intp),
+        *np.empty((3, 25)),
+        torn,
+    )
     return torn
 
 
@@ -37,7 +61,10 @@ def own(detections, rig, people, candidate):
     xy, _ = rig.project(people)
     right = total = 0
     for person, joint, view in np.argwhere(candidate >= 0):
-        right += np.linalg.norm(detections.xy[candidate[person, joint, view]] - xy[view, person, joint]) < 1e-6
+        right += (
+            np.linalg.norm(detections.xy[candidate[person, joint, view]] - xy[view, person, joint])
+            < 1e-6
+        )
         total += 1
     return right / total, total
 
@@ -47,7 +74,9 @@ def test_everybody_gets_their_own_detection_once(five_cameras, two_people, seen_
     rng = np.random.default_rng(0)
     predicted = two_people + rng.normal(0, 0.02, two_people.shape)
     sigma, lost = np.full((2, 25), 0.02), np.zeros((2, 25), dtype=bool)
-    candidate = assign(Predicted(predicted, sigma, lost), Sight.of(detections, five_cameras, BODY_25))
+    candidate = assign(
+        Predicted(predicted, sigma, lost), Sight.of(detections, five_cameras, BODY_25)
+    )
     share, total = own(detections, five_cameras, two_people, candidate)
     assert share == 1.0 and total == 2 * 25 * 5
     taken = candidate[candidate >= 0]
@@ -61,7 +90,9 @@ def test_a_lost_wrist_is_found_by_its_elbow(five_cameras, two_people, seen_exact
     lost[:, WRIST] = True
     predicted[:, WRIST] = predicted[:, ELBOW]
     sigma[:, WRIST] = 0.3
-    candidate = assign(Predicted(predicted, sigma, lost), Sight.of(detections, five_cameras, BODY_25))
+    candidate = assign(
+        Predicted(predicted, sigma, lost), Sight.of(detections, five_cameras, BODY_25)
+    )
     share, _ = own(detections, five_cameras, two_people, candidate)
     assert share == 1.0 and (candidate[:, WRIST] >= 0).all()
 
@@ -71,7 +102,8 @@ def test_nobody_gets_what_is_too_far_away(five_cameras, two_people, seen_exactly
     beside = two_people[:1] + np.array([0.0, 0.0, 0.4])
     predicted = Predicted(beside, np.full((1, 25), 0.02), np.zeros((1, 25), bool))
     nothing = assign(predicted, Sight.of(detections, five_cameras, BODY_25))
-    # 0.4 m up is farther than 0.12 + 2 x 0.02 m, but for other joints of the same kind; there are none.
+    # 0.4 m up is farther than 0.12 + 2 x 0.02 m, but for other joints of the same kind; there are
+    # none.
     assert (nothing < 0).all()
 
 
@@ -88,12 +120,18 @@ def test_a_wrist_a_metre_from_its_elbow_is_torn_and_its_neighbours_are_not(two_p
     places[1, shoulder] += [0.0, 0.0, 1.0]
     torn = torn_joints(places, np.ones((2, 25), bool), views, longest, 0.5)
     assert np.argwhere(torn).tolist() == [[1, shoulder]]
-    assert not torn_joints(places, np.zeros((2, 25), bool), views, longest, 0.5).any(), "nothing is judged"
+    assert not torn_joints(places, np.zeros((2, 25), bool), views, longest, 0.5).any(), (
+        "nothing is judged"
+    )
 
 
 def test_the_legs_of_somebody_else_are_torn_off(two_people):
     """They hang on nothing but a pelvis that nobody sees: they are judged by the shoulders."""
-    legs = [BODY_25.index(f"{side}{joint}") for side in "LR" for joint in ("Hip", "Knee", "Ankle", "Heel")]
+    legs = [
+        BODY_25.index(f"{side}{joint}")
+        for side in "LR"
+        for joint in ("Hip", "Knee", "Ankle", "Heel")
+    ]
     legs += [BODY_25.index(f"{side}{toe}") for side in "LR" for toe in ("BigToe", "SmallToe")]
     places = two_people.copy()
     places[0, legs] = places[1, legs] + [0.0, 6.0, 0.0]
@@ -101,7 +139,8 @@ def test_the_legs_of_somebody_else_are_torn_off(two_people):
     trusted[:, BODY_25.root] = False
     torn = torn_joints(places, trusted, views, longest, 0.5)
     assert sorted(np.flatnonzero(torn[0])) == sorted(legs) and not torn[1].any()
-    # So they are with a shoulder that is not judged either, or with no shoulder: by the next joint that is.
+    # So they are with a shoulder that is not judged either, or with no shoulder: by the next joint
+    # that is.
     trusted[0, [BODY_25.index(joint) for joint in ("Neck", "LShoulder", "RShoulder")]] = False
     torn = torn_joints(places, trusted, views, longest, 0.5)
     assert set(legs) <= set(np.flatnonzero(torn[0])) and not torn[1].any()
@@ -125,7 +164,9 @@ def test_detections_are_given_out_again_and_doubles_go(five_cameras, two_people,
     covariance = np.broadcast_to(0.02**2 * np.eye(3), (3, 25, 3, 3))
     none = np.full((3, 25, 5), -1)
     rows = Observations.of(none, detections, joints)
-    rows = replace(rows, track=np.array([4, 5, 6]), frame=np.full(3, 7), time_s=np.full((3, 5), 0.5))
+    rows = replace(
+        rows, track=np.array([4, 5, 6]), frame=np.full(3, 7), time_s=np.full((3, 5), 0.5)
+    )
     kept = reassociate(given, rows, joints, covariance, BODY_25)
     assert kept.track.tolist() == [4, 5, 6] and (kept.time_s == 0.5).all()
     alone = reassociate(given, rows, joints, covariance, BODY_25, LEAST_PROBABILITY)
@@ -135,7 +176,9 @@ def test_detections_are_given_out_again_and_doubles_go(five_cameras, two_people,
 
 
 def test_the_first_detection_of_a_frame_counts_as_any_other(five_cameras, two_people, seen_exactly):
-    """Somebody of whom two views see six core joints and nothing else, the first detection among them."""
+    """Somebody of whom two views see six core joints and nothing else, the first detection among
+    them.
+    """
     every = seen_exactly(five_cameras, two_people[:1])
     chosen = np.isin(every.joint, list(BODY_25.core)[:6]) & (every.view < 2)
     detections = every.only(chosen)
@@ -153,7 +196,9 @@ def test_the_first_detection_of_a_frame_counts_as_any_other(five_cameras, two_pe
 def test_nothing_is_expected_where_a_person_is_outside_of_the_picture(
     five_cameras, two_people, seen_exactly, axis, side
 ):
-    """Three of five pictures end left, right, above or below of everybody; the other two see all joints."""
+    """Three of five pictures end left, right, above or below of everybody; the other two see all
+    joints.
+    """
     cameras = []
     for number, camera in enumerate(five_cameras.cameras):
         K = camera.K.copy()
@@ -169,7 +214,9 @@ def test_nothing_is_expected_where_a_person_is_outside_of_the_picture(
 
 
 def by_enumeration(weight, slot):
-    """(A, D) marginals over all ways to give D detections to A people, one a slot and one a detection."""
+    """(A, D) marginals over all ways to give D detections to A people, one a slot and one a
+    detection.
+    """
     people, count = weight.shape
     total, marginal = 0.0, np.zeros(weight.shape)
     for owners in itertools.product(range(-1, people), repeat=count):
@@ -183,7 +230,9 @@ def by_enumeration(weight, slot):
 
 
 def test_probabilities_are_the_marginals_of_all_ways_to_give_detections_out():
-    """Two people, three wrists in one view and two in another; exact where they compete for one only."""
+    """Two people, three wrists in one view and two in another; exact where they compete for one
+    only.
+    """
     nothing = np.zeros((0, 2), dtype=int)
     detections = Detections(
         np.array([0, 1, 0, 1, 0]), np.full(5, 4), np.zeros((5, 2)), np.ones(5), nothing, np.zeros(0)
@@ -210,15 +259,23 @@ def test_probabilities_are_the_marginals_of_all_ways_to_give_detections_out():
     view = detections.view
     both = found(score, possible, view)
     np.testing.assert_allclose(both[:, [1, 3]], expected[:, [1, 3]], atol=1e-9)
-    np.testing.assert_allclose(both, expected, atol=0.15)  # both can have wrist 0 and both wrist 4: a cycle
-    np.testing.assert_allclose(found(score[:1], possible[:1], view), by_enumeration(weight[:1], view), atol=1e-12)
+    np.testing.assert_allclose(
+        both, expected, atol=0.15
+    )  # both can have wrist 0 and both wrist 4: a cycle
+    np.testing.assert_allclose(
+        found(score[:1], possible[:1], view), by_enumeration(weight[:1], view), atol=1e-12
+    )
     order = np.array([3, 0, 4, 1, 2])
     again = found(score[::-1][:, order], possible[::-1][:, order], view[order])
     np.testing.assert_allclose(again[::-1], both[:, order], atol=1e-12)
 
 
-def test_two_people_side_by_side_are_less_certain_than_one_alone(five_cameras, two_people, seen_exactly):
-    """Joints 4 cm apart, and no affinities: either may have either. A metre apart each is somebody's."""
+def test_two_people_side_by_side_are_less_certain_than_one_alone(
+    five_cameras, two_people, seen_exactly
+):
+    """Joints 4 cm apart, and no affinities: either may have either. A metre apart each is
+    somebody's.
+    """
     median = []
     for apart in (0.04, 1.0):
         people = np.stack([two_people[0], two_people[0] + [0, apart, 0]])

@@ -1,4 +1,6 @@
-"""Detections of predicted joints on a crowded frame, against what they are defined to be, one thing at a time."""
+"""Detections of predicted joints on a crowded frame, against what they are defined to be, one thing
+at a time.
+"""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -12,7 +14,12 @@ from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.proposal import nearby
 from shapepose_fg.proposal.nearby import Sight
 from shapepose_fg.tracking import view_assignment
-from shapepose_fg.tracking.reassociation import LEAST_PROBABILITY, probabilities_of, reassociate, who_goes
+from shapepose_fg.tracking.reassociation import (
+    LEAST_PROBABILITY,
+    probabilities_of,
+    reassociate,
+    who_goes,
+)
 from shapepose_fg.tracking.view_assignment import Predicted, assign
 
 CORE = list(BODY_25.core)
@@ -24,7 +31,9 @@ SWINGS = {BODY_25.index(side + name) for side in "RL" for name in (
 
 @pytest.fixture(scope="module")
 def predicted(two_people):
-    """Where the four people of the crowded frame are thought to be, how surely, and which joints are lost."""
+    """Where the four people of the crowded frame are thought to be, how surely, and which joints
+    are lost.
+    """
     rng = np.random.default_rng(2)
     people = np.concatenate([two_people, two_people[::-1] + np.array([0.1, 0.5, 0.0])])
     sigma = rng.uniform(0.01, 0.2, (4, 25))
@@ -57,7 +66,9 @@ def settle(monkeypatch):
         kernels = [(view_assignment, name) for name in ("_assign", "claim", "share")]
         for module, name in [*kernels, (nearby, "_together")]:
             # As Python runs it: constants are compiled in.
-            monkeypatch.setattr(module, name, getattr(getattr(module, name), "py_func", getattr(module, name)))
+            monkeypatch.setattr(
+                module, name, getattr(getattr(module, name), "py_func", getattr(module, name))
+            )
         for name, value in settings.items():
             for module in (view_assignment, nearby):
                 for constant in (name.upper(), f"_{name.upper()}"):
@@ -68,10 +79,15 @@ def settle(monkeypatch):
 
 
 def assigned(predicted: Predicted, crowded, rig, config: SimpleNamespace) -> np.ndarray:
-    """Score every detection for every person, take the best first; again with the affinities to what was taken."""
+    """Score every detection for every person, take the best first; again with the affinities to
+    what was taken.
+    """
     places, sigma, lost = predicted.places, predicted.sigma_m, predicted.lost
     xy, depth = rig.project(places)
-    listed = {tuple(pair): value for pair, value in zip(crowded.pairs.tolist(), crowded.affinity, strict=True)}
+    listed = {
+        tuple(pair): value
+        for pair, value in zip(crowded.pairs.tolist(), crowded.affinity, strict=True)
+    }
     near = [
         [
             other
@@ -91,16 +107,22 @@ def assigned(predicted: Predicted, crowded, rig, config: SimpleNamespace) -> np.
                 metres = px * depth[view, person, joint] / rig.focal_px[view]
                 mine = [other for other in near[row] if other in owned[person]]
                 joints = {int(crowded.joint[other]) for other in mine}
-                total = sum(listed.get((row, other), listed.get((other, row), 0.0)) for other in mine)
+                total = sum(
+                    listed.get((row, other), listed.get((other, row), 0.0)) for other in mine
+                )
                 affinity = total / max(len(joints), 1)
                 if np.isnan(px):
                     px = metres = np.inf
                 sure = sigma[person, joint]
                 gate = min(config.far_m + 2 * sure, config.farthest_m)
                 near_enough = lost[person, joint] or metres < gate
-                score = np.exp(-0.5 * metres**2 / (config.near_m**2 + sure**2)) if near_enough else 0.0
+                score = (
+                    np.exp(-0.5 * metres**2 / (config.near_m**2 + sure**2)) if near_enough else 0.0
+                )
                 score += affinity if joints else config.least_affinity
-                trunk = sum(j not in SWINGS for j in np.flatnonzero(before[person, :, view] >= 0).tolist())
+                trunk = sum(
+                    j not in SWINGS for j in np.flatnonzero(before[person, :, view] >= 0).tolist()
+                )
                 free = lost[person, joint] or (joint in SWINGS and trunk >= config.trunk_joints)
                 within = config.reach_m if free else gate
                 if lost[person, joint]:
@@ -137,7 +159,9 @@ def test_detections_are_taken_best_first_by_nearness_and_affinity(
     sight = Sight.of(crowded, five_cameras, BODY_25)
     found = assign(predicted, sight)
     np.testing.assert_array_equal(found, expected)
-    assert (found >= 0).mean() > 0.5 and (found[predicted.lost] >= 0).any(), "lost joints are found, too"
+    assert (found >= 0).mean() > 0.5 and (found[predicted.lost] >= 0).any(), (
+        "lost joints are found, too"
+    )
     settle(overlap_m=0.005)
     assert (
         assign(predicted, Sight.of(crowded, five_cameras, BODY_25)) != found
@@ -147,8 +171,12 @@ def test_detections_are_taken_best_first_by_nearness_and_affinity(
 def test_a_detection_that_serves_two_is_theirs_with_a_probability_of_one_at_most(
     predicted, crowded, five_cameras, monkeypatch, settle
 ):
-    """Marginals of competitors that form a cycle are not exact: those of one detection may add up to more."""
-    monkeypatch.setattr(view_assignment, "probabilities", lambda scored, _: np.full(len(scored.score), 0.6))
+    """Marginals of competitors that form a cycle are not exact: those of one detection may add up
+    to more.
+    """
+    monkeypatch.setattr(
+        view_assignment, "probabilities", lambda scored, _: np.full(len(scored.score), 0.6)
+    )
     settle(passes=1, overlap_m=0.6, farthest_m=0.6)
     sight = Sight.of(crowded, five_cameras, BODY_25)
     chosen, probability = view_assignment.assign_with_probability(predicted, sight)
@@ -165,7 +193,9 @@ def three(five_cameras, two_people, seen_exactly):
     places = np.stack([*two_people, two_people[0] + [0.15, 0.0, 0.0]])
     candidate = np.full((3, 25, 5), -1)
     sure = np.full((2, 25), 0.02), np.zeros((2, 25), dtype=bool)
-    candidate[:2] = assign(Predicted(two_people, *sure), Sight.of(detections, five_cameras, BODY_25))
+    candidate[:2] = assign(
+        Predicted(two_people, *sure), Sight.of(detections, five_cameras, BODY_25)
+    )
     return Input(0, np.zeros(5), detections, five_cameras), candidate, places
 
 
@@ -173,7 +203,9 @@ def test_who_has_too_little_or_is_a_double_goes(three):
     frame, candidate, places = three
 
     def gone(candidate, places, *asked):
-        return who_goes(probabilities_of(frame, candidate, places, BODY_25), places, BODY_25, *asked)
+        return who_goes(
+            probabilities_of(frame, candidate, places, BODY_25), places, BODY_25, *asked
+        )
 
     assert gone(candidate, places, 0.0).tolist() == [False, False, True], "a double"
     assert not gone(candidate, places, 0.0, 0.14).any()
@@ -208,17 +240,29 @@ def test_rows_without_a_joint_are_carried_by_motion_unless_they_must_survive(thr
 
 @pytest.mark.parametrize(
     ("away_m", "tied", "taken"),
-    [(0.4, True, True), (0.78, True, True), (0.82, True, False), (0.04, False, True), (0.15, False, False)],
+    [
+        (0.4, True, True),
+        (0.78, True, True),
+        (0.82, True, False),
+        (0.04, False, True),
+        (0.15, False, False),
+    ],
 )
 def test_what_is_tied_to_the_elbow_is_the_wrist_wherever_it_was_predicted(
     five_cameras, two_people, seen_exactly, away_m, tied, taken
 ):
-    """A wrist that strikes is far from where it was predicted; without affinities it must be near."""
+    """A wrist that strikes is far from where it was predicted; without affinities it must be
+    near.
+    """
     detections = seen_exactly(five_cameras, two_people[:1])
     wrist = BODY_25.index("RWrist")
     of_wrist = (detections.joint[detections.pairs] == wrist).any(axis=1)
-    detections = replace(detections, affinity=np.where(of_wrist & (not tied), 0.0, detections.affinity))
-    right = five_cameras.cTw[0, 0, :3]  # to the right in the first picture: there it is as long as it is
+    detections = replace(
+        detections, affinity=np.where(of_wrist & (not tied), 0.0, detections.affinity)
+    )
+    right = five_cameras.cTw[
+        0, 0, :3
+    ]  # to the right in the first picture: there it is as long as it is
     predicted = two_people[:1].copy()
     predicted[0, wrist] += away_m * right
     sigma, lost = np.full((1, 25), 1e-6), np.zeros((1, 25), dtype=bool)

@@ -1,4 +1,6 @@
-"""Who is who, corrected by hand: rows change hands, only who changed is solved anew, all can be undone."""
+"""Who is who, corrected by hand: rows change hands, only who changed is solved anew, all can be
+undone.
+"""
 
 from dataclasses import replace
 
@@ -8,11 +10,22 @@ import pytest
 from shapepose_fg.core.observation_table import ObservationTable
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.tracking.edits import Action, Edit, Edited, apply, free_number, replay, solve_anew, undo
+from shapepose_fg.tracking.edits import (
+    Action,
+    Edit,
+    Edited,
+    apply,
+    free_number,
+    replay,
+    solve_anew,
+    undo,
+)
 
 
 def result(tracks: dict[int, range]) -> Reconstruction:
-    """People who are there in these frames; every joint of a row is at (first identity, frame, 0)."""
+    """People who are there in these frames; every joint of a row is at (first identity, frame,
+    0).
+    """
     frame = np.concatenate([np.array(frames) for frames in tracks.values()])
     person = np.repeat(list(tracks), [len(frames) for frames in tracks.values()])
     order = np.lexsort((person, frame))
@@ -69,7 +82,9 @@ def names(people: Reconstruction) -> set[int]:
 
 
 def solve(rows: Reconstruction) -> Reconstruction:
-    """Marks what it was given: z = 1 + how many people were solved together; fills gaps of one frame."""
+    """Marks what it was given: z = 1 + how many people were solved together; fills gaps of one
+    frame.
+    """
     joints = rows.joints.copy()
     joints[..., 2] += len(names(rows))
     return replace(rows, joints=joints)
@@ -93,7 +108,9 @@ def test_merge(people):
 
 def test_split(people):
     edited = apply(people, Edit(Action.SPLIT, 1, 8, 12))
-    assert frames_of(edited.people, 1) == list(range(12)) and frames_of(edited.people, 8) == list(range(12, 20))
+    assert frames_of(edited.people, 1) == list(range(12)) and frames_of(edited.people, 8) == list(
+        range(12, 20)
+    )
     assert spans(edited) == {1: range(12), 8: range(12, 20)}
     assert free_number(people.person) == 8 and free_number(Reconstruction.empty().person) == 0
 
@@ -118,7 +135,8 @@ def test_swap_from_a_frame(people):
         late = edited.people.frame >= 15
         assert set(who[own & ~late]) == {person} and set(who[own & late]) == {other}
     assert spans(edited) == {1: range(20), 2: range(20)}
-    # From before both began it is two names that change places; from the middle of a gap, rows still change hands.
+    # From before both began it is two names that change places; from the middle of a gap, rows
+    # still change hands.
     assert spans(apply(people, Edit(Action.SWAP, 5, 7, 0))) == {}
     assert spans(apply(people, Edit(Action.SWAP, 5, 7, 9))) == {5: range(3, 20)}
 
@@ -143,7 +161,10 @@ def test_swap_from_a_frame(people):
         ),
         (Edit(Action.RENAME, 5, 7), "7 is the number of another person"),
         (Edit(Action.RENAME, 5, -1), "-1 is not a valid number of a person; give one from 0"),
-        (Edit(Action.SWAP, 1, 2, 20), "neither 1 nor 2 is present from frame 20 on; give a frame up to 19"),
+        (
+            Edit(Action.SWAP, 1, 2, 20),
+            "neither 1 nor 2 is present from frame 20 on; give a frame up to 19",
+        ),
         (Edit(Action.DROP, 3), "there is no person 3"),
     ],
 )
@@ -200,7 +221,9 @@ def test_a_solver_may_fill_gaps_but_not_return_other_people(people):
     def fills(rows: Reconstruction) -> Reconstruction:
         between = rows.rows(np.flatnonzero(rows.frame == 7))
         table = replace(between.observations, frame=np.array([8]))
-        return Reconstruction.concatenate([rows, replace(between, frame=np.array([8]), observations=table)])
+        return Reconstruction.concatenate(
+            [rows, replace(between, frame=np.array([8]), observations=table)]
+        )
 
     solved = solve_anew(apply(people, Edit(Action.MERGE, 5, 7)), fills)
     assert frames_of(solved, 5) == [*range(3, 9), *range(10, 20)]
@@ -218,7 +241,8 @@ def test_undo_solves_only_what_the_last_correction_touched(people):
     for edit in edits:
         current = solve_anew(apply(current, edit), solve)
     before = undo(people, current, edits)
-    # 1 and 2 are as they were found, and need no solving; 5 was solved when it was merged, and is kept.
+    # 1 and 2 are as they were found, and need no solving; 5 was solved when it was merged, and is
+    # kept.
     assert before.changed == frozenset()
     expected = solve_anew(apply(people, edits[0]), solve)
     np.testing.assert_array_equal(before.people.person, expected.person)
@@ -232,7 +256,9 @@ def test_undo_solves_only_what_the_last_correction_touched(people):
 
 
 def test_undo_keeps_what_was_solved_of_somebody_who_changed_names_since(people):
-    """Who was merged is called 1 by then; undoing what is done to somebody else leaves them solved."""
+    """Who was merged is called 1 by then; undoing what is done to somebody else leaves them
+    solved.
+    """
     edits = [Edit(Action.MERGE, 5, 7), Edit(Action.SWAP, 1, 5, 0), Edit(Action.DROP, 2)]
     assert spans(replay(people, edits[:2])) == {1: range(3, 20)}
     states = [people]
@@ -247,7 +273,9 @@ def test_undo_keeps_what_was_solved_of_somebody_who_changed_names_since(people):
 
 @pytest.mark.parametrize("seed", range(20))
 def test_any_corrections_keep_every_row_once_and_undo_one_by_one(people, seed):
-    """Random corrections: nobody is twice in a frame, no row is there twice, undoing leads back step by step."""
+    """Random corrections: nobody is twice in a frame, no row is there twice, undoing leads back
+    step by step.
+    """
     rng = np.random.default_rng(seed)
     edits: list[Edit] = []
     states = [people]
@@ -276,7 +304,9 @@ def test_any_corrections_keep_every_row_once_and_undo_one_by_one(people, seed):
         assert len(np.unique(pairs, axis=0)) == len(pairs)
         found = np.stack([edited.joints[:, 0, 0], edited.joints[:, 0, 1]], axis=1)
         assert len(np.unique(found, axis=0)) == len(found)
-        np.testing.assert_array_equal(edited.observations.candidate[:, 0, 0], 100 * edited.joints[:, 0, 0])
+        np.testing.assert_array_equal(
+            edited.observations.candidate[:, 0, 0], 100 * edited.joints[:, 0, 0]
+        )
     np.testing.assert_array_equal(replay(people, edits).people.person, states[-1].person)
     for count in range(len(edits), 0, -1):
         before = undo(people, states[count], edits[:count])

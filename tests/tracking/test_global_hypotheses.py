@@ -31,7 +31,9 @@ def seed(tracker, truth, key):
     return Seed(key, tracker.at(truth[key], zero, zero, key / 30.0), np.full((2, 25, 5), -1))
 
 
-def test_worlds_that_have_become_alike_are_followed_once(tracker, five_cameras, walking, people_followed):
+def test_worlds_that_have_become_alike_are_followed_once(
+    tracker, five_cameras, walking, people_followed
+):
     frames, truth = walking
     given, seeds = inputs(five_cameras, frames), [seed(tracker, truth, 6), seed(tracker, truth, 20)]
     found = follow_worlds(tracker, given, seeds, keep=40)
@@ -42,16 +44,23 @@ def test_worlds_that_have_become_alike_are_followed_once(tracker, five_cameras, 
     np.testing.assert_array_equal(found.world, [0, 0, 1, 1])
     for rows, own in zip((slice(0, 2), slice(2, 4)), apart, strict=True):
         np.testing.assert_array_equal(found.there[rows], own.there)
-        # A frame's detections may be the other world's for as long as both are told apart; later they are one.
+        # A frame's detections may be the other world's for as long as both are told apart; later
+        # they are one.
         assert (found.candidate[rows] == own.candidate).mean() > 0.999
         np.testing.assert_allclose(found.places[rows], own.places, atol=0.02)
         np.testing.assert_allclose(found.joints.position[rows], own.joints.position, atol=0.005)
-        assert np.linalg.norm(found.places[rows] - truth.swapaxes(0, 1), axis=-1)[:, 6:].max() < 0.03
+        assert (
+            np.linalg.norm(found.places[rows] - truth.swapaxes(0, 1), axis=-1)[:, 6:].max() < 0.03
+        )
 
 
-def test_who_is_always_seen_well_is_followed_once(tracker, five_cameras, walking, nobody, people_followed):
+def test_who_is_always_seen_well_is_followed_once(
+    tracker, five_cameras, walking, nobody, people_followed
+):
     frames, _ = walking
-    found, chosen = explained(tracker, inputs(five_cameras, frames), Tracks.none(tracker.skeleton), 44)
+    found, chosen = explained(
+        tracker, inputs(five_cameras, frames), Tracks.none(tracker.skeleton), 44
+    )
     assert len(chosen) == len(found) == 2
     assert people_followed == [2] * (len(frames) - 1)
     people_followed.clear()

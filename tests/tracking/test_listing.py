@@ -13,7 +13,9 @@ from tests.conftest import read_body
 
 
 def walkers(sigma_m: float = 0.01) -> Reconstruction:
-    """At 30 Hz for 10 s: 4 stands, 9 walks 1 m/s along x but is not there in seconds 3 to 5; with noise."""
+    """At 30 Hz for 10 s: 4 stands, 9 walks 1 m/s along x but is not there in seconds 3 to 5; with
+    noise.
+    """
     rng = np.random.default_rng(0)
     there = np.array([frame for frame in range(300) if not 90 <= frame < 150])
     frame = np.concatenate([np.arange(300), there])
@@ -50,7 +52,8 @@ def test_figures_by_hand():
     assert np.isnan(walks.stature_m)
     assert still.confidence == pytest.approx(0.5) and walks.confidence == pytest.approx(0.75)
     assert still.seen == 1.0 and walks.seen == pytest.approx(0.8)
-    # 10 s at 1 m/s, from the middle of the first half second to that of the last, straight through the gap.
+    # 10 s at 1 m/s, from the middle of the first half second to that of the last, straight through
+    # the gap.
     assert walks.walked_m == pytest.approx(9.5, abs=0.05)
     assert still.walked_m == 0.0  # noise of 1 cm a joint is no walk
 
@@ -71,6 +74,10 @@ def test_rows_without_any_joint_are_no_step():
 def test_without_times_30_frames_a_second_are_assumed():
     people = walkers()
     untimed = Reconstruction(
-        **{name: getattr(people, name) for name in (*Reconstruction.ROWS, "joint_names") if name != "time_s"}
+        **{
+            name: getattr(people, name)
+            for name in (*Reconstruction.ROWS, "joint_names")
+            if name != "time_s"
+        }
     )
     assert list_tracks(untimed)[1].walked_m == pytest.approx(list_tracks(people)[1].walked_m)

@@ -51,11 +51,19 @@ def test_a_step_back_returns_to_where_it_came_from_less_certain():
     assert (np.linalg.eigvalsh(grown) > -1e-9).all() and np.trace(grown, axis1=2, axis2=3).min() > 0
 
 
-def test_a_measurement_is_the_information_filter_s_also_for_a_ray(five_cameras, two_people, seen_exactly):
-    """Of what the views say of a joint after three linearisations; a wrist is seen by one view, a knee by none."""
+def test_a_measurement_is_the_information_filter_s_also_for_a_ray(
+    five_cameras, two_people, seen_exactly
+):
+    """Of what the views say of a joint after three linearisations; a wrist is seen by one view, a
+    knee by none.
+    """
     rng, names = np.random.default_rng(3), BODY_25.joints
     seen = seen_exactly(five_cameras, two_people)
-    seen = replace(seen, xy=seen.xy + rng.normal(0, 4, seen.xy.shape), confidence=rng.uniform(0.2, 1, len(seen)))
+    seen = replace(
+        seen,
+        xy=seen.xy + rng.normal(0, 4, seen.xy.shape),
+        confidence=rng.uniform(0.2, 1, len(seen)),
+    )
     sure, lost = np.full((2, 25), 0.05), np.zeros((2, 25), dtype=bool)
     sight = Sight.of(seen, five_cameras, BODY_25)
     candidate = assign(Predicted(two_people, sure, lost), sight)
@@ -100,7 +108,9 @@ def test_a_lost_joint_begins_where_the_views_put_it(five_cameras, two_people, se
     candidate = assign(Predicted(two_people, sure / 20, lost & False), sight)
     before = JointStates.at(two_people + 0.5 * lost[..., None], sure, (2.0,))
     trust = Trust.of(config, BODY_25.joints)
-    after, kept, _ = measured(before, lost, candidate, config.weight(seen.confidence), sight, trust, BONES)
+    after, kept, _ = measured(
+        before, lost, candidate, config.weight(seen.confidence), sight, trust, BONES
+    )
     assert (kept >= 0).all()
     np.testing.assert_allclose(after.position, two_people, atol=2e-3)
 

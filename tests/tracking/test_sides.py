@@ -1,4 +1,6 @@
-"""Left and right exchanged by a detector in some views: put right by where people are predicted, and by bodies."""
+"""Left and right exchanged by a detector in some views: put right by where people are predicted,
+and by bodies.
+"""
 
 from dataclasses import replace
 
@@ -54,7 +56,9 @@ def held(tracker, found, rig, people, *, followed=True):
     """Tracks of people after a frame, and its detections."""
     number = np.arange(len(people))
     tracks = tracker.at(people, number, 0 * number, 0.0)
-    tracks, given = hold_now(tracker, tracks, Input(0, np.zeros(len(rig)), found, rig), followed=followed)
+    tracks, given = hold_now(
+        tracker, tracks, Input(0, np.zeros(len(rig)), found, rig), followed=followed
+    )
     return tracks, given.detections
 
 
@@ -65,12 +69,18 @@ def test_what_is_right_stays(tracker, seen, five_cameras, two_people):
 
 @pytest.mark.parametrize("part", PART_OF)
 @pytest.mark.parametrize("views", [[1], [0, 3], [0, 1, 2, 4]])
-def test_a_person_whose_sides_are_exchanged_in_some_views(tracker, seen, five_cameras, two_people, views, part):
+def test_a_person_whose_sides_are_exchanged_in_some_views(
+    tracker, seen, five_cameras, two_people, views, part
+):
     """Predicted 5 cm off; the other person is as they are."""
     wrong = (
-        np.isin(seen.view, views) & (person_of(seen, five_cameras, two_people) == 1) & PART_OF[part][seen.joint]
+        np.isin(seen.view, views)
+        & (person_of(seen, five_cameras, two_people) == 1)
+        & PART_OF[part][seen.joint]
     )
-    _, again = held(tracker, turned(seen, wrong), five_cameras, two_people + np.array([0.03, 0.03, 0.02]))
+    _, again = held(
+        tracker, turned(seen, wrong), five_cameras, two_people + np.array([0.03, 0.03, 0.02])
+    )
     sides = MIRROR[seen.joint] != seen.joint
     if part == "face":  # a face is small: views that see it from the side do not tell
         assert (again.joint != seen.joint)[~wrong].sum() == 0
@@ -94,7 +104,9 @@ def test_a_person_who_has_the_sides_wrong_is_put_right_by_the_body(
 
 
 def test_where_the_body_does_not_tell_it_is_said(tracker, seen, five_cameras, two_people):
-    """Without feet and face a standing body has no front: one of two views is wrong, and nothing tells which."""
+    """Without feet and face a standing body has no front: one of two views is wrong, and nothing
+    tells which.
+    """
     symmetric = np.isin(np.arange(25), [1, 2, 3, 5, 6, 8, 9, 10, 12, 13])
     found = seen.only(symmetric[seen.joint] & np.isin(seen.view, [0, 1]))
     found = turned(found, found.view == 0)
@@ -105,7 +117,9 @@ def test_where_the_body_does_not_tell_it_is_said(tracker, seen, five_cameras, tw
     assert again.mirrored.max() < 0.1, "a followed person has not turned inside out"
 
 
-def test_somebody_else_who_faces_the_other_way_stays_as_they_are(tracker, five_cameras, two_people, seen_exactly):
+def test_somebody_else_who_faces_the_other_way_stays_as_they_are(
+    tracker, five_cameras, two_people, seen_exactly
+):
     """Of two people only one is followed; the other stands half a metre away, turned round."""
     about = two_people[0, 8]
     other = two_people[0].copy()

@@ -13,7 +13,10 @@ from shapepose_fg.tracking.stitching import stitch as stitch_traces
 
 def stitch(track, time_s, joints, skeleton, config, cuts_s=()):
     """The identity of each row."""
-    traces = (Trace.of(n, time_s[track == n], joints[track == n], skeleton) for n in np.unique(track).tolist())
+    traces = (
+        Trace.of(n, time_s[track == n], joints[track == n], skeleton)
+        for n in np.unique(track).tolist()
+    )
     names = stitch_traces(Ends.of(traces), config, cuts_s)
     return np.array([names[each] for each in track.tolist()], dtype=int)
 
@@ -22,8 +25,8 @@ def stitch(track, time_s, joints, skeleton, config, cuts_s=()):
 def rows(two_people):
     """A function of (track, size, first frame, x) tuples -> track, time_s, joints; 20 rows each.
 
-    Each joint has an error of `error_m` that lasts, and one of half of it that does not. Lengths of bones may
-    differ by 15 mm in a track: errors of 5 mm hide nobody who is the same, in no draw.
+    Each joint has an error of `error_m` that lasts, and one of half of it that does not. Lengths of
+    bones may differ by 15 mm in a track: errors of 5 mm hide nobody who is the same, in no draw.
     """
 
     def make(*parts, error_m=0.005):
@@ -43,7 +46,9 @@ def rows(two_people):
 def test_who_comes_back_two_seconds_later_is_the_same(rows):
     track, time_s, joints = rows((3, 1.0, 0, 0.0), (7, 1.0, 80, 1.0), (5, 1.0, 0, 4.0))
     named = stitch(track, time_s, joints, BODY_25, StitchingConfig())
-    assert np.unique(named[track == 7]).tolist() == [3] and np.unique(named[track == 5]).tolist() == [5]
+    assert np.unique(named[track == 7]).tolist() == [3] and np.unique(
+        named[track == 5]
+    ).tolist() == [5]
 
 
 @pytest.mark.parametrize(
@@ -68,25 +73,36 @@ def test_a_chain_of_tracks_gets_one_name_and_a_cut_breaks_it(rows):
 
 
 def test_two_who_swap_places_out_of_sight_are_told_apart_by_their_build(rows):
-    track, time_s, joints = rows((1, 1.0, 0, 0.0), (2, 1.15, 0, 1.0), (3, 1.15, 60, 0.0), (4, 1.0, 60, 1.0))
+    track, time_s, joints = rows(
+        (1, 1.0, 0, 0.0), (2, 1.15, 0, 1.0), (3, 1.15, 60, 0.0), (4, 1.0, 60, 1.0)
+    )
     named = stitch(track, time_s, joints, BODY_25, StitchingConfig())
-    assert np.unique(named[track == 3]).tolist() == [2] and np.unique(named[track == 4]).tolist() == [1]
+    assert np.unique(named[track == 3]).tolist() == [2] and np.unique(
+        named[track == 4]
+    ).tolist() == [1]
 
 
 @pytest.mark.parametrize("first", [(60, 60), (60, 75), (75, 60)])
 def test_of_two_who_leave_and_two_who_come_build_decides_and_then_place(rows, first):
-    """Builds 4 % apart may both be either's, and so may all places, up to a metre away, whoever comes first.
+    """Builds 4 % apart may both be either's, and so may all places, up to a metre away, whoever
+    comes first.
 
-    Where builds are equal the places decide, by half of a squared standard deviation: errors of a millimetre in
-    14 bones are worth a fourteenth of that.
+    Where builds are equal the places decide, by half of a squared standard deviation: errors of a
+    millimetre in 14 bones are worth a fourteenth of that.
     """
     parts = (1, 1.0, 0, 0.0), (2, 1.04, 0, 1.0), (3, 1.04, first[0], 0.3), (4, 1.0, first[1], 0.7)
     track, time_s, joints = rows(*parts, error_m=0.001)
     named = stitch(track, time_s, joints, BODY_25, StitchingConfig())
-    assert np.unique(named[track == 3]).tolist() == [2] and np.unique(named[track == 4]).tolist() == [1]
-    track, time_s, joints = rows(*((name, 1.0, start, x) for name, _, start, x in parts), error_m=0.001)
+    assert np.unique(named[track == 3]).tolist() == [2] and np.unique(
+        named[track == 4]
+    ).tolist() == [1]
+    track, time_s, joints = rows(
+        *((name, 1.0, start, x) for name, _, start, x in parts), error_m=0.001
+    )
     named = stitch(track, time_s, joints, BODY_25, StitchingConfig())
-    assert np.unique(named[track == 3]).tolist() == [1] and np.unique(named[track == 4]).tolist() == [2]
+    assert np.unique(named[track == 3]).tolist() == [1] and np.unique(
+        named[track == 4]
+    ).tolist() == [2]
 
 
 def test_nobody_is_nobody():
@@ -96,11 +112,15 @@ def test_nobody_is_nobody():
 
 
 def two_tracks(gap_s, apart_m, longer_m=0.0, rows=20, known=14) -> Ends:
-    """Two tracks of one second each; of 14 bones some are `known`, the second person's are `longer_m` longer."""
+    """Two tracks of one second each; of 14 bones some are `known`, the second person's are
+    `longer_m` longer.
+    """
     time_s = np.concatenate([np.linspace(0, 1, rows), np.linspace(0, 1, rows) + 1 + gap_s])
     track = np.repeat([3, 7], rows)
     centre = np.zeros((2 * rows, 3))
-    centre[:rows, 0] = np.linspace(-2.0, 0.0, rows)  # the last row's place counts, and the first of the other
+    centre[:rows, 0] = np.linspace(
+        -2.0, 0.0, rows
+    )  # the last row's place counts, and the first of the other
     centre[rows:, 0] = apart_m + np.linspace(0.0, 5.0, rows)
     bones = np.where(track[:, None] == 3, 0.4, 0.4 + longer_m) * np.ones(14)
     bones[:, known:] = np.nan
@@ -134,9 +154,13 @@ def test_a_trace_is_the_centre_of_the_core_joints_that_are_known_and_the_core_bo
     core = list(BODY_25.core)
     joints[1, core[:4]] = np.nan
     trace = Trace.of(1, np.zeros(2), joints, BODY_25)
-    np.testing.assert_allclose(trace.centre, [joints[0, core].mean(axis=0), joints[1, core[4:]].mean(axis=0)])
+    np.testing.assert_allclose(
+        trace.centre, [joints[0, core].mean(axis=0), joints[1, core[4:]].mean(axis=0)]
+    )
     lengths = [
-        np.linalg.norm(joints[0, j] - joints[0, BODY_25.parents[j]]) for j in core if BODY_25.parents[j] in core
+        np.linalg.norm(joints[0, j] - joints[0, BODY_25.parents[j]])
+        for j in core
+        if BODY_25.parents[j] in core
     ]
     np.testing.assert_allclose(np.sort(trace.bones[0]), np.sort(lengths))
 
@@ -165,9 +189,14 @@ def joined_all_at_once(ends: Ends, config: StitchingConfig, cuts_s: list[float])
             alike = known.sum() >= 7 and squared[known].mean() <= 2.0
             cut = any(end < at <= begin for at in cuts_s)
             if alike and not cut and 0 < gap <= config.longest_gap_s and apart <= 0.5 + 1.5 * gap:
-                # -2 log of a Gaussian on the floor, two sigmas of which are in reach, and of the 14 bones.
+                # -2 log of a Gaussian on the floor, two sigmas of which are in reach, and of the 14
+                # bones.
                 sigma = max((0.5 + 1.5 * gap) / 2, 0.05)
-                cost[a, b] = apart**2 / sigma**2 + 2 * np.log(sigma**2 / 0.05**2) + 14 * squared[known].mean()
+                cost[a, b] = (
+                    apart**2 / sigma**2
+                    + 2 * np.log(sigma**2 / 0.05**2)
+                    + 14 * squared[known].mean()
+                )
     pairs = zip(*linear_sum_assignment(cost), strict=True)
     before = {b: a for a, b in pairs if cost[a, b] < alone}
     names: dict[int, int] = {}
@@ -176,7 +205,9 @@ def joined_all_at_once(ends: Ends, config: StitchingConfig, cuts_s: list[float])
     return {int(ends.track[at]): name for at, name in names.items()}
 
 
-@pytest.mark.parametrize(("seed", "seconds", "cuts_s"), [(0, 30.0, []), (1, 100.0, [20.0, 50.0]), (2, 400.0, [])])
+@pytest.mark.parametrize(
+    ("seed", "seconds", "cuts_s"), [(0, 30.0, []), (1, 100.0, [20.0, 50.0]), (2, 400.0, [])]
+)
 def test_groups_of_tracks_are_joined_as_all_at_once_would_be(seed, seconds, cuts_s):
     ends = many_tracks(70, seconds, people=4, seed=seed)
     found = stitch_traces(ends, StitchingConfig(), cuts_s)

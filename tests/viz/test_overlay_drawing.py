@@ -35,21 +35,29 @@ def grey(view: PictureView) -> np.ndarray:
 
 def skeletons(joints: np.ndarray, seen: bool = True, label: str = "") -> Skeletons:
     P = len(joints)
-    return Skeletons(joints, np.full(joints.shape[:2], seen), bones_of(BODY_25.joints), [RED] * P, [label] * P)
+    return Skeletons(
+        joints, np.full(joints.shape[:2], seen), bones_of(BODY_25.joints), [RED] * P, [label] * P
+    )
 
 
 def bent(camera: Camera) -> Camera:
     """The same camera with a lens that bends."""
-    return Camera(camera.name, camera.K, camera.wTc, camera.image_size, np.array([-0.7, 0.1, 0.001, 0, 0]))
+    return Camera(
+        camera.name, camera.K, camera.wTc, camera.image_size, np.array([-0.7, 0.1, 0.001, 0, 0])
+    )
 
 
 @pytest.mark.parametrize("scale", [0.5, 1.0])
 def test_joints_are_drawn_where_the_lens_shows_them(scene, scale):
     camera = bent(scene.rig.cameras[0])
-    view = view_of(camera, (round(camera.image_size[0] * scale), round(camera.image_size[1] * scale)))
+    view = view_of(
+        camera, (round(camera.image_size[0] * scale), round(camera.image_size[1] * scale))
+    )
     joints = scene.keypoints[0, :1].copy()  # a second person's bones may cross the first's joints
     hip = (np.linalg.inv(camera.wTc) @ np.append(joints[0, 8], 1.0))[:3]
-    joints += (0.3 * hip[2] - hip[0]) * camera.wTc[:3, 0]  # half-way to the right border, where the lens bends
+    joints += (0.3 * hip[2] - hip[0]) * camera.wTc[
+        :3, 0
+    ]  # half-way to the right border, where the lens bends
     joints[0, 4] = np.nan
     drawn = grey(view)
     draw_skeletons(drawn, view, skeletons(joints))
@@ -78,7 +86,9 @@ def test_joints_that_were_not_seen_are_rings(scene):
 def test_nothing_is_drawn_of_who_is_behind_the_camera_or_far_outside(scene):
     camera = bent(scene.rig.cameras[0])
     view = view_of(camera)
-    behind = camera.centre - 2 * camera.wTc[:3, 2] + np.random.default_rng(0).normal(0, 0.3, (1, 25, 3))
+    behind = (
+        camera.centre - 2 * camera.wTc[:3, 2] + np.random.default_rng(0).normal(0, 0.3, (1, 25, 3))
+    )
     beside = camera.centre + camera.wTc[:3, 2] + 5 * camera.wTc[:3, 0] + np.zeros((1, 25, 3))
     for joints in (behind, beside, np.full((1, 25, 3), np.nan), np.zeros((0, 25, 3))):
         drawn = grey(view)
@@ -145,7 +155,9 @@ def test_a_letterboxed_picture_is_drawn_on_where_the_people_are(scene):
     """The same person in the same camera, whose pictures were halved and got bars on two sides."""
     camera = scene.rig.cameras[0]
     width, height = camera.image_size
-    placement = Placement(PlacementKind.LETTERBOX, (width // 2 + 100, height // 2), camera.image_size)
+    placement = Placement(
+        PlacementKind.LETTERBOX, (width // 2 + 100, height // 2), camera.image_size
+    )
     view = PictureView(camera, placement, placement.picture_size)
     xy, _ = view.project(scene.keypoints[0, 0])
     plain, _ = camera.project(scene.keypoints[0, 0])

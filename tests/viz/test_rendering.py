@@ -22,7 +22,10 @@ def sphere(rings: int) -> tuple[np.ndarray, np.ndarray]:
     theta = np.linspace(0, np.pi, rings)[:, None]
     phi = np.arange(2 * rings) * np.pi / rings
     vertices = np.stack(
-        np.broadcast_arrays(np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)), -1
+        np.broadcast_arrays(
+            np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)
+        ),
+        -1,
     )
     i, j = np.arange(rings - 1)[:, None] * 2 * rings, np.arange(2 * rings)[None]
     k = (j + 1) % (2 * rings)
@@ -56,10 +59,12 @@ def test_depth_of_a_sphere(camera: Camera):
     root = b**2 - a * (centre @ centre - 1)
     hit = surface.face >= 0
     assert 0.995 < hit.sum() / (root > 0).sum() <= 1.0  # the facets lie inside the sphere
-    inner = root > 0.3  # away from the rim, where a facet's error in depth is not multiplied by the slope
+    inner = (
+        root > 0.3
+    )  # away from the rim, where a facet's error in depth is not multiplied by the slope
     expected = (b[inner] - np.sqrt(root[inner])) / a[inner]
-    # A facet's edge is pi / 199 long, its diagonal d = 0.022, and lies d^2 / 8 = 6e-5 under the sphere; root > 0.3
-    # is a slope of at most 1 / sqrt(0.3).
+    # A facet's edge is pi / 199 long, its diagonal d = 0.022, and lies d^2 / 8 = 6e-5 under the
+    # sphere; root > 0.3 is a slope of at most 1 / sqrt(0.3).
     assert np.abs(surface.depth[inner] - expected).max() < 1.2e-4
     assert np.isinf(surface.depth[~hit]).all()
 
@@ -80,7 +85,9 @@ def test_depth_of_a_tilted_plane(camera: Camera):
 
 
 def test_the_nearer_of_two_quads_wins_and_neighbours_leave_no_gap():
-    square = np.array([[1.75, 1.75], [12.25, 1.75], [12.25, 12.25], [1.75, 12.25]])  # no edge on a pixel's centre
+    square = np.array(
+        [[1.75, 1.75], [12.25, 1.75], [12.25, 12.25], [1.75, 12.25]]
+    )  # no edge on a pixel's centre
     xy = np.concatenate([square, square + np.array([5, 3])])
     faces = np.array([[2, 1, 0], [3, 2, 0], [6, 5, 4], [7, 6, 4]])  # counter-clockwise as seen
     surface = rasterise(xy, np.repeat([3.0, 2.0], 4), faces, (24, 20))
@@ -108,7 +115,9 @@ def test_what_is_behind_the_camera_or_nan_is_not_drawn(camera: Camera):
     vertices, faces = sphere(20)
     behind = vertices + 2 * camera.centre
     assert (drawn(behind, faces, camera).face == -1).all()
-    around = vertices + camera.centre  # the camera is in the middle: no face crosses the image plane whole
+    around = (
+        vertices + camera.centre
+    )  # the camera is in the middle: no face crosses the image plane whole
     assert np.isfinite(drawn(around, faces[:, ::-1], camera).depth).any()
     vertices = vertices.copy()
     vertices[:200] = np.nan
@@ -138,21 +147,30 @@ def test_normals_of_a_sphere():
     vertices, faces = sphere(60)
     away_from_poles = np.abs(vertices[:, 2]) < 0.99
     normals = vertex_normals(vertices, faces)
-    # Area weights on quads cut along one diagonal lean the mean by half a facet's angle at most: pi / 60 / 2.
+    # Area weights on quads cut along one diagonal lean the mean by half a facet's angle at most: pi
+    # / 60 / 2.
     assert np.abs(normals - vertices)[away_from_poles].max() < 0.03
 
 
 def test_the_fast_way_meets_the_same_surfaces(camera: Camera):
-    """Two spheres, one through the other, from outside, from near and from inside, by a camera with skew."""
+    """Two spheres, one through the other, from outside, from near and from inside, by a camera with
+    skew.
+    """
     ball, faces = sphere(40)
     points = np.concatenate([ball, 0.6 * ball + (0.5, 0.7, 0.2)])
     mesh = np.concatenate([faces, faces + len(ball)])
     width, height = camera.image_size
     row, column = np.mgrid[:height, :width]
     hits = []
-    for eye, target in (((4.0, 1, 0.5), (0, 0, 0)), ((1.0, 0.1, 1), (0.5, 0.7, 0.2)), ((0, 0, 0.1), (3.0, 1, 0))):
+    for eye, target in (
+        ((4.0, 1, 0.5), (0, 0, 0)),
+        ((1.0, 0.1, 1), (0.5, 0.7, 0.2)),
+        ((0, 0, 0.1), (3.0, 1, 0)),
+    ):
         shifted = np.array([[200.0, 3.0, 70.0], [0, 180.0, 66.0], [0, 0, 1]])
-        seen_from = Camera("c", shifted, look_at(np.array(eye), np.array(target), UP), camera.image_size)
+        seen_from = Camera(
+            "c", shifted, look_at(np.array(eye), np.array(target), UP), camera.image_size
+        )
         exact = drawn(points, mesh, seen_from)
         depth, vertex = first_surface_at(points, mesh.astype(np.int32), seen_from, column, row)
         hit = exact.face >= 0

@@ -55,7 +55,9 @@ class SequenceFitter:
         numbers, group = np.unique(groups, return_inverse=True)
         joints = len(self.energy.model.keypoint_names)
         if targets.xyz.shape[1] != joints:
-            raise ValueError(f"targets must be the {joints} keypoints of the body, got {targets.xyz.shape[1]}")
+            raise ValueError(
+                f"targets must be the {joints} keypoints of the body, got {targets.xyz.shape[1]}"
+            )
         if time_s.shape != (len(targets),) or not np.isfinite(time_s).all():
             raise ValueError(f"time_s must be {len(targets)} finite numbers, one a row")
         if shapes is not None and len(shapes.mean) != len(numbers):
@@ -72,7 +74,12 @@ class SequenceFitter:
         known = Shapes.unknown(len(numbers)) if shapes is None else shapes
         usable = np.flatnonzero(evidence.status != FitStatus.INVALID_TARGETS)
         cut = cut_segments(
-            usable, group, time_s, gap_s=self.config.gap_s, length=SEGMENT_ROWS, overlap=OVERLAP_ROWS
+            usable,
+            group,
+            time_s,
+            gap_s=self.config.gap_s,
+            length=SEGMENT_ROWS,
+            overlap=OVERLAP_ROWS,
         )
         segments = [segment for segment in cut if found[segment.rows].any()]
         if len(segments) > 0:
@@ -83,7 +90,9 @@ class SequenceFitter:
                 self._fill(fit, part, free[part], origin[part], rows, evidence)
         return SequenceFit(fit, numbers, known)
 
-    def _start(self, evidence: Evidence, group: Index, time_s: Array) -> tuple[Array, Array, ChainRows, Mask]:
+    def _start(
+        self, evidence: Evidence, group: Index, time_s: Array
+    ) -> tuple[Array, Array, ChainRows, Mask]:
         """Initial bodies of B rows from single-row fits; rows without one take that of the nearest
         row of the group in time.
 
@@ -103,7 +112,10 @@ class SequenceFitter:
                 free[theirs, -3:] += evidence.centre[theirs] - middle
                 order = theirs[np.argsort(time_s[theirs], kind="stable")]
                 nearest = order[_nearest(time_s[order], time_s[mine])]
-                place = [np.interp(time_s[mine], time_s[order], free[order, axis]) for axis in (-3, -2, -1)]
+                place = [
+                    np.interp(time_s[mine], time_s[order], free[order, axis])
+                    for axis in (-3, -2, -1)
+                ]
                 free[mine] = free[nearest]
                 free[mine, -3:] = np.stack(place, axis=1)
                 angles[mine] = held[np.searchsorted(ok, nearest)]
@@ -117,7 +129,9 @@ class SequenceFitter:
         """Solved parameters (B, P), and the posterior shapes (G)."""
         owner = np.array([segment.group for segment in segments])
         if fixed:
-            return rows.solved(free, segments, known.mean[owner], known.information[owner], fixed=True)[0], known
+            return rows.solved(
+                free, segments, known.mean[owner], known.information[owner], fixed=True
+            )[0], known
         share = _rows_per_look(rows.time_s, segments, self.config.correlation_s, len(known.mean))
         prior = known.information * share[:, None, None]
         held, firm = known.mean[owner], prior[owner]
@@ -135,7 +149,9 @@ class SequenceFitter:
         if several.any():
             again = several[owner]
             segments = [segment for segment in segments if several[segment.group]]
-            free, *_ = rows.solved(free, segments, mean[owner[again]], total[owner[again]], fixed=True)
+            free, *_ = rows.solved(
+                free, segments, mean[owner[again]], total[owner[again]], fixed=True
+            )
         return free, shapes
 
     def _fill(
@@ -147,7 +163,9 @@ class SequenceFitter:
         rows: ChainRows,
         evidence: Evidence,
     ) -> None:
-        """Fill the rows `part` (R,) of `fit` with the bodies `body` (R, P) around `origin` (R, 3)."""
+        """Fill the rows `part` (R,) of `fit` with the bodies `body` (R, P) around `origin` (R,
+        3).
+        """
         held = Held(body[:, :10], np.full(len(part), SETTLED), rows.angles[part])
         found = self.energy.evaluate(body, rows.targets.rows(part), self.config.kernel_scale, held)
         known, _ = found.covariances()
@@ -162,7 +180,9 @@ class SequenceFitter:
         fit.covariance[part], fit.residual_m[part] = known[ok], residual_m[ok]
 
 
-def _rows_per_look(time_s: Array, segments: list[Segment], correlation_s: float, count: int) -> Array:
+def _rows_per_look(
+    time_s: Array, segments: list[Segment], correlation_s: float, count: int
+) -> Array:
     """(G,) number of rows of each group per independent look at its shape, given the correlation
     time of errors.
     """
@@ -178,4 +198,6 @@ def _nearest(sorted_s: Array, asked_s: Array) -> Index:
     """(M,) index of the nearest of the sorted times to each of `asked_s` (M,)."""
     after = np.clip(np.searchsorted(sorted_s, asked_s), 0, len(sorted_s) - 1)
     before = np.maximum(after - 1, 0)
-    return np.where(np.abs(sorted_s[before] - asked_s) <= np.abs(sorted_s[after] - asked_s), before, after)
+    return np.where(
+        np.abs(sorted_s[before] - asked_s) <= np.abs(sorted_s[after] - asked_s), before, after
+    )

@@ -25,7 +25,8 @@ class Segment:
     rows: Index
     """(T,) row indices, ordered by time."""
     kept: Mask
-    """(T,) whether a row belongs to this segment; the others overlap with the one before or after."""
+    """(T,) whether a row belongs to this segment; the others overlap with the one before or
+    after."""
     group: int
     """Index of the person."""
 
@@ -42,7 +43,9 @@ def cut_segments(
     same, step = np.diff(group[order]) == 0, np.diff(time_s[order])
     if (same & (step <= 0)).any():
         twice = order[1:][same & (step <= 0)][0]
-        raise ValueError(f"group {group[twice]} has two rows at {time_s[twice]} s: give one row a time")
+        raise ValueError(
+            f"group {group[twice]} has two rows at {time_s[twice]} s: give one row a time"
+        )
     segments = []
     for chain in np.split(order, np.flatnonzero(~same | (step > gap_s)) + 1):
         for start in range(0, len(chain), length) if len(chain) > 0 else ():
@@ -106,7 +109,9 @@ class Links:
         turn = log_so3(root[1:] @ root[:-1].swapaxes(1, 2))
         v = self._rate * np.concatenate((turn, others[1:] - others[:-1]), -1)
         K = len(self._smooth)
-        change = sum(weight * v[i : i + K] for i, weight in reversed(list(enumerate(self._weights))))
+        change = sum(
+            weight * v[i : i + K] for i, weight in reversed(list(enumerate(self._weights)))
+        )
         energy = float((self._slow * v**2).sum() + (self._smooth * change**2).sum())
         force = self._bands[0] * v
         for k, band in enumerate(self._bands[1:], start=1):
@@ -191,7 +196,9 @@ class _State:
         """The state after a step of the betas (10,) and the poses (T, N); the root's is in tangents
         of the world.
         """
-        return _State(self.betas + shape, exp_so3(pose[:, :3]) @ self.root, self.others + pose[:, 3:])
+        return _State(
+            self.betas + shape, exp_so3(pose[:, :3]) @ self.root, self.others + pose[:, 3:]
+        )
 
     def free(self) -> Array:
         """(T, P) parameters of the energy."""
@@ -231,7 +238,9 @@ class _Chain:
         """The state solved from `start` (T, P), and the information of the rows about the betas
         (10, 10).
         """
-        state = _State(self._mean if self._fixed else start[0, :10], exp_so3(start[:, 10:13]), start[:, 13:])
+        state = _State(
+            self._mean if self._fixed else start[0, :10], exp_so3(start[:, 10:13]), start[:, 13:]
+        )
         here, damping, information = self._normal(state), _DAMPING_START, np.zeros((10, 10))
         for _ in range(MAX_ITERATIONS):
             shape, pose, information = self._step(state, here, damping)
@@ -249,10 +258,13 @@ class _Chain:
     def _normal(self, state: _State) -> _Normal:
         """Energy and normal equations at a state."""
         T, scale = len(state.root), self._rows.kernel_scale
-        linear = self._rows.energy.linearise(state.free(), self._targets, scale, self._held, nothing(T))
+        linear = self._rows.energy.linearise(
+            state.free(), self._targets, scale, self._held, nothing(T)
+        )
         ends = max(len(self._links.diagonal) - T, 0)
         root, others = (
-            np.concatenate((each, each[-1:].repeat(ends, axis=0))) for each in (state.root, state.others)
+            np.concatenate((each, each[-1:].repeat(ends, axis=0)))
+            for each in (state.root, state.others)
         )
         moved, pull = self._links.at(root, others)
         away = state.betas - self._mean
@@ -260,15 +272,22 @@ class _Chain:
         return _Normal(energy, linear.system, pull[:T], away)
 
     def _step(self, state: _State, here: _Normal, damping: float) -> tuple[Array, Array, Array]:
-        """Steps of betas (10,) and poses (T, N), and the rows' information about the betas (10, 10)."""
+        """Steps of betas (10,) and poses (T, N), and the rows' information about the betas (10,
+        10).
+        """
         (T, N), bands = here.pull.shape, self._links.beyond.shape[-1]
         M = (bands + 1) * N + 11
         kept, front = np.zeros((T, M, -(-N // 16) * 16)), np.zeros((M, M))
-        diagonal, beyond = (np.ascontiguousarray(each[:T]) for each in (self._links.diagonal, self._links.beyond))
+        diagonal, beyond = (
+            np.ascontiguousarray(each[:T]) for each in (self._links.diagonal, self._links.beyond)
+        )
         eliminated(here.system, state.root, diagonal, beyond, here.pull, damping, kept, front)
         said = np.tril(front[-10:, -10:])
         said = said + np.tril(said, -1).T
-        coefficients, gradient = np.append(1.0, np.zeros(10)), front[-10:, -11] + self._firm @ here.away
+        coefficients, gradient = (
+            np.append(1.0, np.zeros(10)),
+            front[-10:, -11] + self._firm @ here.away,
+        )
         if not self._fixed:
             whole = said + self._firm
             whole = whole + damping * np.diag(np.diag(whole))

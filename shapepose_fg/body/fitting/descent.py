@@ -1,6 +1,6 @@
 """Learned gradient descent: the update network moves a body towards its targets, step by step.
 
-    Theta <- Theta + N_w(dE_shape/dTheta, Theta, X)              (Eq. 5 of the paper; Song et al., ECCV 2020)
+    Theta <- Theta + N_w(dE_shape/dTheta, Theta, X)    (Eq. 5 of the paper; Song et al., ECCV 2020)
 
 in the person's own frame: pelvis near the origin, upright, facing +z (see `PersonFrame`). E_shape
 is the data term of `BodyEnergy`, with an analytic gradient. Training
@@ -90,7 +90,9 @@ class Sight:
     ):
         rest = tuple(sorted(set(range(len(BODY_POINTS))) - set(slots)))
         if len(rest) != (0 if others is None else len(others.root)):
-            raise ValueError(f"others must be the {len(rest)} points of the body that are not among the targets")
+            raise ValueError(
+                f"others must be the {len(rest)} points of the body that are not among the targets"
+            )
         every = (points if others is None else points.joined(others)).part(
             np.argsort(slots + rest, kind="stable").tolist()
         )
@@ -100,7 +102,9 @@ class Sight:
             own.offset[list(slots)], own.bone[list(slots)] = offsets
         self._own, self._limbs, self._kernel_scale = own, every.limbs(), kernel_scale
 
-    def __call__(self, state: BodyState, target: Array, information: Array, scale: Any) -> NDArray[np.float32]:
+    def __call__(
+        self, state: BodyState, target: Array, information: Array, scale: Any
+    ) -> NDArray[np.float32]:
         """(B, `UpdateNetwork.num_inputs`) network inputs; gradients are multiplied by `scale`
         (79,).
         """
@@ -128,8 +132,16 @@ def moved(change, size, betas, local, transl):
             transl[b, x] += size * change[b, 142 + x]
         for q in range(22):
             R, c, at = local[b, q], change[b], 10 + 6 * q
-            a0, a1, a2 = R[0, 0] + size * c[at], R[1, 0] + size * c[at + 1], R[2, 0] + size * c[at + 2]
-            b0, b1, b2 = R[0, 1] + size * c[at + 3], R[1, 1] + size * c[at + 4], R[2, 1] + size * c[at + 5]
+            a0, a1, a2 = (
+                R[0, 0] + size * c[at],
+                R[1, 0] + size * c[at + 1],
+                R[2, 0] + size * c[at + 2],
+            )
+            b0, b1, b2 = (
+                R[0, 1] + size * c[at + 3],
+                R[1, 1] + size * c[at + 4],
+                R[2, 1] + size * c[at + 5],
+            )
             v = 1 / math.sqrt(a0 * a0 + a1 * a1 + a2 * a2)
             a0, a1, a2 = v * a0, v * a1, v * a2
             v = a0 * b0 + a1 * b1 + a2 * b2

@@ -1,6 +1,7 @@
 """Energy of a body given joint targets; `body/kernels/bodies.py` linearises it row by row.
 
-    E(Theta) = sum_i rho((x_i(Theta) - z_i)ᵀ M_i (x_i(Theta) - z_i)) + |betas|² - 2 log p(theta) + constant
+    E(Theta) = sum_i rho((x_i(Theta) - z_i)ᵀ M_i (x_i(Theta) - z_i))
+               + |betas|² - 2 log p(theta) + constant
 
 with M_i the information of target z_i, rho a robust kernel, and p the Gaussian pose prior: SMPLify
 (Bogo et al. 2016) for 3D joints. There is no factor 1/2, so that the inverse of half its Hessian is
@@ -172,8 +173,8 @@ class BodyEnergy:
         return Held(np.zeros((count, 10)), np.ones(count), np.tile(self.priors.mean, (count, 1)))
 
     def linearise(
-        self, free: Array, targets: EnergyTargets, scale: Array | float, held: Held, asked: Index | None = None,
-        *, slope_only: bool = False,
+        self, free: Array, targets: EnergyTargets, scale: Array | float, held: Held,
+        asked: Index | None = None, *, slope_only: bool = False,
     ) -> Linear:  # fmt: skip
         """Linearise the energy at free parameters (B, P), with a scale of the robust kernel for all
         rows or each row (B,).
@@ -186,11 +187,25 @@ class BodyEnergy:
         linear = Linear(*map(np.empty, ((B,), (B, K, 3), (B, K), (B, P), size)))
         scales, work = _plain(np.broadcast_to(scale, (B,))), Work.of(self._limbs, P)
         asked = np.require(asked, np.intp, ["C", "W"])
-        linearised(self._limbs, self.priors, _plain(free), _rows(targets, held), scales, asked, linear, work)
+        linearised(
+            self._limbs,
+            self.priors,
+            _plain(free),
+            _rows(targets, held),
+            scales,
+            asked,
+            linear,
+            work,
+        )
         return linear
 
     def evaluate(
-        self, free: Array, targets: EnergyTargets, scale: float, held: Held, asked: Index | None = None
+        self,
+        free: Array,
+        targets: EnergyTargets,
+        scale: float,
+        held: Held,
+        asked: Index | None = None,
     ) -> Evaluated:
         """Bodies at free parameters (B, P) with energy and step; `asked` as in `linearise`."""
         linear = self.linearise(free, targets, scale, held, asked)
@@ -217,7 +232,9 @@ def _plain(array: Array) -> Array:
 
 def _rows(targets: EnergyTargets, held: Held) -> Rows:
     """Targets and priors in the form that kernels take."""
-    return Rows(*map(_plain, (targets.xyz, targets.information, held.betas, held.stiffness, held.angles)))
+    return Rows(
+        *map(_plain, (targets.xyz, targets.information, held.betas, held.stiffness, held.angles))
+    )
 
 
 def visible_joints(model: BodyModel, prior: PosePrior) -> Index:
@@ -225,6 +242,8 @@ def visible_joints(model: BodyModel, prior: PosePrior) -> Index:
     Jacobian.
     """
     poses, still = prior.sample(np.random.default_rng(0), 8), np.zeros((8, 3))
-    _, jacobian = model.keypoints_with_jacobian(BodyParameters(np.zeros((8, 10)), still, poses, still))
+    _, jacobian = model.keypoints_with_jacobian(
+        BodyParameters(np.zeros((8, 10)), still, poses, still)
+    )
     speed = np.abs(jacobian[..., 13:-3]).reshape(*jacobian.shape[:3], 23, 3).max(axis=(0, 1, 2, 4))
     return np.flatnonzero(speed > VISIBLE_M_PER_RAD)

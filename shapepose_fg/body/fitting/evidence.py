@@ -67,8 +67,14 @@ def weigh(targets: JointTargets, model_sigma_m: float) -> Evidence:
 
 @part
 def _positive(a, b, c, d, e, f):
-    """Whether the symmetric matrix ((a, b, c), (b, d, e), (c, e, f)) is positive definite, by its minors."""
-    return a > 0 and a * d - b * b > 0 and a * (d * f - e * e) + b * (c * e - b * f) + c * (b * e - c * d) > 0
+    """Whether the symmetric matrix ((a, b, c), (b, d, e), (c, e, f)) is positive definite, by its
+    minors.
+    """
+    return (
+        a > 0
+        and a * d - b * b > 0
+        and a * (d * f - e * e) + b * (c * e - b * f) + c * (b * e - c * d) > 0
+    )
 
 
 @kernel("f4 f0 f4 f2 b2 b1")

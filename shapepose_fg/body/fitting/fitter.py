@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
 Method = Literal["auto", "learned", "plain"]
 _ONE_TABLE = (
-    "is one with [body] now, which has model_sigma_m, kernel_scale, polish_steps, unfinished, gap_s and"
-    " correlation_s (lasting_s before); its other settings are constants"
+    "is one with [body] now, which has model_sigma_m, kernel_scale, polish_steps, unfinished, "
+    "gap_s and correlation_s (lasting_s before); its other settings are constants"
 )
 
 
@@ -66,7 +66,9 @@ class BodyConfig(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.method not in get_args(Method):
-            raise ValueError(f"method must be one of {' '.join(get_args(Method))}, got {self.method!r}")
+            raise ValueError(
+                f"method must be one of {' '.join(get_args(Method))}, got {self.method!r}"
+            )
 
 
 class FitStatus(StrEnum):
@@ -91,7 +93,8 @@ class JointTargets(Rows):
     """Target positions with information for the joints of B rows (people, frames or both)."""
 
     xyz: Array
-    """(B, J, 3) target of each joint in the world, metres; ignored where the information is zero."""
+    """(B, J, 3) target of each joint in the world, metres; ignored where the information is
+    zero."""
     information: Array
     """(B, J, 3, 3) inverse covariance of each target, 1/m², symmetric and positive *semi*-definite.
     Zero for an unseen joint, rank 2 for one seen by a single view (a ray), full otherwise."""
@@ -102,7 +105,9 @@ class JointTargets(Rows):
         if xyz.ndim != 3 or xyz.shape[-1] != 3:
             raise ValueError(f"xyz must be (B, J, 3), got {xyz.shape}")
         if information.shape != (*xyz.shape, 3):
-            raise ValueError(f"information must be {(*xyz.shape, 3)} like xyz, got {information.shape}")
+            raise ValueError(
+                f"information must be {(*xyz.shape, 3)} like xyz, got {information.shape}"
+            )
         object.__setattr__(self, "xyz", xyz)
         object.__setattr__(self, "information", information)
 
@@ -111,7 +116,9 @@ class JointTargets(Rows):
         """Targets at `joints` (B, J, 3), metres, with covariance (B, J, 3, 3); none where either is
         NaN.
         """
-        known = np.asarray(np.isfinite(joints).all(axis=-1) & np.isfinite(covariance).all(axis=(-2, -1)))
+        known = np.asarray(
+            np.isfinite(joints).all(axis=-1) & np.isfinite(covariance).all(axis=(-2, -1))
+        )
         information = np.zeros(covariance.shape)
         information[known] = np.linalg.inv(covariance[known])
         return cls(np.where(known[..., None], joints, 0.0), (information + information.mT) / 2)
@@ -161,7 +168,8 @@ class BodyFit(Rows):
     """(B, J, 3, 3) covariance of this prediction of the detector's joint, including the model's
     error, m²."""
     residual_m: Array
-    """(B,) weighted root mean square distance of the joints to their targets, metres; NaN where not OK."""
+    """(B,) weighted root mean square distance of the joints to their targets, metres; NaN where not
+    OK."""
     status: NDArray[np.str_]
     """(B,) a `FitStatus` each."""
 
@@ -175,7 +183,9 @@ class BodyFit(Rows):
         """Rows without a body: zero parameters, NaN joints, a copy of the given `status` (B,)."""
         B, J = len(status), num_joints
         zeros, unknown = ((10,), (3,), (23, 3), (3,)), ((J, 3), (J, 3, 3), (J, 3), (J, 3, 3), ())
-        columns = [np.zeros((B, *shape)) for shape in zeros] + [np.full((B, *shape), np.nan) for shape in unknown]
+        columns = [np.zeros((B, *shape)) for shape in zeros] + [
+            np.full((B, *shape), np.nan) for shape in unknown
+        ]
         return cls(*columns, status=np.asarray(status).astype(STATUS_TYPE))
 
     def put_bodies(self, index: Index, body: "BodyParameters", origin: Array) -> None:
@@ -197,7 +207,11 @@ class Shapes:
     """(G, 10, 10) inverse covariances; the prior of an unknown person is the identity, around 0."""
 
     def __post_init__(self) -> None:
-        if self.mean.ndim != 2 or self.mean.shape[1] != 10 or self.information.shape != (*self.mean.shape, 10):
+        if (
+            self.mean.ndim != 2
+            or self.mean.shape[1] != 10
+            or self.information.shape != (*self.mean.shape, 10)
+        ):
             shapes = f"{self.mean.shape} and {self.information.shape}"
             raise ValueError(f"mean and information must be (G, 10) and (G, 10, 10), got {shapes}")
 
@@ -231,7 +245,9 @@ class BodyFitter(ABC):
     time."""
 
     @abstractmethod
-    def fit(self, targets: JointTargets, initial: BodyFit | None = None, groups: Index | None = None) -> BodyFit:
+    def fit(
+        self, targets: JointTargets, initial: BodyFit | None = None, groups: Index | None = None
+    ) -> BodyFit:
         """Fit a body to every row of `targets`.
 
         `initial` has one row per target; the fit may start at its OK rows. `groups` (B,) are
@@ -276,8 +292,9 @@ def check_fitter(fitter: object) -> None:
     """Raise TypeError unless `fitter` is a `BodyFitter`."""
     if not isinstance(fitter, BodyFitter):
         raise TypeError(
-            f"{type(fitter).__name__} must inherit from shapepose_fg.body.fitting.fitter.BodyFitter, which makes"
-            " the other methods of a fitter from `fit`"
+            f"{type(fitter).__name__} must inherit from "
+            "shapepose_fg.body.fitting.fitter.BodyFitter, which makes the other methods of a "
+            "fitter from `fit`"
         )
 
 
@@ -285,5 +302,7 @@ def check_groups(groups: Index, rows: int) -> Index:
     """`groups` as an array; raises ValueError unless it has one integer per row."""
     groups = np.asarray(groups)
     if groups.shape != (rows,) or groups.dtype.kind not in "iu":
-        raise ValueError(f"groups must be {rows} whole numbers, one a row, got {groups.dtype} {groups.shape}")
+        raise ValueError(
+            f"groups must be {rows} whole numbers, one a row, got {groups.dtype} {groups.shape}"
+        )
     return groups

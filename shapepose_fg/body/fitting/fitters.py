@@ -53,7 +53,9 @@ than a Gaussian predicts: without them, 85 % of the wrists of the validation sub
 
 
 def make_fitter(
-    config: BodyConfig | None = None, model: BodyModel | None = None, law: Motion = CONSTANT_VELOCITY
+    config: BodyConfig | None = None,
+    model: BodyModel | None = None,
+    law: Motion = CONSTANT_VELOCITY,
 ) -> "SmplFitter":
     """The fitter for `config`, on `model` or the body of the package; `law` is the motion model
     over time.
@@ -64,7 +66,9 @@ def make_fitter(
     model = BodyModel.default() if model is None else model
     if config.method == "plain":
         return SmplFitter(model, config=config, law=law)
-    weights = FitterWeights.load(Path(config.weights)) if config.weights else FitterWeights.of(model)
+    weights = (
+        FitterWeights.load(Path(config.weights)) if config.weights else FitterWeights.of(model)
+    )
     if config.method == "auto" and not config.weights and fingerprint(model) != weights.body:
         return SmplFitter(model, config=config, law=law)
     return SmplFitter(model, config=config, weights=weights, law=law)
@@ -104,8 +108,14 @@ class SmplFitter(BodyFitter):
             self._spread = np.array([_SPREAD.get(name, 1.0) for name in names])
         else:
             weights.check(self.model)
-            self.optimiser = NetworkDescent(self.energy, weights, config.kernel_scale, config.polish_steps)
-            self._fallback, self._unfinished, self._spread = plain, config.unfinished, weights.spread_of(names)
+            self.optimiser = NetworkDescent(
+                self.energy, weights, config.kernel_scale, config.polish_steps
+            )
+            self._fallback, self._unfinished, self._spread = (
+                plain,
+                config.unfinished,
+                weights.spread_of(names),
+            )
 
     @cached_property
     def sets(self) -> Index:
@@ -117,7 +127,9 @@ class SmplFitter(BodyFitter):
         model = self.model.with_keypoint_offsets(offsets)
         return SmplFitter(model, self.prior, self.config, self.weights, self.law)
 
-    def fit(self, targets: JointTargets, initial: BodyFit | None = None, groups: Index | None = None) -> BodyFit:
+    def fit(
+        self, targets: JointTargets, initial: BodyFit | None = None, groups: Index | None = None
+    ) -> BodyFit:
         """Fit a body to every row of `targets`; see `BodyFit` for the result.
 
         OK rows of `initial` are warm starts of Levenberg-Marquardt, without closed form and
@@ -127,7 +139,9 @@ class SmplFitter(BodyFitter):
         return self._fit(targets, initial, groups, leave_out=True)
 
     def fit_whole(self, targets: JointTargets, initial: BodyFit | None = None) -> BodyFit:
-        """Fit as `fit` does in a fraction of the time; `prior_xyz` and `prior_covariance` are NaN."""
+        """Fit as `fit` does in a fraction of the time; `prior_xyz` and `prior_covariance` are
+        NaN.
+        """
         fit = self._fit(targets, initial, None, leave_out=False)
         fit.prior_xyz[:], fit.prior_covariance[:] = np.nan, np.nan
         return fit
@@ -158,18 +172,31 @@ class SmplFitter(BodyFitter):
             size = sizes.ratio(mean[far])
             adult = sequence.fit(own.larger(1 / size[whose]), groups, time_s)
             mean[far] = sizes.resized(self.model, adult.shapes.mean, size)
-        again = sequence.fit(own, groups, time_s, Shapes(mean[far], information[far]), fixed_shapes=True)
-        return SequenceFit(found.fit.with_rows(rows, again.fit), found.groups, Shapes(mean, information))
+        again = sequence.fit(
+            own, groups, time_s, Shapes(mean[far], information[far]), fixed_shapes=True
+        )
+        return SequenceFit(
+            found.fit.with_rows(rows, again.fit), found.groups, Shapes(mean, information)
+        )
 
     def _fit(
-        self, targets: JointTargets, initial: BodyFit | None, groups: Index | None, *, leave_out: bool
+        self,
+        targets: JointTargets,
+        initial: BodyFit | None,
+        groups: Index | None,
+        *,
+        leave_out: bool,
     ) -> BodyFit:
         """Fit a body to every row, with or without the leave-one-out passes."""
         count = len(self.model.keypoint_names)
         if targets.xyz.shape[1] != count:
-            raise ValueError(f"targets must be the {count} keypoints of the body, got {targets.xyz.shape[1]}")
+            raise ValueError(
+                f"targets must be the {count} keypoints of the body, got {targets.xyz.shape[1]}"
+            )
         if initial is not None and len(initial) != len(targets):
-            raise ValueError(f"initial must have one row per target: {len(targets)}, got {len(initial)}")
+            raise ValueError(
+                f"initial must have one row per target: {len(targets)}, got {len(initial)}"
+            )
         groups = np.arange(len(targets)) if groups is None else check_groups(groups, len(targets))
         evidence = weigh(targets, self.config.model_sigma_m)
         fit = BodyFit.failed(evidence.status, count)
@@ -178,7 +205,9 @@ class SmplFitter(BodyFitter):
             return fit
         evidence, groups = evidence.rows(rows), groups[rows]
         start = None if initial is None else self._start(initial.rows(rows), evidence.centre)
-        passes = Passes.of(evidence, self.sets, groups) if leave_out else Passes.whole(evidence, groups)
+        passes = (
+            Passes.of(evidence, self.sets, groups) if leave_out else Passes.whole(evidence, groups)
+        )
         votes = passes.votes & evenly(groups, _VOTERS)[passes.row]
         self._fill(fit, rows, passes, self._posterior(replace(passes, votes=votes), start))
         return fit
@@ -223,7 +252,11 @@ class SmplFitter(BodyFitter):
 
         The passes that contribute are first fitted independently.
         """
-        free, precision, settled = free.copy(), np.zeros((len(free), 10, 10)), np.zeros(len(free), dtype=bool)
+        free, precision, settled = (
+            free.copy(),
+            np.zeros((len(free), 10, 10)),
+            np.zeros(len(free), dtype=bool),
+        )
         for index in _parts(np.flatnonzero(passes.votes), _CHUNK):
             targets, none = passes.given(index)[0], nothing(len(index))
             body = self.optimiser.evaluated(free[index], targets, held.rows(index), none)
@@ -238,26 +271,36 @@ class SmplFitter(BodyFitter):
 
         Rows that have not converged, or are not finite, become NOT_CONVERGED.
         """
-        wider, evidence, chunks = self._spread[:, None, None], passes.evidence, passes.chunks(_CHUNK)
+        wider, evidence, chunks = (
+            self._spread[:, None, None],
+            passes.evidence,
+            passes.chunks(_CHUNK),
+        )
         whole = [part for part, index in zip(parts, chunks, strict=True) if index[0] < len(rows)]
         found = JointPosterior.concatenate(whole)
         unseen = np.all(evidence.information == 0, axis=(-1, -2))[..., None, None]
         prior_xyz, prior_covariance = found.xyz.copy(), found.covariance.copy()
         for part, index in zip(parts[len(whole) :], chunks[len(whole) :], strict=True):
             asked = passes.asked(index)
-            left_out = np.take_along_axis(passes.without[index], asked, axis=1)  # smaller sets are padded
+            left_out = np.take_along_axis(
+                passes.without[index], asked, axis=1
+            )  # smaller sets are padded
             into = np.broadcast_to(passes.row[index, None], asked.shape)[left_out], asked[left_out]
             prior_xyz[into] = np.take_along_axis(part.xyz, asked[..., None], axis=1)[left_out]
             prior_covariance[into] = part.covariance[left_out]
         done = found.left < self._unfinished  # false for NaN
-        done &= np.isfinite(prior_xyz).all(axis=(1, 2)) & np.isfinite(prior_covariance).all(axis=(1, 2, 3))
+        done &= np.isfinite(prior_xyz).all(axis=(1, 2)) & np.isfinite(prior_covariance).all(
+            axis=(1, 2, 3)
+        )
         fit.status[rows[~done]] = FitStatus.NOT_CONVERGED
         rows, origin = rows[done], evidence.centre[done]
         fit.put_bodies(rows, self.energy.complete(found.free[done]), origin)
         fit.joints[rows] = found.xyz[done] + origin[:, None]
         fit.covariance[rows] = np.where(unseen, wider * found.covariance, found.covariance)[done]
         fit.prior_xyz[rows] = prior_xyz[done] + origin[:, None]
-        fit.prior_covariance[rows] = wider * prior_covariance[done] + self.config.model_sigma_m**2 * np.eye(3)
+        fit.prior_covariance[rows] = wider * prior_covariance[
+            done
+        ] + self.config.model_sigma_m**2 * np.eye(3)
         fit.residual_m[rows] = np.sqrt(found.squared.sum(axis=1) / evidence.total_information)[done]
 
     def _starts(self, evidence: Evidence) -> tuple[Array, Array, Mask]:
@@ -270,7 +313,9 @@ class SmplFitter(BodyFitter):
         free, held = self._arrive(passes, None)
         done = np.zeros(len(free), dtype=bool)
         for part in passes.chunks(_CHUNK):
-            body = self.optimiser.evaluated(free[part], passes.given(part)[0], held.rows(part), nothing(len(part)))
+            body = self.optimiser.evaluated(
+                free[part], passes.given(part)[0], held.rows(part), nothing(len(part))
+            )
             free[part], done[part] = body.free, body.left < self._unfinished
         unsettled = np.flatnonzero(~done)
         if self._fallback is not None and len(unsettled) > 0:

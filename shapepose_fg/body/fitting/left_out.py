@@ -43,7 +43,9 @@ class Passes:
     def whole(cls, evidence: Evidence, groups: Index) -> "Passes":
         """One pass per row of `groups` (R,), with all targets."""
         R, J = evidence.xyz.shape[:2]
-        return cls(evidence, np.arange(R), np.zeros((R, J), dtype=bool), groups, np.ones(R, dtype=bool))
+        return cls(
+            evidence, np.arange(R), np.zeros((R, J), dtype=bool), groups, np.ones(R, dtype=bool)
+        )
 
     @classmethod
     def of(cls, evidence: Evidence, sets: Index, groups: Index) -> "Passes":
@@ -75,7 +77,11 @@ class Passes:
         """
         R, M = len(self.evidence.xyz), len(self.row)
         ends = [(0, R), (R, M)]
-        return [np.arange(at, min(at + size, end)) for start, end in ends for at in range(start, end, size)]
+        return [
+            np.arange(at, min(at + size, end))
+            for start, end in ends
+            for at in range(start, end, size)
+        ]
 
     def asked(self, index: Index) -> Index:
         """(B, N) joints that some passes must predict: all, or those left out, padded with others
@@ -140,8 +146,12 @@ def _coupling(energy: BodyEnergy, prior: PosePrior) -> Array:
     H, J = linear.hessian, linear.jacobian
     root = [10, 11, 12, -3, -2, -1]
     H[:, root, root] += _ROOT_INFORMATION
-    covariance = J @ np.linalg.solve(H, J.swapaxes(1, 2)) + BodyConfig.model_sigma_m**2 * np.eye(3 * count)
-    K = np.linalg.inv(covariance).reshape(_POSES, count, 3, count, 3).swapaxes(2, 3)  # (N, J, J, 3, 3)
+    covariance = J @ np.linalg.solve(H, J.swapaxes(1, 2)) + BodyConfig.model_sigma_m**2 * np.eye(
+        3 * count
+    )
+    K = (
+        np.linalg.inv(covariance).reshape(_POSES, count, 3, count, 3).swapaxes(2, 3)
+    )  # (N, J, J, 3, 3)
     own = K[:, np.arange(count), np.arange(count)]
     # The Schur complement: K_aa - K_ab K_bb^-1 K_ba is a's information when b is missing too.
     less = own[:, :, None] - K @ np.linalg.solve(own[:, None], K.swapaxes(-1, -2))

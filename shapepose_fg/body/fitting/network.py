@@ -20,7 +20,9 @@ NUM_PARAMETERS = 10 + 6 * NUM_ROTATIONS + 3
 NUM_TANGENT = 10 + 3 * NUM_ROTATIONS + 3
 """Number of tangent parameters: betas, tangents of the rotations, translation."""
 _NUM_POINTS = len(BODY_POINTS)
-_NONE, _LITTLE, _ROOT_HALF, _HALF, _ONE, _FAR = map(np.float32, (0.0, 1e-5, 0.5**0.5, 0.5, 1.0, 3.9))
+_NONE, _LITTLE, _ROOT_HALF, _HALF, _ONE, _FAR = map(
+    np.float32, (0.0, 1e-5, 0.5**0.5, 0.5, 1.0, 3.9)
+)
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,8 @@ class NetworkConfig(Settings):
     dropout: Annotated[float, Interval(ge=0, le=0.99)] = 0.1
     """Dropout rate in training."""
     half_precision: bool = True
-    """Trains with bfloat16 products, twice as fast on processors that have them; fits are always in float32."""
+    """Trains with bfloat16 products, twice as fast on processors that have them; fits are always in
+    float32."""
 
 
 class UpdateNetwork:
@@ -56,9 +59,15 @@ class UpdateNetwork:
         shapes = layer_shapes(config)
         found = {name: value.shape for name, value in weights.items()}
         if found != shapes:
-            wrong = sorted(name for name in found.keys() | shapes if found.get(name) != shapes.get(name))
-            raise ValueError(f"the network's {wrong[0]} is {found.get(wrong[0])}, not {shapes.get(wrong[0])}")
-        self.weights = {name: np.ascontiguousarray(value, dtype=np.float32) for name, value in weights.items()}
+            wrong = sorted(
+                name for name in found.keys() | shapes if found.get(name) != shapes.get(name)
+            )
+            raise ValueError(
+                f"the network's {wrong[0]} is {found.get(wrong[0])}, not {shapes.get(wrong[0])}"
+            )
+        self.weights = {
+            name: np.ascontiguousarray(value, dtype=np.float32) for name, value in weights.items()
+        }
         """Weights by name, float32."""
         self._enter = np.ascontiguousarray(self.weights["enter.weight"][:, : self.num_inputs])
 
@@ -92,7 +101,10 @@ def _layers(block: int) -> list[str]:
 def layer_shapes(config: NetworkConfig) -> dict[str, tuple[int, ...]]:
     """The shapes of a network's weights by name."""
     width, shapes = config.width, {"gradient_scale": (NUM_TANGENT,)}
-    sizes = {"enter": (width, UpdateNetwork.num_inputs + config.steps), "leave": (NUM_PARAMETERS, width)}
+    sizes = {
+        "enter": (width, UpdateNetwork.num_inputs + config.steps),
+        "leave": (NUM_PARAMETERS, width),
+    }
     for block in range(config.blocks):
         sizes |= dict(zip(_layers(block), ((width,), (width, width), (width, width)), strict=True))
     for name, size in sizes.items():
@@ -118,7 +130,16 @@ def _layer(x, weight, bias, y):
             j, k, m = min(i + 1, B - 1), min(i + 2, B - 1), min(i + 3, B - 1)
             for o in range(start, min(start + 16, outputs), 2):
                 q = min(o + 1, outputs - 1)
-                a, b, c, d, e, f, g, h = bias[o], bias[o], bias[o], bias[o], bias[q], bias[q], bias[q], bias[q]
+                a, b, c, d, e, f, g, h = (
+                    bias[o],
+                    bias[o],
+                    bias[o],
+                    bias[o],
+                    bias[q],
+                    bias[q],
+                    bias[q],
+                    bias[q],
+                )
                 for p in range(count):
                     v, w = weight[o, p], weight[q, p]
                     a += x[i, p] * v
@@ -166,7 +187,8 @@ def _gelu(x):
         v = min(max(x[i] * _ROOT_HALF, -_FAR), _FAR)
         s = v * v
         above = (
-            ((((_ABOVE[0] * s + _ABOVE[1]) * s + _ABOVE[2]) * s + _ABOVE[3]) * s + _ABOVE[4]) * s + _ABOVE[5]
+            ((((_ABOVE[0] * s + _ABOVE[1]) * s + _ABOVE[2]) * s + _ABOVE[3]) * s + _ABOVE[4]) * s
+            + _ABOVE[5]
         ) * s
         below = (((_BELOW[0] * s + _BELOW[1]) * s + _BELOW[2]) * s + _BELOW[3]) * s + _BELOW[4]
         x[i] = _HALF * x[i] * (_ONE + v * (above + _ABOVE[6]) / below)

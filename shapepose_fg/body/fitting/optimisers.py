@@ -46,7 +46,9 @@ class NetworkDescent:
     ignores initial bodies.
     """
 
-    def __init__(self, energy: BodyEnergy, weights: FitterWeights, kernel_scale: float, polish_steps: int):
+    def __init__(
+        self, energy: BodyEnergy, weights: FitterWeights, kernel_scale: float, polish_steps: int
+    ):
         model = energy.model
         self._energy, self._frame, self._polish_steps = energy, weights.frame, polish_steps
         self._scale, self._slots = kernel_scale, slots(model.keypoint_names)
@@ -59,7 +61,9 @@ class NetworkDescent:
             others=body.points.part(rest) if rest else None, offsets=model.offsets_of_keypoints,
         )  # fmt: skip
 
-    def arrive(self, targets: EnergyTargets, variance: Array, start: Array | None = None) -> tuple[Array, Held]:
+    def arrive(
+        self, targets: EnergyTargets, variance: Array, start: Array | None = None
+    ) -> tuple[Array, Held]:
         """Parameters (B, P) after the network's steps from the closed form, and priors centred
         there.
 
@@ -76,7 +80,9 @@ class NetworkDescent:
         local = np.broadcast_to(frame.local, (count, 24, 3, 3))
         state = BodyState(np.zeros((count, 10)), local, np.broadcast_to(frame.transl, (count, 3)))
         with np.errstate(all="ignore"):  # divergence gives NaN
-            *_, arrived = self._descent.unroll(state, inside, information * well_seen[..., None, None])
+            *_, arrived = self._descent.unroll(
+                state, inside, information * well_seen[..., None, None]
+            )
         # Transform from the person's frame to that of the targets.
         orient = log_so3(rotation @ arrived.local[:, 0])
         angles = log_so3(arrived.local[:, 1:]).reshape(count, -1)[:, self._energy.angles]
@@ -88,13 +94,17 @@ class NetworkDescent:
         free[~(np.abs(arrived.betas).max(axis=1) < _NOBODY)] = np.nan
         return free, Held(arrived.betas, np.ones(count), angles)
 
-    def evaluated(self, free: Array, targets: EnergyTargets, held: Held, asked: Index | None = None) -> Evaluated:
+    def evaluated(
+        self, free: Array, targets: EnergyTargets, held: Held, asked: Index | None = None
+    ) -> Evaluated:
         """The polished bodies of `arrive` (B, P), with the energy and the keypoints `asked`
         (default: all).
         """
         return self.again(free, targets, held, asked)
 
-    def again(self, free: Array, targets: EnergyTargets, held: Held, asked: Index | None = None) -> Evaluated:
+    def again(
+        self, free: Array, targets: EnergyTargets, held: Held, asked: Index | None = None
+    ) -> Evaluated:
         """Gauss-Newton steps from `free` (B, P); a step that does not lower a row's energy is
         rejected.
 
@@ -109,9 +119,16 @@ class NetworkDescent:
             there = energy.retract(body.free, body.step)
             slope = energy.linearise(there, targets, scale, held, slope_only=True)
             body.move(slope.energy < body.energy, there, slope)  # false for NaN
-            stale = np.flatnonzero(np.abs(robust_weight(body.squared, scale) - before).max(axis=1) > STALE)
+            stale = np.flatnonzero(
+                np.abs(robust_weight(body.squared, scale) - before).max(axis=1) > STALE
+            )
             if len(stale) > 0:
-                given = targets.rows(stale), scale, held.rows(stale), None if asked is None else asked[stale]
+                given = (
+                    targets.rows(stale),
+                    scale,
+                    held.rows(stale),
+                    None if asked is None else asked[stale],
+                )
                 body.put(stale, energy.evaluate(body.free[stale], *given))
         return body
 
@@ -125,7 +142,9 @@ class LevenbergMarquardt:
         self._frame = PersonFrame.of_angles(energy.model, prior.mean, prior.covariance)
         self._mean_angles = prior.mean[energy.angles]
 
-    def arrive(self, targets: EnergyTargets, variance: Array, start: Array | None = None) -> tuple[Array, Held]:
+    def arrive(
+        self, targets: EnergyTargets, variance: Array, start: Array | None = None
+    ) -> tuple[Array, Held]:
         """The optimum (B, P), each row with its own shape, under the priors; from `start` where it
         is not NaN.
         """
@@ -140,13 +159,17 @@ class LevenbergMarquardt:
         held = self._energy.held_by_priors(count)
         return self.solve(free, targets, warm, held), held
 
-    def evaluated(self, free: Array, targets: EnergyTargets, held: Held, asked: Index | None = None) -> Evaluated:
+    def evaluated(
+        self, free: Array, targets: EnergyTargets, held: Held, asked: Index | None = None
+    ) -> Evaluated:
         """The bodies of `arrive` (B, P), with the energy and the keypoints `asked`
         (default: all).
         """
         return self._energy.evaluate(free, targets, self._scale, held, asked)
 
-    def again(self, free: Array, targets: EnergyTargets, held: Held, asked: Index | None = None) -> Evaluated:
+    def again(
+        self, free: Array, targets: EnergyTargets, held: Held, asked: Index | None = None
+    ) -> Evaluated:
         """The optimum from `free` (B, P), under other priors."""
         free = self.solve(free, targets, np.ones(len(free), dtype=bool), held)
         return self.evaluated(free, targets, held, asked)
@@ -156,7 +179,9 @@ class LevenbergMarquardt:
         energy, rows = self._energy, np.arange(len(free))
         result, free, damping = free.copy(), free.copy(), np.full(len(free), _DAMPING_START)
         widening = np.where(warm, 0, ANNEAL_STEPS)
-        here = energy.linearise(free, targets, self._scale * 2.0**widening, held, nothing(len(free)))
+        here = energy.linearise(
+            free, targets, self._scale * 2.0**widening, held, nothing(len(free))
+        )
         for _ in range(MAX_ITERATIONS):
             step, promised = np.empty(free.shape), np.empty(len(free))
             solved(here.system.copy(), damping, step, promised)
@@ -176,14 +201,23 @@ class LevenbergMarquardt:
             narrower = np.flatnonzero(going & (widening > 0))
             if len(narrower) > 0:
                 widening[narrower] -= 1
-                some = targets.rows(narrower), self._scale * 2.0 ** widening[narrower], held.rows(narrower)
+                some = (
+                    targets.rows(narrower),
+                    self._scale * 2.0 ** widening[narrower],
+                    held.rows(narrower),
+                )
                 narrowed = energy.linearise(free[narrower], *some, nothing(len(narrower)))
                 for old, new in zip(here, narrowed, strict=True):
                     old[narrower] = new
             if going.all():
                 continue
             result[rows[~going]] = free[~going]
-            rows, free, damping, widening = rows[going], free[going], damping[going], widening[going]
+            rows, free, damping, widening = (
+                rows[going],
+                free[going],
+                damping[going],
+                widening[going],
+            )
             here, targets, held = (
                 type(here)(*(each[going] for each in here)),
                 targets.rows(going),

@@ -42,7 +42,10 @@ class PersonFrame:
         """The frame of a body with sample `poses` (N, 24, 3), axis-angle, root first, weighted by
         `weight` (N,).
         """
-        angles, share = poses[:, 1:].reshape(len(poses), 69).astype(np.float64), weight / weight.sum()
+        angles, share = (
+            poses[:, 1:].reshape(len(poses), 69).astype(np.float64),
+            weight / weight.sum(),
+        )
         mean = share @ angles
         return cls.of_angles(model, mean, (angles - mean).T @ ((angles - mean) * share[:, None]))
 

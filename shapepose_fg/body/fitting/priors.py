@@ -56,7 +56,9 @@ class PosePrior:
             if value.shape != shape:
                 raise ValueError(f"the pose prior's {name} must be {shape}, got {value.shape}")
             if np.isnan(value).any():
-                raise ValueError(f"the pose prior's {name} has values that are not finite: fit it again")
+                raise ValueError(
+                    f"the pose prior's {name} has values that are not finite: fit it again"
+                )
             object.__setattr__(self, name, value)
         if np.abs(self.covariance - self.covariance.T).max() > 1e-9:
             raise ValueError("the pose prior's covariance must be symmetric")
@@ -69,9 +71,15 @@ class PosePrior:
     @cache
     def default() -> "PosePrior":
         """The prior that ships with the package (read once)."""
-        data = read_npz(_DATA / "pose_prior.npz", ("means", "covariances", "lower", "upper", "provenance"), _CURE)
+        data = read_npz(
+            _DATA / "pose_prior.npz",
+            ("means", "covariances", "lower", "upper", "provenance"),
+            _CURE,
+        )
         arrays = (data["means"][0], data["covariances"][0], data["lower"], data["upper"])
-        return PosePrior(*(value.astype(np.float64) for value in arrays), provenance=str(data["provenance"]))
+        return PosePrior(
+            *(value.astype(np.float64) for value in arrays), provenance=str(data["provenance"])
+        )
 
     def widened(self, factor: float) -> "PosePrior":
         """Return this prior with standard deviations `factor` times as large."""
@@ -95,7 +103,9 @@ class PosePrior:
         """Draw `count` poses (count, 23, 3), rad; angles are clipped to the limits."""
         rng.random(count)  # unused draw; keeps the samples of each seed unchanged
         white = rng.normal(size=(count, NUM_ANGLES))
-        factor = np.broadcast_to(np.linalg.cholesky(self.covariance), (count, NUM_ANGLES, NUM_ANGLES))
+        factor = np.broadcast_to(
+            np.linalg.cholesky(self.covariance), (count, NUM_ANGLES, NUM_ANGLES)
+        )
         draw = self.mean + np.einsum("nij,nj->ni", factor, white)
         return np.clip(draw, self.lower, self.upper).reshape(count, 23, 3)
 
@@ -122,16 +132,22 @@ class MotionPrior:
         for name in ("acceleration", "velocity"):
             value = np.asarray(getattr(self, name), dtype=np.float64)
             if value.shape != (NUM_MOVING,):
-                raise ValueError(f"the motion prior's {name} must be ({NUM_MOVING},), got {value.shape}")
+                raise ValueError(
+                    f"the motion prior's {name} must be ({NUM_MOVING},), got {value.shape}"
+                )
             if not (np.isfinite(value) & (value > 0)).all():
-                raise ValueError(f"the motion prior's {name} must be positive numbers: fit it again")
+                raise ValueError(
+                    f"the motion prior's {name} must be positive numbers: fit it again"
+                )
             object.__setattr__(self, name, value)
 
     @staticmethod
     @cache
     def default() -> "MotionPrior":
         """The prior that ships with the package (read once)."""
-        data = read_npz(_DATA / "motion_prior.npz", ("acceleration", "velocity", "provenance"), _CURE)
+        data = read_npz(
+            _DATA / "motion_prior.npz", ("acceleration", "velocity", "provenance"), _CURE
+        )
         return MotionPrior(data["acceleration"], data["velocity"], str(data["provenance"]))
 
     def part(self, angles: Index) -> tuple[Array, Array]:

@@ -76,21 +76,31 @@ class FitterWeights:
         about, tensors = _read_tensors(path)
         if about.get("format") != _FORMAT:
             raise InputError(
-                f"{path}: these are not weights of the learned fitter; train some with shapepose-fg train-fitter"
+                f"{path}: these are not weights of the learned fitter; train some with "
+                "shapepose-fg train-fitter"
             )
         if not all(np.isfinite(tensor).all() for tensor in tensors.values()):
-            raise InputError(f"{path}: the weights have values that are not finite; train or fetch them again")
+            raise InputError(
+                f"{path}: the weights have values that are not finite; train or fetch them again"
+            )
         try:
             spread = tensors.pop(_SPREAD)
             learnt = {name: value for name, value in tensors.items() if not name.startswith(_FRAME)}
             network = UpdateNetwork(NetworkConfig(**json.loads(about["network"])), learnt)
             placed = {k: v.astype(np.float64) for k, v in tensors.items() if k.startswith(_FRAME)}
             frame = PersonFrame(**{k.removeprefix(_FRAME): v for k, v in placed.items()})
-            return cls(network, frame, about["body"], spread.astype(np.float64), json.loads(about["card"]), path)
+            return cls(
+                network,
+                frame,
+                about["body"],
+                spread.astype(np.float64),
+                json.loads(about["card"]),
+                path,
+            )
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
             why = (
-                f"the weights are of another version of the fitter ({str(error).splitlines()[0]}); train"
-                " them again"
+                "the weights are of another version of the fitter "
+                f"({str(error).splitlines()[0]}); train them again"
             )
             raise InputError(f"{path}: {why}") from error
 
@@ -98,7 +108,9 @@ class FitterWeights:
         """Write a safetensors file."""
         tensors = {**self.network.weights, _SPREAD: self.spread}
         tensors |= {_FRAME + name: value for name, value in vars(self.frame).items()}
-        tensors = {name: np.ascontiguousarray(value, dtype=np.float32) for name, value in tensors.items()}
+        tensors = {
+            name: np.ascontiguousarray(value, dtype=np.float32) for name, value in tensors.items()
+        }
         about = {
             "format": _FORMAT,
             "network": json.dumps(asdict(self.network.config)),
@@ -113,8 +125,8 @@ class FitterWeights:
         """
         if fingerprint(model) != self.body:
             raise InputError(
-                "these weights were trained on another body model: train weights for yours with shapepose-fg"
-                " train-fitter --body, or use the plain fitter"
+                "these weights were trained on another body model: train weights for yours with "
+                "shapepose-fg train-fitter --body, or use the plain fitter"
             )
 
 
@@ -126,7 +138,9 @@ def _read_tensors(path: Path) -> tuple[dict[str, str], dict[str, NDArray[np.floa
             for name in names:
                 kind = file.get_slice(name).get_dtype()
                 if kind not in _KINDS:
-                    raise InputError(f"{path}: {name} holds {kind}, not numbers of {' '.join(_KINDS)}; {_CURE}")
+                    raise InputError(
+                        f"{path}: {name} holds {kind}, not numbers of {' '.join(_KINDS)}; {_CURE}"
+                    )
             return file.metadata() or {}, {name: file.get_tensor(name) for name in names}
     except (OSError, SafetensorError) as error:
         raise InputError(f"{path}: cannot be read as safetensors ({error}); {_CURE}") from error

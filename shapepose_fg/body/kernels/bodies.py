@@ -33,7 +33,11 @@ def _rotation(x, y, z, R, T):
     """R = exp of an axis-angle, and its right Jacobian T."""
     s = x * x + y * y + z * z
     if s < 1e-4:
-        a, b, c = 1 - s / 6 * (1 - s / 20), 0.5 - s / 24 * (1 - s / 30), 1 / 6 - s / 120 * (1 - s / 42)
+        a, b, c = (
+            1 - s / 6 * (1 - s / 20),
+            0.5 - s / 24 * (1 - s / 30),
+            1 / 6 - s / 120 * (1 - s / 42),
+        )
     else:
         t = math.sqrt(s)
         a, b = math.sin(t) / t, (1 - math.cos(t)) / s
@@ -76,10 +80,21 @@ def _bent(slope, L, T, q, c):
 def _share(M, sigma_m, S):
     """S = I - (I + sigma² M)^-1 for a symmetric M (3, 3), by minors."""
     v = sigma_m * sigma_m
-    a, b, c, d, e, f = v * M[0, 0] + 1, v * M[0, 1], v * M[0, 2], v * M[1, 1] + 1, v * M[1, 2], v * M[2, 2] + 1
+    a, b, c, d, e, f = (
+        v * M[0, 0] + 1,
+        v * M[0, 1],
+        v * M[0, 2],
+        v * M[1, 1] + 1,
+        v * M[1, 2],
+        v * M[2, 2] + 1,
+    )
     p, q, r = d * f - e * e, c * e - b * f, b * e - c * d
     scale = 1 / (a * p + b * q + c * r)
-    S[0, 0], S[1, 1], S[2, 2] = 1 - scale * p, 1 - scale * (a * f - c * c), 1 - scale * (a * d - b * b)
+    S[0, 0], S[1, 1], S[2, 2] = (
+        1 - scale * p,
+        1 - scale * (a * f - c * c),
+        1 - scale * (a * d - b * b),
+    )
     S[0, 1] = S[1, 0] = -scale * q
     S[0, 2] = S[2, 0] = -scale * r
     S[1, 2] = S[2, 1] = -scale * (b * c - a * e)
@@ -112,7 +127,9 @@ def _laid(limbs, betas, place, w):
             xyz[i] += betas[n] * limbs.root_by_shape[n, i]
     if len(limbs.by_pose) > 0:
         for e in range(207):
-            w.entry[0, e] = w.local[1 + e // 9, e % 9 // 3, e % 3] - (1.0 if e % 9 % 4 == 0 else 0.0)
+            w.entry[0, e] = w.local[1 + e // 9, e % 9 // 3, e % 3] - (
+                1.0 if e % 9 % 4 == 0 else 0.0
+            )
         for i in range(len(d)):
             for e in range(207):
                 d[i] += limbs.by_pose[i, e] * w.entry[0, e]
@@ -399,7 +416,10 @@ def seen(limbs, own, betas, local, place, target, information, kernel_scale, ste
             row[at + n] = betas[b, n] / 3
         for q in range(22):
             for x in range(3):
-                row[at + 10 + 6 * q + x], row[at + 13 + 6 * q + x] = local[b, q, x, 0], local[b, q, x, 1]
+                row[at + 10 + 6 * q + x], row[at + 13 + 6 * q + x] = (
+                    local[b, q, x, 0],
+                    local[b, q, x, 1],
+                )
         for x in range(3):
             row[at + 142 + x] = place[b, x]
         for i in range(79):  # descent direction, without the hands

@@ -160,4 +160,6 @@ class Work(NamedTuple):
         terms = (np.zeros(3 * L), np.zeros(3 * L), np.zeros(3 * L), np.zeros((24, 3)))
         points = (np.zeros((3, 207)), np.zeros(3 * K), np.zeros(3 * K), np.zeros((K, 3, 85)))
         columns = (np.zeros((K, 85), dtype=np.intp), np.zeros(K, dtype=np.intp))
-        return cls(*rotations, *terms, *points, *columns, np.zeros(K), np.zeros(K), np.zeros(unknowns))
+        return cls(
+            *rotations, *terms, *points, *columns, np.zeros(K), np.zeros(K), np.zeros(unknowns)
+        )

@@ -41,7 +41,12 @@ def _reduced(H, n, first, end):
                     g += H[i + 2, p] * w
                     h += H[i + 3, p] * w
                 v, w, scale = 1 / H[j, j], H[j + 1, j], 1 / H[j + 1, j + 1]
-                a, b, c, d = (H[i, j] - a) * v, (H[i + 1, j] - b) * v, (H[i + 2, j] - c) * v, (H[i + 3, j] - d) * v
+                a, b, c, d = (
+                    (H[i, j] - a) * v,
+                    (H[i + 1, j] - b) * v,
+                    (H[i + 2, j] - c) * v,
+                    (H[i + 3, j] - d) * v,
+                )
                 H[i, j], H[i + 1, j], H[i + 2, j], H[i + 3, j] = a, b, c, d
                 H[i, j + 1] = (H[i, j + 1] - e - a * w) * scale
                 H[i + 1, j + 1] = (H[i + 1, j + 1] - f - b * w) * scale

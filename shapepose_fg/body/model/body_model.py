@@ -32,9 +32,11 @@ class BodyParameters:
     betas: Array
     """(B, 10) shape, in standard deviations over adults."""
     global_orient: Array
-    """(B, 3) axis-angle in radians of the pelvis, from the model's frame (y up, facing +z) to the world."""
+    """(B, 3) axis-angle in radians of the pelvis, from the model's frame (y up, facing +z) to the
+    world."""
     body_pose: Array
-    """(B, 23, 3) axis-angle in radians of each further joint, relative to its parent, in SMPL's order."""
+    """(B, 23, 3) axis-angle in radians of each further joint, relative to its parent, in SMPL's
+    order."""
     transl: Array
     """(B, 3) metres, added to every vertex after posing; this is not the position of the pelvis."""
 
@@ -44,7 +46,8 @@ class BodyParameters:
             if value.shape != (len(self.betas), *shape):
                 expected = ", ".join(map(str, ("B", *shape)))
                 raise ValueError(
-                    f"{name} must be ({expected}) with the B of betas {self.betas.shape}, got {value.shape}"
+                    f"{name} must be ({expected}) with the B of betas {self.betas.shape}, got "
+                    f"{value.shape}"
                 )
             object.__setattr__(self, name, value)
 
@@ -148,14 +151,20 @@ class BodyModel:
         This is the only method with a cost that grows with the mesh. Raises ValueError unless
         `only` is one-dimensional.
         """
-        mesh = self._mesh if only is None else self._part_of_mesh(np.ascontiguousarray(only, dtype=np.intp))
+        mesh = (
+            self._mesh
+            if only is None
+            else self._part_of_mesh(np.ascontiguousarray(only, dtype=np.intp))
+        )
         B, local, betas = len(parameters), parameters.local, parameters.betas
         rotations = accumulate(local)[:, mesh.bones]
         shaped = mesh.template + (betas @ mesh.shapes).reshape(B, *mesh.template.shape)
         if mesh.pose_blend is not None:
             bent = (local[:, 1:] - np.eye(3)).reshape(B, -1)
             shaped = shaped + (bent @ mesh.pose_blend).reshape(shaped.shape)
-        rest = mesh.rest_joints + (betas @ mesh.rest_joint_shapes).reshape(B, *mesh.rest_joints.shape)
+        rest = mesh.rest_joints + (betas @ mesh.rest_joint_shapes).reshape(
+            B, *mesh.rest_joints.shape
+        )
         shift = self.joints(parameters)[:, mesh.bones] - (rotations @ rest[..., None])[..., 0]
         posed = mesh.weights @ shift
         for axis in range(3):  # of the vertices at rest
@@ -175,8 +184,9 @@ class BodyModel:
     def keypoints_with_jacobian(self, parameters: BodyParameters) -> tuple[Array, Array]:
         """Keypoints (B, K, 3) and their analytic Jacobian (B, K, 3, 85).
 
-        Columns: betas 10, global_orient 3, body_pose 23 x 3, transl 3. A rotation's columns are its right tangent
-        `R <- R exp(delta)`, the rotation being the joint's own, relative to its parent.
+        Columns: betas 10, global_orient 3, body_pose 23 x 3, transl 3. A rotation's columns are its
+        right tangent `R <- R exp(delta)`, the rotation being the joint's own, relative to its
+        parent.
         """
         points = self.keypoint_points
         return points.positions_with_jacobian(parameters.local, parameters.betas, parameters.transl)
@@ -188,8 +198,14 @@ class BodyModel:
         """
         if not self.keypoint_offsets.xyz_m.any():
             return None
-        xyz, bones = np.zeros((len(self.points.root), 3)), np.zeros(len(self.points.root), dtype=np.intp)
-        xyz[: len(BODY_25)], bones[: len(BODY_25)] = self.keypoint_offsets.xyz_m, self.keypoint_offsets.bones
+        xyz, bones = (
+            np.zeros((len(self.points.root), 3)),
+            np.zeros(len(self.points.root), dtype=np.intp),
+        )
+        xyz[: len(BODY_25)], bones[: len(BODY_25)] = (
+            self.keypoint_offsets.xyz_m,
+            self.keypoint_offsets.bones,
+        )
         chosen = list(slots(self.keypoint_names))
         return xyz[chosen], bones[chosen]
 
@@ -219,7 +235,10 @@ class BodyModel:
         """The large arrays, computed at the first use of vertices."""
         arrays = self.arrays
         shapes = arrays.shapes.transpose(2, 0, 1)  # (10, Nv, 3)
-        rest, rest_shapes = arrays.joint_regressor @ arrays.template, arrays.joint_regressor @ shapes
+        rest, rest_shapes = (
+            arrays.joint_regressor @ arrays.template,
+            arrays.joint_regressor @ shapes,
+        )
         blend = arrays.pose_blend
         return _Mesh(
             template=arrays.template,
@@ -263,7 +282,9 @@ class _Mesh:
             shapes=self.shapes[:, columns],
             pose_blend=None if self.pose_blend is None else self.pose_blend[:, columns],
             rest_joints=self.rest_joints[bones],
-            rest_joint_shapes=self.rest_joint_shapes[:, (3 * bones[:, None] + np.arange(3)).ravel()],
+            rest_joint_shapes=self.rest_joint_shapes[
+                :, (3 * bones[:, None] + np.arange(3)).ravel()
+            ],
             weights=self.weights[vertices][:, bones],
             bones=bones,
         )
@@ -282,10 +303,14 @@ def accumulate(local: Array) -> Array:
 def _contract(arrays: SmplArrays) -> SkinnedPoints:
     """All `BODY_POINTS` of a body, without detector offsets, contracted from the mesh, float64."""
     components = np.concatenate((arrays.template[..., None], arrays.shapes), -1)
-    joints = np.einsum("jv,vxn->jxn", arrays.joint_regressor, components, optimize=True)  # at rest, (24, 3, 11)
+    joints = np.einsum(
+        "jv,vxn->jxn", arrays.joint_regressor, components, optimize=True
+    )  # at rest, (24, 3, 11)
     top = np.zeros((1, len(arrays.template)))  # of the head: the highest vertex of the T-pose
     top[0, np.argmax(arrays.template[:, 1])] = 1
-    keypoints, head = (_regressed(arrays, each, joints) for each in (arrays.keypoint_regressor, top))
+    keypoints, head = (
+        _regressed(arrays, each, joints) for each in (arrays.keypoint_regressor, top)
+    )
     # Joint j moves with bone j, at the joint's own rest position.
     eye = np.eye(len(SMPL_PARENTS))
     moments = eye[:, :, None, None] * joints[:, None]
@@ -299,7 +324,9 @@ def _regressed(arrays: SmplArrays, regressor: Array, joints: Array) -> SkinnedPo
     regressor, weights = regressor[:, touched], arrays.weights[touched]
     components = [arrays.template[touched, :, None], arrays.shapes[touched]]
     components += [] if arrays.pose_blend is None else [arrays.pose_blend[touched]]
-    moments = np.einsum("kv,vj,vxn->kjxn", regressor, weights, np.concatenate(components, -1), optimize=True)
+    moments = np.einsum(
+        "kv,vj,vxn->kjxn", regressor, weights, np.concatenate(components, -1), optimize=True
+    )
     shares, total = regressor @ weights, regressor.sum(1)
     return contract(moments, shares, joints, SMPL_PARENTS, total, arrays.pose_blend is not None)
 

@@ -63,7 +63,12 @@ class KeypointOffsets:
     """(25,) index in `SMPL_24` of the bone with which each joint moves."""
 
     def __post_init__(self) -> None:
-        for name, kind in {"xyz_m": float, "sigma_m": float, "count": np.intp, "bones": np.intp}.items():
+        for name, kind in {
+            "xyz_m": float,
+            "sigma_m": float,
+            "count": np.intp,
+            "bones": np.intp,
+        }.items():
             value, shape = np.asarray(getattr(self, name)), (25, 3) if name == "xyz_m" else (25,)
             if value.shape != shape:
                 raise ValueError(f"{name} must be {shape}, got {value.shape}")
@@ -72,7 +77,8 @@ class KeypointOffsets:
             object.__setattr__(self, name, value.astype(kind))
         if np.linalg.norm(self.xyz_m, axis=1).max() > LARGEST_M:
             raise ValueError(
-                f"xyz_m must be metres, none longer than {LARGEST_M}; learn them from other detections"
+                f"xyz_m must be metres, none longer than {LARGEST_M}; learn them from other "
+                "detections"
             )
         if (self.sigma_m < 0).any() or (self.count < 0).any():
             raise ValueError("sigma_m and count must not be negative")
@@ -97,10 +103,13 @@ class KeypointOffsets:
         for joint, offset in zip(given, metres.values(), strict=True):
             mirror = BODY_25.mirror[joint]
             if mirror != joint and mirror in given:
-                raise ValueError(f"give {BODY_25.joints[joint]} or {BODY_25.joints[mirror]}, not both")
+                raise ValueError(
+                    f"give {BODY_25.joints[joint]} or {BODY_25.joints[mirror]}, not both"
+                )
             if mirror == joint and offset[0] != 0:
                 raise ValueError(
-                    f"{BODY_25.joints[joint]} is on the plane of symmetry: its x must be 0, got {offset[0]}"
+                    f"{BODY_25.joints[joint]} is on the plane of symmetry: its x must be 0, got "
+                    f"{offset[0]}"
                 )
             xyz[mirror] = np.array(offset) * (-1.0, 1.0, 1.0)
             xyz[joint] = offset
@@ -140,13 +149,16 @@ class KeypointOffsets:
         """The offsets in the `content` of a file at `path`; raises InputError if there are none."""
         if not isinstance(content, dict) or content.get("format") != _FORMAT:
             raise InputError(
-                f"{path}: holds no keypoint offsets; give a run.json that does, or what KeypointOffsets.save wrote"
+                f"{path}: holds no keypoint offsets; give a run.json that does, or what "
+                "KeypointOffsets.save wrote"
             )
         try:
             return cls.from_dict(content)
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             reason = f"{error} is missing" if isinstance(error, KeyError) else str(error)
-            raise InputError(f"{path}: {reason}; restore the file, or learn the offsets again") from None
+            raise InputError(
+                f"{path}: {reason}; restore the file, or learn the offsets again"
+            ) from None
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> "KeypointOffsets":

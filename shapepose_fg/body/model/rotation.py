@@ -24,7 +24,9 @@ def hat(v: Array) -> Array:
 
 
 def exp_so3(axis_angle: Array) -> Array:
-    """Rotation matrices of axis-angle vectors in radians, any norm; (..., 3) -> (..., 3, 3) (Rodrigues)."""
+    """Rotation matrices of axis-angle vectors in radians, any norm; (..., 3) -> (..., 3, 3)
+    (Rodrigues).
+    """
     R = np.empty((*axis_angle.shape, 3))
     _exp(np.require(axis_angle, float, ["C", "W"]).reshape(-1, 3), R.reshape(-1, 3, 3))
     return R
@@ -55,12 +57,16 @@ def _exp(vectors, R):
         x, y, z = vectors[n]
         s = x * x + y * y + z * z
         if s < _SERIES_BELOW:  # closed forms lose digits to cancellation
-            first, second = 1 - s / 6 * (1 - s / 20 * (1 - s / 42)), 0.5 - s / 24 * (1 - s / 30 * (1 - s / 56))
+            first, second = (
+                1 - s / 6 * (1 - s / 20 * (1 - s / 42)),
+                0.5 - s / 24 * (1 - s / 30 * (1 - s / 56)),
+            )
         else:
             t = math.sqrt(s)
             first, second = math.sin(t) / t, (1 - math.cos(t)) / s
         R[n, 0, 0], R[n, 1, 1], R[n, 2, 2] = (
-            1 - second * (y * y + z * z), 1 - second * (x * x + z * z), 1 - second * (x * x + y * y),
+            1 - second * (y * y + z * z), 1 - second * (x * x + z * z),
+            1 - second * (x * x + y * y),
         )  # fmt: skip
         R[n, 0, 1], R[n, 1, 0] = second * x * y - first * z, second * x * y + first * z
         R[n, 0, 2], R[n, 2, 0] = second * x * z + first * y, second * x * z - first * y
@@ -86,7 +92,11 @@ def _log(R, vectors):
         sine = math.sqrt(x * x + y * y + z * z)
         sign = -1.0 if w < 0 else 1.0
         scale = 2 * math.atan2(sine, sign * w) / sine if sine > 0 else 0.0
-        vectors[n, 0], vectors[n, 1], vectors[n, 2] = sign * scale * x, sign * scale * y, sign * scale * z
+        vectors[n, 0], vectors[n, 1], vectors[n, 2] = (
+            sign * scale * x,
+            sign * scale * y,
+            sign * scale * z,
+        )
 
 
 def right_jacobian_inverse(axis_angle: Array) -> Array:

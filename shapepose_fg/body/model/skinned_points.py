@@ -69,7 +69,10 @@ class SkinnedPoints:
         pose = None
         if any(points.offsets_pose is not None for points in both):
             empty = [np.zeros((207, *points.offsets.shape)) for points in both]
-            parts = [e if p.offsets_pose is None else p.offsets_pose for p, e in zip(both, empty, strict=True)]
+            parts = [
+                e if p.offsets_pose is None else p.offsets_pose
+                for p, e in zip(both, empty, strict=True)
+            ]
             pose = np.concatenate(parts, 1)
         return replace(
             self,
@@ -98,12 +101,17 @@ class SkinnedPoints:
         term[point, bone] = np.arange(len(bone))
         parents = np.array(SMPL_PARENTS, dtype=np.intp)
         shape = self.offsets_shape[:, point, :, bone].transpose(0, 2, 1)
-        pose = np.zeros((0, 207, 3)) if self.offsets_pose is None else self.offsets_pose[:, point, :, bone]
+        pose = (
+            np.zeros((0, 207, 3))
+            if self.offsets_pose is None
+            else self.offsets_pose[:, point, :, bone]
+        )
         parts = (
-            np.append(0, np.cumsum(rides.sum(1))), bone, np.where(bone > 0, term[point, parents[bone]], -1),
+            np.append(0, np.cumsum(rides.sum(1))), bone,
+            np.where(bone > 0, term[point, parents[bone]], -1),
             self.offsets[point, :, bone].ravel(), shape.reshape(-1, 10).T, shape,
-            pose.transpose(0, 2, 1).reshape(-1, 207), self.root.ravel(), self.root_shape.reshape(10, -1),
-            self.translation, parents, column,
+            pose.transpose(0, 2, 1).reshape(-1, 207), self.root.ravel(),
+            self.root_shape.reshape(10, -1), self.translation, parents, column,
         )  # fmt: skip
         return Limbs(*map(_contiguous, parts))
 
@@ -112,21 +120,28 @@ class SkinnedPoints:
         return self.limbs()
 
     def positions(self, local: Array, betas: Array, transl: Array) -> Array:
-        """(B, K, 3) world positions from rotations relative to the parents (B, 24, 3, 3), betas (B, 10) and transl
-        (B, 3).
+        """(B, K, 3) world positions from rotations relative to the parents (B, 24, 3, 3), betas (B,
+        10) and transl (B, 3).
         """
         return self._placed(local, betas, transl, jacobian=False)[0]
 
-    def positions_with_jacobian(self, local: Array, betas: Array, transl: Array) -> tuple[Array, Array]:
+    def positions_with_jacobian(
+        self, local: Array, betas: Array, transl: Array
+    ) -> tuple[Array, Array]:
         """Positions (B, K, 3) and their Jacobian (B, K, 3, 85).
 
-        Columns: betas 10, then 24 right tangents `R <- R exp(delta)` of the local rotations, then transl 3.
+        Columns: betas 10, then 24 right tangents `R <- R exp(delta)` of the local rotations, then
+        transl 3.
         """
         return self._placed(local, betas, transl, jacobian=True)
 
-    def _placed(self, local: Array, betas: Array, transl: Array, *, jacobian: bool) -> tuple[Array, Array]:
+    def _placed(
+        self, local: Array, betas: Array, transl: Array, *, jacobian: bool
+    ) -> tuple[Array, Array]:
         B, K = len(betas), len(self.root)
-        local, betas, transl = (np.require(part, float, ["C", "W"]) for part in (local, betas, transl))
+        local, betas, transl = (
+            np.require(part, float, ["C", "W"]) for part in (local, betas, transl)
+        )
         xyz, slopes = np.zeros((B, K, 3)), np.zeros((B if jacobian else 0, K, 3, NUM_COLUMNS))
         placed(self._limbs, local, betas, transl, xyz, slopes, Work.of(self._limbs, NUM_COLUMNS))
         return xyz, slopes
@@ -149,7 +164,8 @@ def contract(
 
     Parameters
     ----------
-    moments: (K, 24, 3, 1 + 10 + 207) sum over vertices of regressor x weight x vertex, for the template,
+    moments: (K, 24, 3, 1 + 10 + 207) sum over vertices of regressor x weight x vertex, for the
+    template,
         each shape component and each pose blend shape.
     shares: (K, 24) sum over vertices of regressor x weight.
     joints: (24, 3, 11) rest positions of the joints: mean shape, then per unit of each beta.

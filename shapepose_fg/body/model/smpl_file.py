@@ -21,8 +21,8 @@ SMPL_PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17
 _NUM_KEYPOINTS = len(BODY_25)
 _SMPL_NUM_VERTICES = 6890
 _SMPL_VERTEX_KEYPOINTS = {
-    "Nose": 332, "REye": 6260, "LEye": 2800, "REar": 4071, "LEar": 583, "LBigToe": 3216, "LSmallToe": 3226,
-    "LHeel": 3387, "RBigToe": 6617, "RSmallToe": 6624, "RHeel": 6787,
+    "Nose": 332, "REye": 6260, "LEye": 2800, "REar": 4071, "LEar": 583, "LBigToe": 3216,
+    "LSmallToe": 3226, "LHeel": 3387, "RBigToe": 6617, "RSmallToe": 6624, "RHeel": 6787,
 }  # fmt: skip
 """Vertices of SMPL's own mesh for keypoints."""
 _SMPL_JOINT_KEYPOINTS = {
@@ -81,8 +81,9 @@ def read_smpl_file(path: Path, keypoint_regressor: Real | None = None) -> SmplAr
         keypoints = _smpl_keypoint_regressor(joint_regressor)
     else:
         raise InputError(
-            f"{path}: no keypoint_regressor, and with {count} vertices this is not SMPL's own mesh: add the key, "
-            f"or pass keypoint_regressor= ({_NUM_KEYPOINTS}, {count}), the weights that make BODY_25 from vertices"
+            f"{path}: no keypoint_regressor, and with {count} vertices this is not SMPL's own "
+            f"mesh: add the key, or pass keypoint_regressor= ({_NUM_KEYPOINTS}, {count}), the "
+            "weights that make BODY_25 from vertices"
         )
     problem = _implausible(template, joint_regressor, keypoints)
     if problem is not None:
@@ -110,12 +111,13 @@ def _read_entries(path: Path) -> dict[str, Any]:
         raise
     except RefusedPickle as error:
         raise InputError(
-            f"{path}: cannot be read safely ({error}); use the unchanged file from the model's site, or save"
-            " its arrays as .npz"
+            f"{path}: cannot be read safely ({error}); use the unchanged file from the model's "
+            "site, or save its arrays as .npz"
         ) from error
     except Exception as error:  # a damaged pickle can raise any error
         raise InputError(
-            f"{path}: cannot be read as a body model ({type(error).__name__}: {error}); download the file again"
+            f"{path}: cannot be read as a body model ({type(error).__name__}: {error}); download "
+            "the file again"
         ) from error
 
 
@@ -133,7 +135,9 @@ class _Entries:
         try:
             return value if isinstance(value, np.ndarray) else as_array(value)
         except Exception as error:  # records of a damaged pickle can contain anything
-            raise InputError(f"{self.path}: {name} is not an array ({error}); download the file again") from error
+            raise InputError(
+                f"{self.path}: {name} is not an array ({error}); download the file again"
+            ) from error
 
     def floats(self, name: str, shape: tuple[int | None, ...], value: Any = None) -> Array:
         """The array `name`, or `value` in its place, validated as finite and of this shape; None is
@@ -146,11 +150,13 @@ class _Entries:
         if not fits or value.dtype.kind not in "fiub":
             expected = ", ".join("Nv" if n is None else str(n) for n in shape)
             raise InputError(
-                f"{self.path}: {name} must be numbers ({expected}), got {value.dtype} {value.shape}: "
-                "use an unchanged file of one model"
+                f"{self.path}: {name} must be numbers ({expected}), got {value.dtype} "
+                f"{value.shape}: use an unchanged file of one model"
             )
         if not np.all(np.isfinite(value)):
-            raise InputError(f"{self.path}: {name} has values that are not finite; download the file again")
+            raise InputError(
+                f"{self.path}: {name} has values that are not finite; download the file again"
+            )
         return np.ascontiguousarray(value, dtype=np.float64)
 
     def shapes(self, count: int) -> Array:
@@ -158,8 +164,8 @@ class _Entries:
         shapes = self.array("shapedirs")
         if shapes.ndim != 3 or shapes.shape[2] < NUM_BETAS:
             raise InputError(
-                f"{self.path}: shapedirs must be ({count}, 3, {NUM_BETAS} or more), got {shapes.shape}: "
-                f"use the file with {NUM_BETAS} shape components"
+                f"{self.path}: shapedirs must be ({count}, 3, {NUM_BETAS} or more), got "
+                f"{shapes.shape}: use the file with {NUM_BETAS} shape components"
             )
         return self.floats("shapedirs", (count, 3, NUM_BETAS), shapes[..., :NUM_BETAS])
 
@@ -174,17 +180,23 @@ class _Entries:
         weights = self.floats("weights", (count, 24))
         total = weights.sum(1, keepdims=True)
         if np.any(weights < -1e-6) or np.any(np.abs(total - 1) > 1e-2):  # files round
-            raise InputError(f"{self.path}: weights must be >= 0 with rows that sum to 1: not this model's file")
+            raise InputError(
+                f"{self.path}: weights must be >= 0 with rows that sum to 1: not this model's file"
+            )
         return weights / total
 
     def faces(self, count: int) -> NDArray[np.int64]:
         """Triangles, validated to use existing vertices."""
         faces = self.array("f")
         if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
-            raise InputError(f"{self.path}: f must be whole numbers (F, 3), got {faces.dtype} {faces.shape}")
+            raise InputError(
+                f"{self.path}: f must be whole numbers (F, 3), got {faces.dtype} {faces.shape}"
+            )
         faces = faces.astype(np.int64)
         if np.any(faces < 0) or np.any(faces >= count):
-            raise InputError(f"{self.path}: f names vertices outside 0..{count - 1}; download the file again")
+            raise InputError(
+                f"{self.path}: f names vertices outside 0..{count - 1}; download the file again"
+            )
         return faces
 
     def check_tree(self) -> None:
@@ -195,11 +207,13 @@ class _Entries:
         fits = table.shape == (2, 24) and table.dtype.kind in "iuf"
         if fits:
             parents = np.asarray(table[0], dtype=np.int64)
-            fits = np.array_equal(parents[1:], SMPL_PARENTS[1:]) and np.array_equal(table[1], np.arange(24))
+            fits = np.array_equal(parents[1:], SMPL_PARENTS[1:]) and np.array_equal(
+                table[1], np.arange(24)
+            )
         if not fits:
             raise InputError(
-                f"{self.path}: kintree_table is not the tree of SMPL's 24 joints (shape {table.shape}): use a"
-                " SMPL body; SMPL-H, SMPL-X and others are not supported"
+                f"{self.path}: kintree_table is not the tree of SMPL's 24 joints (shape "
+                f"{table.shape}): use a SMPL body; SMPL-H, SMPL-X and others are not supported"
             )
 
 
@@ -217,7 +231,9 @@ def _smpl_keypoint_regressor(joint_regressor: Array) -> Array:
     for name, joint in _SMPL_JOINT_KEYPOINTS.items():
         regressor[BODY_25.index(name)] = joint_regressor[joint]
     for middle, sides in {"Neck": ("RShoulder", "LShoulder"), "MidHip": ("RHip", "LHip")}.items():
-        regressor[BODY_25.index(middle)] = regressor[[BODY_25.index(side) for side in sides]].mean(0)
+        regressor[BODY_25.index(middle)] = regressor[[BODY_25.index(side) for side in sides]].mean(
+            0
+        )
     return regressor
 
 
@@ -230,25 +246,39 @@ def _implausible(template: Array, joint_regressor: Array, keypoint_regressor: Ar
     height = float(np.ptp(template[:, 1]))
     if not _HEIGHT_M[0] <= height <= _HEIGHT_M[1]:
         return f"v_template is {height:.4g} high along y: give it in metres, y up"
-    for name, regressor in (("J_regressor", joint_regressor), ("keypoint_regressor", keypoint_regressor)):
+    for name, regressor in (
+        ("J_regressor", joint_regressor),
+        ("keypoint_regressor", keypoint_regressor),
+    ):
         off = np.abs(regressor.sum(axis=1) - 1).max()
         if off > _SUM_TOLERANCE:
-            return f"{name} has rows that do not sum to 1 (off by {off:.2g}): use an unchanged file of one model"
+            return (
+                f"{name} has rows that do not sum to 1 (off by {off:.2g}): use an unchanged file "
+                "of one model"
+            )
     joints: dict[str, Array] = dict(zip(SMPL_24, joint_regressor @ template, strict=True))
-    keypoints: dict[str, Array] = dict(zip(BODY_25.joints, keypoint_regressor @ template, strict=True))
+    keypoints: dict[str, Array] = dict(
+        zip(BODY_25.joints, keypoint_regressor @ template, strict=True)
+    )
     for part in (*_RISING, "elbow", "wrist"):
         if not joints[f"left_{part}"][0] > joints[f"right_{part}"][0]:
-            return f"J_regressor puts left_{part} to the right of right_{part}: the body's left is +x"
+            return (
+                f"J_regressor puts left_{part} to the right of right_{part}: the body's left is +x"
+            )
     for side in ("left", "right"):
         for low, high in pairwise(_RISING):
             if not joints[f"{side}_{low}"][1] < joints[f"{side}_{high}"][1]:
                 return (
-                    f"J_regressor puts {side}_{low} above {side}_{high}: rows are SMPL's joints in order, y is up"
+                    f"J_regressor puts {side}_{low} above {side}_{high}: rows are SMPL's joints "
+                    "in order, y is up"
                 )
     for name, joint in _BELONGS.items():
         distance = float(np.linalg.norm(keypoints[name] - joints[joint]))
         side, part = joint.split("_")
         mirrored = joints[f"{'right' if side == 'left' else 'left'}_{part}"]
         if distance > _FARTHEST * height or distance > np.linalg.norm(keypoints[name] - mirrored):
-            return f"keypoint_regressor puts {name} {distance:.2g} m from {joint}: rows are BODY_25 in order"
+            return (
+                f"keypoint_regressor puts {name} {distance:.2g} m from {joint}: rows are BODY_25 "
+                "in order"
+            )
     return None

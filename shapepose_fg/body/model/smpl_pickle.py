@@ -63,7 +63,11 @@ _COLUMNS = {Name(f"scipy.sparse{part}", "csc_matrix") for part in ("", ".csc", "
 _ROWS = {Name(f"scipy.sparse{part}", "csr_matrix") for part in ("", ".csr", "._csr")}
 _REBUILDS = {Name("copy_reg", "_reconstructor"), Name("copyreg", "_reconstructor")}
 """Functions that create an object of the class given as their first argument."""
-_OTHERS = {Name("numpy", "ndarray"), Name("__builtin__", "object"), Name("builtins", "object")} | _REBUILDS
+_OTHERS = {
+    Name("numpy", "ndarray"),
+    Name("__builtin__", "object"),
+    Name("builtins", "object"),
+} | _REBUILDS
 _KNOWN = _RECONSTRUCT | _SCALAR | _FROM_BUFFER | _DTYPE | _BYTES | _COLUMNS | _ROWS | _OTHERS
 
 
@@ -72,11 +76,11 @@ def _is_chumpy(name: Name) -> bool:
 
 
 _INSTRUCTIONS = (
-    "PROTO FRAME STOP MARK POP NONE NEWTRUE NEWFALSE INT BININT BININT1 BININT2 LONG LONG1 LONG4 FLOAT BINFLOAT"
-    " STRING BINSTRING SHORT_BINSTRING UNICODE BINUNICODE SHORT_BINUNICODE BINUNICODE8 BINBYTES SHORT_BINBYTES"
-    " BINBYTES8 BYTEARRAY8 EMPTY_LIST EMPTY_DICT EMPTY_TUPLE LIST TUPLE TUPLE1 TUPLE2 TUPLE3 DICT APPEND APPENDS"
-    " SETITEM SETITEMS PUT BINPUT LONG_BINPUT MEMOIZE GET BINGET LONG_BINGET GLOBAL STACK_GLOBAL REDUCE NEWOBJ"
-    " BUILD"
+    "PROTO FRAME STOP MARK POP NONE NEWTRUE NEWFALSE INT BININT BININT1 BININT2 LONG LONG1 LONG4 "
+    "FLOAT BINFLOAT STRING BINSTRING SHORT_BINSTRING UNICODE BINUNICODE SHORT_BINUNICODE "
+    "BINUNICODE8 BINBYTES SHORT_BINBYTES BINBYTES8 BYTEARRAY8 EMPTY_LIST EMPTY_DICT EMPTY_TUPLE "
+    "LIST TUPLE TUPLE1 TUPLE2 TUPLE3 DICT APPEND APPENDS SETITEM SETITEMS PUT BINPUT LONG_BINPUT "
+    "MEMOIZE GET BINGET LONG_BINGET GLOBAL STACK_GLOBAL REDUCE NEWOBJ BUILD"
 ).split()
 
 
@@ -84,7 +88,9 @@ def _counted(step: Callable[[Any], None]) -> Callable[[Any], None]:
     def run(reader: Any) -> None:
         reader.steps += 1
         if reader.steps > _MOST_STEPS:
-            raise RefusedPickle(f"it has over {_MOST_STEPS} instructions, but a body model has a few thousand")
+            raise RefusedPickle(
+                f"it has over {_MOST_STEPS} instructions, but a body model has a few thousand"
+            )
         step(reader)
 
     return run
@@ -134,7 +140,9 @@ class _Reader(pickle._Unpickler):  # type: ignore[name-defined]
 
     def fill(self, values: list[Any]) -> None:
         """Add entries to a dict; keys other than text could have very slow comparisons."""
-        if not isinstance(self.stack[-1], dict) or not all(isinstance(key, str | int) for key in values[::2]):
+        if not isinstance(self.stack[-1], dict) or not all(
+            isinstance(key, str | int) for key in values[::2]
+        ):
             raise RefusedPickle("it has keys that are not text")
         self.stack[-1].update(zip(values[::2], values[1::2], strict=True))
 
@@ -211,7 +219,9 @@ def _number_type(record: Any) -> np.dtype[Any]:
     name = record.arguments[0]
     if not isinstance(name, str) or name[:1] not in ("f", "i", "u", "b") or not name[1:].isdigit():
         raise TypeError(f"arrays of {str(name)[:20]!r} are not numbers")
-    byte_order = record.state[1] if isinstance(record.state, tuple) and len(record.state) > 1 else "="
+    byte_order = (
+        record.state[1] if isinstance(record.state, tuple) and len(record.state) > 1 else "="
+    )
     return np.dtype(name).newbyteorder(byte_order if byte_order in ("<", ">") else "=")
 
 

@@ -9,8 +9,12 @@ from shapepose_fg.body.model.rotation import exp_so3, log_so3
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.skeleton import SMPL_24
 
-_BONES = tuple([SMPL_24.index(f"{side}_{name}") for name in ("ankle", "foot")] for side in ("right", "left"))
-_ANKLES, _KNEES = ([SMPL_24.index(f"{side}_{name}") for side in ("right", "left")] for name in ("ankle", "knee"))
+_BONES = tuple(
+    [SMPL_24.index(f"{side}_{name}") for name in ("ankle", "foot")] for side in ("right", "left")
+)
+_ANKLES, _KNEES = (
+    [SMPL_24.index(f"{side}_{name}") for side in ("right", "left")] for name in ("ankle", "knee")
+)
 SINK_M = 0.01
 """Depth below the floor that is tolerated, m: flesh and soles are soft."""
 _BEND_RAD = 0.6
@@ -22,7 +26,8 @@ _ROWS = 8
 """Number of bodies per batch of vertices."""
 
 Bodies = tuple[Array, Array, Array, Array]
-"""`betas` (B, 10), `global_orient` (B, 3), `body_pose` (B, 23, 3) and `transl` (B, 3) as in `BodyParameters`."""
+"""`betas` (B, 10), `global_orient` (B, 3), `body_pose` (B, 23, 3) and `transl` (B, 3) as in
+`BodyParameters`."""
 
 
 def feet_vertices(model: BodyModel) -> list[Index]:
@@ -53,7 +58,9 @@ def above_floor(model: BodyModel, bodies: Bodies, normal: Array, height_m: float
     turned = exp_so3(_bends(model, bodies, normal, height_m))
     pose, ankles = pose.copy(), np.array(_ANKLES) - 1
     pose[:, ankles] = log_so3(turned @ exp_so3(pose[:, ankles]))
-    sunk = np.maximum(height_m - SINK_M - _lowest(model, (betas, orient, pose, transl), normal), 0.0)
+    sunk = np.maximum(
+        height_m - SINK_M - _lowest(model, (betas, orient, pose, transl), normal), 0.0
+    )
     return betas, orient, pose, transl + sunk[:, None] * normal
 
 
@@ -70,12 +77,16 @@ def _bends(model: BodyModel, bodies: Bodies, normal: Array, height_m: float) -> 
     flat = arm - (arm @ normal)[..., None] * normal
     length = np.maximum(np.linalg.norm(flat, axis=-1), 0.05)
     axis = np.cross(flat / length[..., None], normal)
-    return np.einsum("bfji,bfj->bfi", shanks, axis * np.minimum(sunk / length, _BEND_RAD)[..., None])
+    return np.einsum(
+        "bfji,bfj->bfi", shanks, axis * np.minimum(sunk / length, _BEND_RAD)[..., None]
+    )
 
 
 def _lowest(model: BodyModel, bodies: Bodies, normal: Array) -> Array:
     """(B,) smallest height of each body along a `normal` (3,), metres, accurate to 1 cm."""
-    chosen = np.union1d(np.concatenate(feet_vertices(model)), np.arange(0, model.num_vertices, _BEYOND))
+    chosen = np.union1d(
+        np.concatenate(feet_vertices(model)), np.arange(0, model.num_vertices, _BEYOND)
+    )
     return np.asarray((_vertices(model, bodies, chosen) @ normal).min(axis=1))
 
 

@@ -5,7 +5,8 @@ A body is fitted to each row (a person in a frame). The part of the residuals th
 the rows, in the frame of the bone, is the offset. Around the fits the energy is quadratic; summed
 over the rows it is
 
-    E(o, c) = sum_i min_dtheta |r - J dtheta - R o|²_W + |theta + dtheta - mean - c|²_P  +  |o|²_Q + |c|²_P
+    E(o, c) = sum_i min_dtheta |r - J dtheta - R o|²_W + |theta + dtheta - mean - c|²_P
+              + |o|²_Q + |c|²_P
 
 with r the residuals, R the bones' rotations, W the information of the joints, P the precision of
 the prior of shape and pose. `c` is the recording's own mean shape and pose: without it, a room full
@@ -90,7 +91,9 @@ def learn_offsets(
             break
         energy = BodyEnergy(model, wide)
         evidence = weigh(targets, config.model_sigma_m)
-        model = model.with_keypoint_offsets(_solved(energy, fit, evidence, config.kernel_scale, precision))
+        model = model.with_keypoint_offsets(
+            _solved(energy, fit, evidence, config.kernel_scale, precision)
+        )
     return model.keypoint_offsets
 
 
@@ -101,13 +104,23 @@ def _solved(
     fitted.
     """
     rows, size = np.flatnonzero(fit.ok), 75 + energy.num_free
-    hessian, gradient, prior = np.zeros((size, size)), np.zeros(size), np.zeros((size - 75, size - 75))
+    hessian, gradient, prior = (
+        np.zeros((size, size)),
+        np.zeros(size),
+        np.zeros((size - 75, size - 75)),
+    )
     for start in range(0, len(rows), _CHUNK):
         part = rows[start : start + _CHUNK]
         centred = evidence.xyz[part] - evidence.centre[part, None]
         seen = EnergyTargets(centred, evidence.information[part])
-        here = _eliminate(energy, energy.parameters(fit.rows(part), evidence.centre[part]), seen, kernel_scale)
-        hessian, gradient, prior = hessian + here[0], gradient + here[1], prior + here[2] / len(rows)
+        here = _eliminate(
+            energy, energy.parameters(fit.rows(part), evidence.centre[part]), seen, kernel_scale
+        )
+        hessian, gradient, prior = (
+            hessian + here[0],
+            gradient + here[1],
+            prior + here[2] / len(rows),
+        )
     count = (np.abs(evidence.information[rows]).max(axis=(-1, -2)) > 0).sum(axis=0)
     current = energy.model.keypoint_offsets.xyz_m.ravel()
     hessian, gradient = hessian / _ROWS_PER_DRAW, gradient / _ROWS_PER_DRAW
@@ -147,7 +160,9 @@ def _eliminate(
     prior_hessian = here - jacobian.swapaxes(1, 2) @ weighed.reshape(R, 3 * K, P)
     prior_gradient = linear.gradient + (jacobian.swapaxes(1, 2) @ force.reshape(R, -1, 1))[..., 0]
     crossed = (by_offset.swapaxes(-1, -2) @ weighed).reshape(R, 3 * K, P)
-    both = np.concatenate([crossed, -prior_hessian], axis=1)  # (R, 75 + P, P): second derivatives with the body
+    both = np.concatenate(
+        [crossed, -prior_hessian], axis=1
+    )  # (R, 75 + P, P): second derivatives with the body
     by_own = -(by_offset.swapaxes(-1, -2) @ force).reshape(R, -1)
     gradient = np.concatenate([by_own, -prior_gradient], axis=1)
     system = np.concatenate([here, both, linear.gradient[:, None]], axis=1)

@@ -29,9 +29,12 @@ BATCH = "batch.json"
 def batch(
     running: RunOptions,
     table: Path = argument("RECORDINGS.TOML", "Table of the recordings (docs/batch.md)."),
-    output: Path = option(RESULT, "Folder for batch.json and a folder of results per recording.", REQUIRED),
+    output: Path = option(
+        RESULT, "Folder for batch.json and a folder of results per recording.", REQUIRED
+    ),
     at_once: int | None = option(
-        RUN, "Number of recordings processed at once; by default as many as keep all processes busy."
+        RUN,
+        "Number of recordings processed at once; by default as many as keep all processes busy.",
     ),
 ) -> None:
     """Reconstruct all recordings of a table; each result has the same bytes as that of
@@ -44,13 +47,17 @@ def batch(
 
     running.check()
     if at_once is not None and not 1 <= at_once <= 64:
-        raise InputError(f"--at-once {at_once}: must be 1 to 64; leave it out to keep all processes busy")
+        raise InputError(
+            f"--at-once {at_once}: must be 1 to 64; leave it out to keep all processes busy"
+        )
     entries = read_table(table)
     with only_run_in(output, [BATCH]):
         _run(table, entries, output, running, at_once)
 
 
-def _run(table: Path, entries: "list[Entry]", output: Path, running: RunOptions, at_once: int | None) -> None:
+def _run(
+    table: Path, entries: "list[Entry]", output: Path, running: RunOptions, at_once: int | None
+) -> None:
     """Run the batch in a folder that is locked for other processes."""
     from shapepose_fg.cli.batch.runner import BatchRunner, look_at_all
     from shapepose_fg.cli.batch.status import Bars, BatchStatus
@@ -66,14 +73,20 @@ def _run(table: Path, entries: "list[Entry]", output: Path, running: RunOptions,
         with ExitStack() as opened:
             here = running.cluster in (None, "local")
             if here:
-                scheduler = opened.enter_context(local_cluster(running.workers or cores(), dashboard=True))
+                scheduler = opened.enter_context(
+                    local_cluster(running.workers or cores(), dashboard=True)
+                )
             else:
                 scheduler = look_at(str(running.cluster))
             # A coordinator keeps five workers busy if it does the tracking itself, and ten
             # otherwise. While one recording is being read or written, another one fills the queue.
             most = max(2, min(1 + scheduler.processes // 6, cores()))
             count = min(at_once or most, len(todo))
-            done = "" if len(todo) == len(entries) else f", {len(entries) - len(todo)} of them are already done"
+            done = (
+                ""
+                if len(todo) == len(entries)
+                else f", {len(entries) - len(todo)} of them are already done"
+            )
             _say(scheduler, f"{len(entries)} recordings{done}", count, here=here)
             batch_status.write()
             runner = BatchRunner(entries, sizes, output, scheduler.address, count)
@@ -82,7 +95,10 @@ def _run(table: Path, entries: "list[Entry]", output: Path, running: RunOptions,
                     runner.run(batch_status, Bars(shown, batch_status))
             except Stopped as stop:
                 done = len(batch_status.names("done"))
-                where = f"{done} of {len(entries)} recordings are done in {output}; continue with --resume"
+                where = (
+                    f"{done} of {len(entries)} recordings are done in {output}; continue with "
+                    "--resume"
+                )
                 raise Stopped(stop.number, where) from None
     show(batch_status.summary(time.monotonic() - begin))
     print(f"written  {output / BATCH}")
@@ -104,7 +120,8 @@ def status_of(
     file = output / BATCH
     if file.exists() and not (resume or restart):
         raise InputError(
-            f"{file}: this folder has a batch already; continue with --resume, or start again with --restart"
+            f"{file}: this folder has a batch already; continue with --resume, or start again "
+            "with --restart"
         )
     if resume and not file.exists():
         note(f"{output}: there is no batch to resume; a new one is started")
@@ -125,10 +142,18 @@ def status_of(
 def _say(scheduler: "Scheduler", what: str, at_once: int, *, here: bool) -> None:
     """Print what will be done, and where its progress is shown."""
     place = "here" if here else f"at {scheduler.address}"
-    print(f"{what}; {scheduler.processes} processes {place}, {at_once} recordings at once", flush=True)
+    print(
+        f"{what}; {scheduler.processes} processes {place}, {at_once} recordings at once", flush=True
+    )
     if scheduler.processes == 0:
-        note(f"no worker process has connected to {scheduler.address} yet; start one with `dask worker`")
+        note(
+            f"no worker process has connected to {scheduler.address} yet; start one with `dask "
+            "worker`"
+        )
     if scheduler.dashboard is not None:
         print(f"what every process does: {scheduler.dashboard}", flush=True)
     elif here:
-        note('Dask\'s dashboard, which shows what every process does, needs bokeh: pip install "dask[dashboard]"')
+        note(
+            "Dask's dashboard, which shows what every process does, needs bokeh: pip install "
+            '"dask[dashboard]"'
+        )

@@ -92,10 +92,18 @@ class BatchRunner:
         leaders: list[Leader] = []
         try:
             while True:
-                while len(leaders) < self.at_once and (entry := self._next(batch_status, leaders)) is not None:
+                while (
+                    len(leaders) < self.at_once
+                    and (entry := self._next(batch_status, leaders)) is not None
+                ):
                     watcher.began(entry.name)
                     folder, restart = self.output / entry.name, batch_status.of[entry.name].anew
-                    how = self.cluster, self.at_once, not restart and (folder / PARTS).exists(), restart
+                    how = (
+                        self.cluster,
+                        self.at_once,
+                        not restart and (folder / PARTS).exists(),
+                        restart,
+                    )
                     leaders.append(Leader(Assignment(entry.name, entry.request, folder, *how)))
                 if len(leaders) == 0:
                     break
@@ -124,12 +132,16 @@ class BatchRunner:
             before = None if entry.after is None else batch_status.of[entry.after].status
             if before == "failed":
                 reason = (
-                    f"it needs the body shapes of recording {entry.after}, which failed; correct that one first"
+                    f"it needs the body shapes of recording {entry.after}, which failed; correct "
+                    "that one first"
                 )
                 batch_status.set(entry.name, own.failed(reason, 0.0, 0))
             elif before in (None, "done"):
                 found.append(entry)
-        turn = {each.name: (batch_status.of[each.name].attempts, -self.sizes[each.name]) for each in found}
+        turn = {
+            each.name: (batch_status.of[each.name].attempts, -self.sizes[each.name])
+            for each in found
+        }
         return min(found, key=lambda each: turn[each.name], default=None)
 
     def _heard(self, leader: "Leader", batch_status: BatchStatus, watcher: Bars) -> bool:
@@ -222,7 +234,9 @@ def _lead(assignment: Assignment) -> None:
     for stream in (sys.stdout, sys.stderr):
         reconfigure: Any = getattr(stream, "reconfigure", lambda **_: None)
         reconfigure(encoding="utf-8", line_buffering=True)
-    execution = Execution(None, assignment.cluster, assignment.sharing, progress=lambda *told: _tell.send(told))
+    execution = Execution(
+        None, assignment.cluster, assignment.sharing, progress=lambda *told: _tell.send(told)
+    )
     try:
         with stoppable():
             known = prepare(assignment.request, assignment.folder)
@@ -241,8 +255,11 @@ def _lead(assignment: Assignment) -> None:
         _tell.close()
 
 
-def look_at_all(table: Path, entries: Sequence[Entry], output: Path, *, begun: bool) -> dict[str, int]:
-    """Check the inputs and output folders of all recordings; returns the size of each one's detections, bytes.
+def look_at_all(
+    table: Path, entries: Sequence[Entry], output: Path, *, begun: bool
+) -> dict[str, int]:
+    """Check the inputs and output folders of all recordings; returns the size of each one's
+    detections, bytes.
 
     `begun` means that interrupted runs in the folders will be continued or removed. InputError if
     an input is missing or wrong, if existing results are in the way (it describes the first such
@@ -262,14 +279,15 @@ def look_at_all(table: Path, entries: Sequence[Entry], output: Path, *, begun: b
     whole, free = sum(sizes.values()), shutil.disk_usage(output).free
     if free < _LEAST * whole:
         raise InputError(
-            f"{output}: {len(entries)} recordings need at least {decimal(int(_LEAST * whole))} of disk space,"
-            f" and {decimal(free)} are free; free some space, give another --output, or split the table"
+            f"{output}: {len(entries)} recordings need at least {decimal(int(_LEAST * whole))} "
+            f"of disk space, and {decimal(free)} are free; free some space, give another "
+            "--output, or split the table"
         )
     if free < _USUAL * whole:
         usual = decimal(int(_USUAL * whole))
         note(
-            f"{output}: {decimal(free)} of disk space are free; results of recordings of this size usually"
-            f" take {usual}"
+            f"{output}: {decimal(free)} of disk space are free; results of recordings of this "
+            f"size usually take {usual}"
         )
     return sizes
 
@@ -281,7 +299,11 @@ def _look_at(entry: Entry, folder: Path, begun: bool) -> int:
     _, places, _ = find_places(known.detections, asked.rig())
     find_skeleton(asked.skeleton)
     source = known.settings().offsets.source
-    for file in (asked.body, asked.timestamps, None if source in ("recording", "none") else Path(source)):
+    for file in (
+        asked.body,
+        asked.timestamps,
+        None if source in ("recording", "none") else Path(source),
+    ):
         if file is not None:
             open_regular(file).close()
     if asked.shapes is not None:
@@ -290,7 +312,8 @@ def _look_at(entry: Entry, folder: Path, begun: bool) -> int:
     refuse_corrected(folder)
     if (folder / PARTS).exists() and not begun:
         raise InputError(
-            f"{folder / PARTS}: there is an interrupted run; continue with --resume, or start again with --restart"
+            f"{folder / PARTS}: there is an interrupted run; continue with --resume, or start "
+            "again with --restart"
         )
     if (folder / PEOPLE).exists() and not begun:
         raise InputError(f"{folder}: there is a finished result; move it, or give another --output")

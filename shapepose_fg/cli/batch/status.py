@@ -49,13 +49,19 @@ class RecordingStatus:
     def done(self, found: "Ended", seconds: float) -> "RecordingStatus":
         """The status after a successful attempt of this duration, seconds."""
         attempts, seconds = self.attempts + 1, self.seconds + seconds
-        return replace(self, status="done", attempts=attempts, anew=False, seconds=seconds, **asdict(found))
+        return replace(
+            self, status="done", attempts=attempts, anew=False, seconds=seconds, **asdict(found)
+        )
 
     def failed(self, reason: str, seconds: float, most: int) -> "RecordingStatus":
-        """The status after a failed attempt of this duration, seconds; final after `most` attempts."""
+        """The status after a failed attempt of this duration, seconds; final after `most`
+        attempts.
+        """
         attempts, seconds = self.attempts + 1, self.seconds + seconds
         status = "failed" if attempts >= most else "waiting"
-        return replace(self, status=status, attempts=attempts, seconds=seconds, reasons=(*self.reasons, reason))
+        return replace(
+            self, status=status, attempts=attempts, seconds=seconds, reasons=(*self.reasons, reason)
+        )
 
 
 @dataclass
@@ -93,10 +99,15 @@ class BatchStatus:
         """A table of the results of all recordings, with totals below it."""
         rows = []
         for name, each in self.of.items():
-            row = ["" if number is None else str(number) for number in (each.frames, each.people, each.rows)]
+            row = [
+                "" if number is None else str(number)
+                for number in (each.frames, each.people, each.rows)
+            ]
             row += [clock(each.seconds) if each.attempts > 0 else "", str(len(each.warnings) or "")]
             rows.append((Text(name), Text(each.status, style=_STYLES[each.status]), *row))
-        counts = [f"{len(self.names(each))} {each}" for each in _STYLES if len(self.names(each)) > 0]
+        counts = [
+            f"{len(self.names(each))} {each}" for each in _STYLES if len(self.names(each)) > 0
+        ]
         frames = sum(each.frames or 0 for each in self.of.values())
         caption = f"{', '.join(counts)}; {frames} frames; time of this run {clock(seconds)}"
         heads = ("recording", "", "frames", "people", "rows", "time", "warnings")
@@ -108,9 +119,13 @@ def read_status(file: Path) -> dict[str, RecordingStatus]:
     content = read_json(file)
     cure = "start again with --restart"
     if not isinstance(content, dict) or content.get("format") != _FORMAT:
-        raise InputError(f"{file}: this is not the status file of a batch; {cure}, or give another --output")
+        raise InputError(
+            f"{file}: this is not the status file of a batch; {cure}, or give another --output"
+        )
     try:
-        kind = TypeAdapter(dict[str, RecordingStatus], config=ConfigDict(strict=True, allow_inf_nan=False))
+        kind = TypeAdapter(
+            dict[str, RecordingStatus], config=ConfigDict(strict=True, allow_inf_nan=False)
+        )
         return kind.validate_json(json.dumps(content.get("recordings")))
     except ValidationError as error:
         place, problem = first_problem(error)
@@ -145,7 +160,10 @@ class Bars:
         each = self._status.of[name]
         if failed is None:
             people = "" if each.people is None else f"{each.people} people, "
-            words = ("done: ", "green"), f"{name}, {each.frames} frames, {people}{clock(each.seconds)}"
+            words = (
+                ("done: ", "green"),
+                f"{name}, {each.frames} frames, {people}{clock(each.seconds)}",
+            )
         else:
             more = " (tried once more after the others)" if again else ""
             words = ("failed: ", "bold red"), f"{name}: {failed}{more}"

@@ -41,12 +41,15 @@ def read_table(path: Path) -> list[Entry]:
     """
     tables = read_toml(path)
     for key in tables.keys() - {"defaults", "recordings"}:
-        raise InputError(f"{path}: {key} is not a known table; write [defaults] and [recordings.NAME]")
+        raise InputError(
+            f"{path}: {key} is not a known table; write [defaults] and [recordings.NAME]"
+        )
     defaults = _table(tables.get("defaults", {}), path, "defaults")
     recordings = _table(tables.get("recordings", {}), path, "recordings")
     if not 1 <= len(recordings) <= _MOST:
         raise InputError(
-            f"{path}: the table has {len(recordings)} recordings; give 1 to {_MOST}, each as [recordings.NAME]"
+            f"{path}: the table has {len(recordings)} recordings; give 1 to {_MOST}, each as "
+            "[recordings.NAME]"
         )
     _check_names(list(recordings), path)
     config_from(defaults, Request, path, place="defaults", cure=_CURE)
@@ -69,13 +72,16 @@ def _table(value: Any, path: Path, place: str) -> dict[str, Any]:
 
 
 def _check_names(names: list[str], path: Path) -> None:
-    """InputError for names that are not valid for a folder, or that are equal on some file systems."""
+    """InputError for names that are not valid for a folder, or that are equal on some file
+    systems.
+    """
     seen = {"batch.json": "batch.json"}
     for name in names:
         if _NAME.fullmatch(name) is None:
             raise InputError(
-                f"{path}: recordings.{name[:100]}: the name is also that of a folder, so it must have up to 100"
-                " letters, digits, dots, - and _, and begin with a letter or digit; rename it"
+                f"{path}: recordings.{name[:100]}: the name is also that of a folder, so it must "
+                "have up to 100 letters, digits, dots, - and _, and begin with a letter or "
+                "digit; rename it"
             )
         if name.lower() in seen:
             other = seen[name.lower()]
@@ -91,17 +97,27 @@ def _located(request: Request, path: Path, place: str) -> Request:
     given = {name: getattr(request, name) for name in _PATHS}
     if request.skeleton is not None and not layouts_called(request.skeleton):
         given["skeleton"] = Path(request.skeleton)
-    found = {name: _inside(value, path, f"{place}.{name}") for name, value in given.items() if value is not None}
-    return replace(request, **{name: str(value) if name == "skeleton" else value for name, value in found.items()})
+    found = {
+        name: _inside(value, path, f"{place}.{name}")
+        for name, value in given.items()
+        if value is not None
+    }
+    return replace(
+        request,
+        **{name: str(value) if name == "skeleton" else value for name, value in found.items()},
+    )
 
 
 def _inside(given: Path, path: Path, place: str) -> Path:
     """Resolve a path: relative to the table's folder and inside it, or absolute."""
     if "\0" in str(given):
-        raise InputError(f"{path}: {place}: {str(given)[:80]!r} is not a valid file name; correct it")
+        raise InputError(
+            f"{path}: {place}: {str(given)[:80]!r} is not a valid file name; correct it"
+        )
     if not (is_inside(path.parent, given) or given.is_absolute()):
         raise InputError(
-            f"{path}: {place}: {given} is outside the table's folder; if this is intended, give an absolute path"
+            f"{path}: {place}: {given} is outside the table's folder; if this is intended, give "
+            "an absolute path"
         )
     return path.parent / given  # an absolute path stays unchanged
 
@@ -119,8 +135,8 @@ def _in_turn(entries: list[Entry], path: Path) -> list[Entry]:
             other = projects.setdefault((project.resolve(), each.request.frames), each.name)
             if other != each.name:
                 raise InputError(
-                    f"{path}: recordings.{each.name}: {project} is also the project of {other}, and their TRC"
-                    " files would overwrite each other; remove one of them"
+                    f"{path}: recordings.{each.name}: {project} is also the project of {other}, "
+                    "and their TRC files would overwrite each other; remove one of them"
                 )
         if shapes is not None:
             each = replace(each, after=last.get(shapes.resolve()))
@@ -135,5 +151,7 @@ def asked(request: Request) -> dict[str, Any]:
     for name in (field.name for field in fields(request)):
         value = getattr(request, name)
         if value != getattr(default, name):
-            found[name] = str(value) if isinstance(value, Path) else list(value) if name == "cuts" else value
+            found[name] = (
+                str(value) if isinstance(value, Path) else list(value) if name == "cuts" else value
+            )
     return found

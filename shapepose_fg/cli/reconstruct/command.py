@@ -1,4 +1,6 @@
-"""`shapepose-fg reconstruct`: from the cameras and detections of a recording to a folder of results."""
+"""`shapepose-fg reconstruct`: from the cameras and detections of a recording to a folder of
+results.
+"""
 
 import re
 from dataclasses import replace
@@ -15,17 +17,25 @@ from shapepose_fg.core.errors import InputError
 def reconstruct(
     request: Request,
     running: RunOptions,
-    cuts: str | None = option(TIME, "First frames after cuts; no track or motion crosses a cut.", metavar="A,B"),
+    cuts: str | None = option(
+        TIME, "First frames after cuts; no track or motion crosses a cut.", metavar="A,B"
+    ),
     output: Path | None = option(RESULT, "Folder for the results; created if missing."),
-    overwrite: bool = option(RESULT, "Replace a finished result in --output.", False, "--overwrite"),
+    overwrite: bool = option(
+        RESULT, "Replace a finished result in --output.", False, "--overwrite"
+    ),
     strict: bool = option(RESULT, "Exit with code 1 if there are warnings.", False, "--strict"),
 ) -> None:
     """Reconstruct the people of a recording: 3D joints with covariances, and bodies."""
     running.check()
     try:
-        frames = () if cuts is None else tuple(int(word) for word in re.split(r"[,\s]+", cuts.strip()))
+        frames = (
+            () if cuts is None else tuple(int(word) for word in re.split(r"[,\s]+", cuts.strip()))
+        )
     except ValueError:
-        raise InputError(f"--cuts {cuts}: must be increasing frame numbers, such as 300,600") from None
+        raise InputError(
+            f"--cuts {cuts}: must be increasing frame numbers, such as 300,600"
+        ) from None
     known = prepare(replace(request, cuts=frames), output)
     from shapepose_fg.cli.reconstruct.run import carry_out
     from shapepose_fg.pipeline.execution import Execution

@@ -32,7 +32,16 @@ if TYPE_CHECKING:
     from shapepose_fg.io.pose2sim_project import Pose2SimProject
     from shapepose_fg.pipeline.config import PipelineConfig
 
-OUTPUTS = (PEOPLE, RUN_FILE, OBSERVATIONS, "cameras.json", "footage.json", MOMENTS, CLOCKS, "report.html")
+OUTPUTS = (
+    PEOPLE,
+    RUN_FILE,
+    OBSERVATIONS,
+    "cameras.json",
+    "footage.json",
+    MOMENTS,
+    CLOCKS,
+    "report.html",
+)
 """The files of a results folder."""
 
 
@@ -48,21 +57,35 @@ class Request(ProjectOptions, TimeOptions):
         RESULT, "File of settings, TOML: all or some of those that `shapepose-fg config` prints."
     )
     frames: str | None = frames_option()
-    body: Path | None = option(INPUT, "Body model in SMPL's file format, instead of the built-in one.")
+    body: Path | None = option(
+        INPUT, "Body model in SMPL's file format, instead of the built-in one."
+    )
     trajectory: list[str] | None = option(
         INPUT, "Poses of a moving camera, TUM or CSV; may be repeated.", metavar="CAMERA=FILE"
     )
-    synchronise: bool = option(TIME, "Estimate the start times of unsynchronised cameras from the people.", False)
-    readout: float | None = option(TIME, "Readout time of rolling shutters, first to last row, seconds.")
+    synchronise: bool = option(
+        TIME, "Estimate the start times of unsynchronised cameras from the people.", False
+    )
+    readout: float | None = option(
+        TIME, "Readout time of rolling shutters, first to last row, seconds."
+    )
     cuts: tuple[int, ...] = ()
     """First frames after a cut."""
     temporal: bool | None = option(
         TIME, "Solve people over time, or frame by frame.", None, "--temporal/--no-temporal"
     )
-    shapes: Path | None = option(RESULT, "File (.npz) of people's body shapes; read if it exists, and updated.")
-    chunk_frames: int | None = option(RUN, "Track people in parallel, too, in chunks of about this many frames.")
-    report: bool = option(RESULT, "Write report.html, a page for the browser.", True, "--report/--no-report")
-    check: bool = option(RESULT, "Check whether cameras and detections fit.", True, "--check/--no-check")
+    shapes: Path | None = option(
+        RESULT, "File (.npz) of people's body shapes; read if it exists, and updated."
+    )
+    chunk_frames: int | None = option(
+        RUN, "Track people in parallel, too, in chunks of about this many frames."
+    )
+    report: bool = option(
+        RESULT, "Write report.html, a page for the browser.", True, "--report/--no-report"
+    )
+    check: bool = option(
+        RESULT, "Check whether cameras and detections fit.", True, "--check/--no-check"
+    )
 
     def rig(self) -> "Rig":
         """The cameras, with the option `readout` for rolling shutters, if the calibration does not
@@ -80,7 +103,9 @@ class Request(ProjectOptions, TimeOptions):
         if not 0 <= self.readout <= LONGEST_READOUT_S:
             most = f"0 to {LONGEST_READOUT_S:g} seconds, such as 0.02"
             raise InputError(f"--readout {self.readout:g}: must be {most}")
-        cameras = (replace(each, readout_s=each.readout_s or self.readout) for each in found.cameras)
+        cameras = (
+            replace(each, readout_s=each.readout_s or self.readout) for each in found.cameras
+        )
         return replace(found, cameras=tuple(cameras))
 
 
@@ -112,22 +137,34 @@ class Prepared:
 
         asked = self.request
         if asked.config is not None and asked.preset is not None:
-            cure = f"`shapepose-fg config --preset {asked.preset}` writes its settings into a file to edit"
+            cure = (
+                f"`shapepose-fg config --preset {asked.preset}` writes its settings into a file "
+                "to edit"
+            )
             raise InputError(
-                f"--preset {asked.preset} and --config {asked.config}: settings come from one of them; {cure}"
+                f"--preset {asked.preset} and --config {asked.config}: settings come from one of "
+                f"them; {cure}"
             )
         preset = Preset.ACCURATE if asked.preset is None else asked.preset
-        found = preset.settings() if asked.config is None else read_config(asked.config, PipelineConfig)
+        found = (
+            preset.settings() if asked.config is None else read_config(asked.config, PipelineConfig)
+        )
         found = found if asked.temporal is None else replace(found, temporal=asked.temporal)
         if asked.shapes is not None and not found.temporal:
-            raise InputError("--shapes: shapes need people over time; leave out --no-temporal, or --shapes")
-        if asked.chunk_frames is not None and not (found.temporal and asked.chunk_frames >= found.batch_frames):
             raise InputError(
-                f"--chunk-frames {asked.chunk_frames}: must be {found.batch_frames} (batch_frames) or more, and"
-                " people over time are needed"
+                "--shapes: shapes need people over time; leave out --no-temporal, or --shapes"
+            )
+        if asked.chunk_frames is not None and not (
+            found.temporal and asked.chunk_frames >= found.batch_frames
+        ):
+            raise InputError(
+                f"--chunk-frames {asked.chunk_frames}: must be {found.batch_frames} "
+                "(batch_frames) or more, and people over time are needed"
             )
         if self.project is not None and not found.temporal:
-            raise InputError("--project: its files need people over time; leave out --no-temporal, or --project")
+            raise InputError(
+                "--project: its files need people over time; leave out --no-temporal, or --project"
+            )
         return found
 
     def span(self, count: int, first: int = 0) -> range:
@@ -146,8 +183,8 @@ class Prepared:
             return check_cuts(self.request.cuts, count)
         except ValueError:
             raise InputError(
-                f"--cuts {','.join(map(str, self.request.cuts))}: must be increasing frame numbers between 1 and"
-                f" {count - 1}, such as 300,600"
+                f"--cuts {','.join(map(str, self.request.cuts))}: must be increasing frame "
+                f"numbers between 1 and {count - 1}, such as 300,600"
             ) from None
 
 
@@ -164,12 +201,18 @@ def prepare(request: Request, output: Path | None, tell: Callable[..., None] = n
         output = output or project.output
         if request.fps is None and request.timestamps is None:
             request = replace(request, fps=project.fps)
-    places = {"--calibration": request.calibration, "--detections": request.detections, "--output": output}
+    places = {
+        "--calibration": request.calibration,
+        "--detections": request.detections,
+        "--output": output,
+    }
     refuse_missing(places)
     calibration, detections, output = (cast(Path, place) for place in places.values())
     check_fps(request.fps)
     if request.synchronise and request.timestamps is not None:
-        raise InputError("--synchronise and --timestamps: times are either estimated or given; give one of them")
+        raise InputError(
+            "--synchronise and --timestamps: times are either estimated or given; give one of them"
+        )
     request = replace(request, timestamps=times_beside(detections, request.fps, request.timestamps))
     if request.synchronise and request.fps is None and request.timestamps is None:
         raise InputError("--fps: missing; give the frame rate of the cameras")

@@ -61,7 +61,12 @@ class Ended:
 
 
 def carry_out(
-    known: Prepared, execution: Execution, *, resume: bool = False, restart: bool = False, overwrite: bool = False
+    known: Prepared,
+    execution: Execution,
+    *,
+    resume: bool = False,
+    restart: bool = False,
+    overwrite: bool = False,
 ) -> Ended:
     """Execute a request: reconstruct, write the results into its folder, and print a summary.
 
@@ -71,8 +76,12 @@ def carry_out(
     """
     output = known.output
     refuse_corrected(output)
-    if (output / PEOPLE).exists() and not (overwrite or (resume and (output / manifest.PARTS).is_dir())):
-        raise InputError(f"{output}: there is a finished result; give another --output, or --overwrite")
+    if (output / PEOPLE).exists() and not (
+        overwrite or (resume and (output / manifest.PARTS).is_dir())
+    ):
+        raise InputError(
+            f"{output}: there is a finished result; give another --output, or --overwrite"
+        )
     settings = known.settings()  # report wrong settings before the whole recording is read
     with only_run_in(output, OUTPUTS), _recording_folder(inside(output, ".detections")) as kept:
         known = _synchronised(known, kept=resume and (output / manifest.PARTS).is_dir())
@@ -82,8 +91,12 @@ def carry_out(
         reading = ReadInputs((*files, known.detections))
         rig, own = asked.rig(), output / CAMERAS
         if (asked.cameras or asked.without) and own.exists() and own.samefile(known.calibration):
-            raise InputError(f"{own}: the result would replace this file by fewer cameras; copy it first")
-        recording, times = read_recording(known.detections, rig, known.skeleton, kept, asked.fps, asked.timestamps)
+            raise InputError(
+                f"{own}: the result would replace this file by fewer cameras; copy it first"
+            )
+        recording, times = read_recording(
+            known.detections, rig, known.skeleton, kept, asked.fps, asked.timestamps
+        )
         note(*recording.notes)
         count = len(recording)
         span, cuts = known.span(count, recording.first), known.cuts(count)
@@ -95,7 +108,8 @@ def carry_out(
             if fitter.weights is None and settings.body.method != "plain":
                 cure = f"shapepose-fg train-fitter {shlex.join(['--body', str(asked.body)])}"
                 note(
-                    f"{asked.body}: bodies are fitted by the plain optimiser; {cure} trains a better fitter, once"
+                    f"{asked.body}: bodies are fitted by the plain optimiser; {cure} trains a "
+                    "better fitter, once"
                 )
         task = Task(recording, rig, settings, span, times, cuts, fitter=fitter)
         inputs = reading.checksums((known.calibration, *recording.sources, *files[1:]))
@@ -108,8 +122,12 @@ def carry_out(
         del reading  # it is large for half a million files
         note(*_about_moving(task))
         report = check_setup(known, task) if asked.check and not rig.moves else None
-        task = task if report is None else replace(task, detections=Trusted(recording, report.trust))
-        return _Run(task, recording, known, inputs, execution, report).carried_out(resume=resume, restart=restart)
+        task = (
+            task if report is None else replace(task, detections=Trusted(recording, report.trust))
+        )
+        return _Run(task, recording, known, inputs, execution, report).carried_out(
+            resume=resume, restart=restart
+        )
 
 
 def _synchronised(known: Prepared, *, kept: bool) -> Prepared:
@@ -136,22 +154,29 @@ def _about_moving(task: Task) -> list[str]:
         return []
     told = ["cameras move: the set-up check needs fixed cameras and is left out"]
     if (rig.carrier >= 0).all():
-        told.append("no camera is fixed: the world frame is the start of the first trajectory, and drifts with it")
+        told.append(
+            "no camera is fixed: the world frame is the start of the first trajectory, and "
+            "drifts with it"
+        )
     if not task.config.temporal:
         told.append("frame by frame: trajectories are used as given, without uncertainty")
     spells = without_poses(rig, times)
     for view in sorted({view for view, _, _ in spells}):
         spans = [(first, last) for each, first, last in spells if each == view]
-        count, where = sum(last - first for first, last in spans), ", ".join(f"{a}-{b - 1}" for a, b in spans[:4])
+        count, where = (
+            sum(last - first for first, last in spans),
+            ", ".join(f"{a}-{b - 1}" for a, b in spans[:4]),
+        )
         told.append(
-            f"{rig.names[view]}: {count} pictures are outside its trajectory and are not used (frames {where}"
-            f"{' ...' * (len(spans) > 4)})"
+            f"{rig.names[view]}: {count} pictures are outside its trajectory and are not used "
+            f"(frames {where}{' ...' * (len(spans) > 4)})"
         )
         if count == len(times):
             path, time_s = rig.trajectories[int(rig.carrier[view])], times.frame_s
             raise InputError(
-                f"{path.name}: runs from {path.time_s[0]:.10g} to {path.time_s[-1]:.10g} s, the pictures of"
-                f" {rig.names[view]} from {time_s[0]:.10g} to {time_s[-1]:.10g}; give --timestamps of its clock"
+                f"{path.name}: runs from {path.time_s[0]:.10g} to {path.time_s[-1]:.10g} s, the "
+                f"pictures of {rig.names[view]} from {time_s[0]:.10g} to {time_s[-1]:.10g}; give "
+                "--timestamps of its clock"
             )
     return told
 
@@ -259,18 +284,27 @@ class _Run:
         result = result.with_run(**about)
         every = max(1, -(-len(result) // MOST_ROWS))
         if every > 1:
-            note(f"check and report use every {th(every)} frame, because the result has {len(result)} rows")
+            note(
+                f"check and report use every {th(every)} frame, because the result has "
+                f"{len(result)} rows"
+            )
         rig = kept_rig(kept, rig) or rig
         people = result.reconstruction(every=every)
         report = self.report
         looked_at = [frame for frame in frames if frame % every == 0]
-        checked = None if report is None else result_check(report, people, task.detections, rig, looked_at)
+        checked = (
+            None
+            if report is None
+            else result_check(report, people, task.detections, rig, looked_at)
+        )
         result = result if checked is None else result.with_run(**checked.as_run())
         people = people.with_run(**result.run)
         note(*set_aside(output))
         result.save(output)
         # The cameras of the observations, for solving or drawing them again.
-        if not (output / CAMERAS).exists() or not (output / CAMERAS).samefile(self.known.calibration):
+        if not (output / CAMERAS).exists() or not (output / CAMERAS).samefile(
+            self.known.calibration
+        ):
             write_rig(rig, output / CAMERAS)
         if not self.known.request.synchronise:
             (output / CLOCKS).unlink(missing_ok=True)
@@ -295,22 +329,36 @@ class _Run:
             show_check(checked)
         count = len(result.rows_of) if self.task.config.temporal else None
         return Ended(
-            len(self.task.whole()[0]), len(result), count, () if checked is None else tuple(checked.warnings)
+            len(self.task.whole()[0]),
+            len(result),
+            count,
+            () if checked is None else tuple(checked.warnings),
         )
 
     def _written(self, result: Assembly, people: Reconstruction, rig: Rig, every: int) -> list[str]:
         """Write the report and files for other programs; returns their paths and notes."""
         output, project = self.known.output, self.known.project
-        files = ["people.npz", "run.json", *(["observations.npz"] if len(result) > 0 else []), CAMERAS]
+        files = [
+            "people.npz",
+            "run.json",
+            *(["observations.npz"] if len(result) > 0 else []),
+            CAMERAS,
+        ]
         written = [str(output / name) for name in files]
         if rig.moves:
-            written.append(f"{output / 'trajectories'}  poses of moving cameras: CSV with covariances, and TUM")
+            written.append(
+                f"{output / 'trajectories'}  poses of moving cameras: CSV with covariances, and TUM"
+            )
         if self.known.request.report:
-            written.append(f"{write_report(output, people, rig, every=every)}  open it in a browser")
+            written.append(
+                f"{write_report(output, people, rig, every=every)}  open it in a browser"
+            )
         else:  # the report of an earlier result would be out of date
             (output / REPORT).unlink(missing_ok=True)
         if project is not None:
-            from shapepose_fg.io.export.markers import write_pose2sim_files  # imports SciPy: a fifth of a second
+            from shapepose_fg.io.export.markers import (
+                write_pose2sim_files,
+            )  # imports SciPy: a fifth of a second
 
             whole = people if len(people) == len(result) else result.reconstruction()
             made = write_pose2sim_files(whole, self.task.rig.up, project)
@@ -325,7 +373,10 @@ class _Run:
             done = manifest.frames_done(output)
         except InputError as error:
             return str(error)
-        return f"{done} of {count} frames are stored in {output / manifest.PARTS}; continue with --resume"
+        return (
+            f"{done} of {count} frames are stored in {output / manifest.PARTS}; continue with "
+            "--resume"
+        )
 
 
 def _known_people(file: Path, body: Path | None) -> SubjectShapes:

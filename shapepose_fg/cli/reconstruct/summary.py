@@ -57,10 +57,14 @@ def summary_table(
     table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
     table.add_column(style="bold")
     table.add_column(overflow="fold")
-    table.add_row("frames", f"{len(span)} ({span.start}:{span.stop}) of {cameras} cameras{rate_words(run)}")
+    table.add_row(
+        "frames", f"{len(span)} ({span.start}:{span.stop}) of {cameras} cameras{rate_words(run)}"
+    )
     over_time = run.get("configuration", {}).get("temporal", False)
     for each in run.get("trajectories", []):
-        corrected = f"corrected by up to {each['moved_mm']:.0f} mm and {each['turned_deg']:.1f} degrees"
+        corrected = (
+            f"corrected by up to {each['moved_mm']:.0f} mm and {each['turned_deg']:.1f} degrees"
+        )
         known = f"sigma {each['sigma_mm']:.0f} mm and {each['sigma_deg']:.1f} degrees"
         words = (
             f"{each['way_m']:.1f} m; {corrected}; {known}"
@@ -69,24 +73,42 @@ def summary_table(
         )
         table.add_row("moving", f"{' '.join(each['cameras'])}: {words}")
     count = f"{len(result.rows_of)} people over time" if over_time else "without identities"
-    table.add_row("people", f"{count}, {per_frame.mean():.1f} a frame ({per_frame.min()} to {per_frame.max()})")
+    table.add_row(
+        "people",
+        f"{count}, {per_frame.mean():.1f} a frame ({per_frame.min()} to {per_frame.max()})",
+    )
     table.add_row("rows", f"{len(result)} in all")
     for status, count in sorted(counts["status"].items()):
         table.add_row("", f"{count} {status}", style="green" if status == "ok" else "yellow")
     if len(doubtful := _doubtful(run)) > 0:
         table.add_row("", doubtful, style="yellow")
     lost = [
-        f"{count} rows dropped: {reason}{_frames_words(run.get('dropped_frames', {}).get(reason, []))}"
+        (
+            f"{count} rows dropped: "
+            f"{reason}{_frames_words(run.get('dropped_frames', {}).get(reason, []))}"
+        )
         for reason, count in run.get("people", {}).get("dropped", {}).items()
     ]
     if unchecked:  # otherwise the check reports it
-        lasts = float(np.ptp(task.whole()[1].frame_s[span.start : span.stop])) * len(span) / max(len(span) - 1, 1)
-        lost += unseen(task.detections, task.rig.names, span, per_frame, lasts if task.config.temporal else None)
+        lasts = (
+            float(np.ptp(task.whole()[1].frame_s[span.start : span.stop]))
+            * len(span)
+            / max(len(span) - 1, 1)
+        )
+        lost += unseen(
+            task.detections,
+            task.rig.names,
+            span,
+            per_frame,
+            lasts if task.config.temporal else None,
+        )
     if len(lost) > 0:
         table.add_row("lost", "; ".join(lost), style="yellow")
     for what, spans in run.get("thinned_frames", {}).items():
         table.add_row(
-            "", f"too many {what}; those of highest confidence were used{_frames_words(spans)}", style="yellow"
+            "",
+            f"too many {what}; those of highest confidence were used{_frames_words(spans)}",
+            style="yellow",
         )
     for camera, spans in run.get("repeated_pictures", {}).items():
         words = f"{camera} repeats pictures; the repeated ones are left out{_frames_words(spans)}"
@@ -95,7 +117,9 @@ def summary_table(
         table.add_row("joints", _joints(counts["joints"], people))
     # Loading the body takes a third of a second once, and is not part of the time per frame.
     stages = {name: spent for name, spent in run.get("seconds", {}).items() if name != "load"}
-    table.add_row("time", f"{1e3 * sum(stages.values()) / len(span):.1f} ms a frame, {seconds:.1f} s in all")
+    table.add_row(
+        "time", f"{1e3 * sum(stages.values()) / len(span):.1f} ms a frame, {seconds:.1f} s in all"
+    )
     words = (f"{name} {1e3 * spent / len(span):.1f}" for name, spent in stages.items())
     table.add_row("", "  ".join(words), style="dim")
     return table
@@ -109,8 +133,16 @@ def _doubtful(run: dict[str, Any]) -> str:
     if isinstance(said, dict):
         count = sum(rows for tenth, rows in said.items() if float(tenth) < _SURE)
         return f"{count} have a probability below {_SURE}" if count > 0 else ""
-    few = [f"{each['person']} ({each['probability']:.2f})" for each in said if each["probability"] < _SURE]
-    return f"probability below {_SURE}: person {', '.join(few[:8])}{' ...' * (len(few) > 8)}" if few else ""
+    few = [
+        f"{each['person']} ({each['probability']:.2f})"
+        for each in said
+        if each["probability"] < _SURE
+    ]
+    return (
+        f"probability below {_SURE}: person {', '.join(few[:8])}{' ...' * (len(few) > 8)}"
+        if few
+        else ""
+    )
 
 
 def _frames_words(spans: list[list[int]]) -> str:
@@ -122,10 +154,16 @@ def _frames_words(spans: list[list[int]]) -> str:
 def _joints(count: dict[str, int], people: Reconstruction) -> str:
     """Shares of joints by how they are known, and standard deviations, in words."""
     total = max(sum(count.values()), 1)
-    shares = [f"{100 * count[how] / total:.1f} % {word}" for how, word in _KNOWN_WORDS.items() if count[how] > 0]
+    shares = [
+        f"{100 * count[how] / total:.1f} % {word}"
+        for how, word in _KNOWN_WORDS.items()
+        if count[how] > 0
+    ]
     variance = np.trace(people.covariance, axis1=-2, axis2=-1) / 3
     variance = variance[np.isfinite(variance) & (variance >= 0)]
-    sigma = f"; median sigma {1e3 * np.sqrt(np.median(variance)):.0f} mm" if len(variance) > 0 else ""
+    sigma = (
+        f"; median sigma {1e3 * np.sqrt(np.median(variance)):.0f} mm" if len(variance) > 0 else ""
+    )
     return ", ".join(shares) + sigma
 
 

@@ -25,15 +25,17 @@ MOST_DEPTH = 64
 """Maximum depth of nested lists and objects: no format needs a fifth of it, and libyaml's loader is
 recursive."""
 _MOST_DOTS = 100
-"""Maximum number of dots in a line of TOML: the parser's time grows with the square of the parts of a dotted
-key."""
+"""Maximum number of dots in a line of TOML: the parser's time grows with the square of the parts of
+a dotted key."""
 _LONG_NUMBER = re.compile(r"\d{19}")
 _BROKEN_OFF = re.compile(r"(-|\.|[eE][+-]?|tr?u?|fa?l?s?|nu?l?)?\s*")
 """Matches the rest of a truncated JSON text, which ends within a number or a word, or between two
 values."""
 
 
-def open_regular(path: Path, cure: str = "check the path", most: int | None = None) -> BufferedReader:
+def open_regular(
+    path: Path, cure: str = "check the path", most: int | None = None
+) -> BufferedReader:
     """Open the file at `path` for reading bytes.
 
     InputError if it is missing, unreadable, larger than `most` bytes, or not a regular file:
@@ -49,7 +51,9 @@ def open_regular(path: Path, cure: str = "check the path", most: int | None = No
     except FileNotFoundError:
         raise InputError(f"{path}: there is no such file; {cure}") from None
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from None
+        raise InputError(
+            f"{path}: cannot be read ({error.strerror}); check its permissions"
+        ) from None
     except ValueError:  # a zero byte in the path
         raise InputError(f"{str(path)!r}: this is not a valid file name; check the path") from None
     _refuse_unusable(path, os.fstat(stream.fileno()), most)
@@ -86,13 +90,17 @@ def inside(folder: Path, name: str) -> Path:
 
 
 def files_below(folder: Path, suffixes: tuple[str, ...] | None = None) -> Iterator[Path]:
-    """Files in a folder and its subfolders, with one of the `suffixes`; links to folders are followed."""
+    """Files in a folder and its subfolders, with one of the `suffixes`; links to folders are
+    followed.
+    """
     entered = {folder.resolve()}
     for place, folders, names in os.walk(folder, followlinks=True):
         real = {name: Path(place, name).resolve() for name in folders}
         folders[:] = [name for name in folders if real[name] not in entered]
         entered.update(real.values())
-        yield from (Path(place, name) for name in names if suffixes is None or Path(name).suffix in suffixes)
+        yield from (
+            Path(place, name) for name in names if suffixes is None or Path(name).suffix in suffixes
+        )
 
 
 def read_bytes(path: Path, most: int = LARGE) -> bytes:
@@ -107,7 +115,9 @@ def read_bytes(path: Path, most: int = LARGE) -> bytes:
 
 def _check_size(path: Path, size: int, most: int) -> None:
     if size > most:
-        raise InputError(f"{path}: the file is over {most >> 20} MiB, too large for its kind; check the path")
+        raise InputError(
+            f"{path}: the file is over {most >> 20} MiB, too large for its kind; check the path"
+        )
 
 
 def read_text(path: Path, *, may_be_empty: bool = False, most: int = LARGE) -> str:
@@ -165,8 +175,13 @@ def parse_json(text: str, path: Path | str) -> Any:
         raise not_json(path, error.lineno, error.colno, error.msg, rest=text[error.pos :]) from None
     except InputError:
         raise
-    except (ValueError, RecursionError) as error:  # such as an integer of 5,000 digits, or 10,000 open brackets
-        raise InputError(f"{path}: cannot be read as JSON ({error}); write the file again") from None
+    except (
+        ValueError,
+        RecursionError,
+    ) as error:  # such as an integer of 5,000 digits, or 10,000 open brackets
+        raise InputError(
+            f"{path}: cannot be read as JSON ({error}); write the file again"
+        ) from None
     return bounded(value, path, numbers=has_long_number(text))
 
 
@@ -175,14 +190,17 @@ def not_text(path: Path, byte: int) -> InputError:
     return InputError(f"{path}: byte {byte} is not UTF-8 text; check the path")
 
 
-def not_json(path: Path | str, line: int, column: int, problem: str, *, rest: str | None) -> InputError:
+def not_json(
+    path: Path | str, line: int, column: int, problem: str, *, rest: str | None
+) -> InputError:
     """An error about JSON text at a line and column, counted from 1; `rest` is the text from there
     on, if known.
     """
     cut = rest is not None and (problem.startswith("Unterminated") or _BROKEN_OFF.fullmatch(rest))
     ends = " (the file ends too early)" if cut else ""
     return InputError(
-        f"{path}: line {line} column {column} is not JSON: {problem}{ends}; correct it or write the file again"
+        f"{path}: line {line} column {column} is not JSON: {problem}{ends}; correct it or write "
+        "the file again"
     )
 
 
@@ -199,18 +217,29 @@ def read_toml(path: Path, *, may_be_empty: bool = False) -> dict[str, Any]:
 def parse_toml(path: Path, text: str) -> dict[str, Any]:
     """Parse the TOML `text` of the file at `path`."""
     if len(text) > SMALL:
-        raise InputError(f"{path}: the file has {len(text)} characters, too many for TOML; check the path")
+        raise InputError(
+            f"{path}: the file has {len(text)} characters, too many for TOML; check the path"
+        )
     for number, line in enumerate(text.splitlines(), 1):
         if line.count(".") > _MOST_DOTS and not line.lstrip().startswith("#"):
-            raise InputError(f"{path}: line {number} has over {_MOST_DOTS} dots; split it into several lines")
+            raise InputError(
+                f"{path}: line {number} has over {_MOST_DOTS} dots; split it into several lines"
+            )
     try:
         return bounded(tomllib.loads(text), path)
     except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: cannot be read as TOML ({error}); correct it or write the file again") from None
+        raise InputError(
+            f"{path}: cannot be read as TOML ({error}); correct it or write the file again"
+        ) from None
     except InputError:
         raise
-    except (ValueError, RecursionError) as error:  # such as an invalid date, or an integer of 5,000 digits
-        raise InputError(f"{path}: cannot be read as TOML ({error}); write the file again") from None
+    except (
+        ValueError,
+        RecursionError,
+    ) as error:  # such as an invalid date, or an integer of 5,000 digits
+        raise InputError(
+            f"{path}: cannot be read as TOML ({error}); write the file again"
+        ) from None
 
 
 def bounded(value: Any, path: Path | str, *, numbers: bool = True) -> Any:
@@ -225,12 +254,20 @@ def bounded(value: Any, path: Path | str, *, numbers: bool = True) -> Any:
         way, each = waiting.pop()
         if len(way) > MOST_DEPTH:
             raise InputError(f"{path}: its lists are over {MOST_DEPTH} deep; write the file again")
-        items = each.items() if isinstance(each, dict) else enumerate(each) if isinstance(each, list) else ()
+        items = (
+            each.items()
+            if isinstance(each, dict)
+            else enumerate(each)
+            if isinstance(each, list)
+            else ()
+        )
         for key, child in items:
             if isinstance(child, dict | list):
                 waiting.append(((*way, key), child))
             elif numbers and type(child) is int and not -(2**63) <= child < 2**63:
-                place = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in (*way, key))
+                place = "".join(
+                    f"[{part}]" if isinstance(part, int) else f".{part}" for part in (*way, key)
+                )
                 place = place.removeprefix(".")[:80]
                 raise InputError(f"{path}: {place} is a whole number of over 18 digits; correct it")
     return value
@@ -318,7 +355,9 @@ def _naming(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.filename is not None and not Path(str(error.filename)).name.startswith(f".{path.name}."):
+        if error.filename is not None and not Path(str(error.filename)).name.startswith(
+            f".{path.name}."
+        ):
             raise
         raise OSError(error.errno, error.strerror, str(path)) from error
 
@@ -330,6 +369,8 @@ def unique_keys(pairs: list[tuple[str, Any]], path: Path | str) -> dict[str, Any
     members: dict[str, Any] = {}
     for key, value in pairs:
         if key in members:
-            raise InputError(f'{path}: key "{key}" occurs twice in one object; give each its own name')
+            raise InputError(
+                f'{path}: key "{key}" occurs twice in one object; give each its own name'
+            )
         members[key] = value
     return members

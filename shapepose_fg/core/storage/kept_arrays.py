@@ -71,7 +71,9 @@ class KeptArrays:
         """Description of where a set is stored, for messages."""
         return name
 
-    def columns(self, name: str, columns: Mapping[str, Column], sizes: dict[str, int]) -> dict[str, NDArray[Any]]:
+    def columns(
+        self, name: str, columns: Mapping[str, Column], sizes: dict[str, int]
+    ) -> dict[str, NDArray[Any]]:
         """Arrays of a set; InputError if one does not match its column, or these `sizes`."""
         with naming(self.place(name), ANEW):
             return checked_columns(columns, {key: self.array(name, key) for key in columns}, sizes)
@@ -84,7 +86,9 @@ def _mapped(arrays: Arrays) -> Arrays:
     """Copies of arrays in a separate memory mapping, which is released immediately when they are
     deleted; memory of the allocator would remain in use.
     """
-    starts = np.cumsum([0, *(-(-array.nbytes // _ALIGNED) * _ALIGNED for array in arrays.values())]).tolist()
+    starts = np.cumsum(
+        [0, *(-(-array.nbytes // _ALIGNED) * _ALIGNED for array in arrays.values())]
+    ).tolist()
     if starts[-1] == 0:
         return {key: array.copy() for key, array in arrays.items()}
     memory = mmap.mmap(-1, starts[-1], flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
@@ -112,7 +116,9 @@ class InFolder(KeptArrays):
         self._checked: dict[tuple[str, str | None], tuple[int, ...]] = {}
 
     def names(self, prefix: str) -> list[str]:
-        found = (file.name for file in self.folder.glob(f"*{_SUFFIX}") if not file.name.startswith("."))
+        found = (
+            file.name for file in self.folder.glob(f"*{_SUFFIX}") if not file.name.startswith(".")
+        )
         return sorted(name.removesuffix(_SUFFIX) for name in found if name.startswith(prefix))
 
     def keep(self, name: str, arrays: Arrays, about: Any = None) -> None:
@@ -144,7 +150,9 @@ class InFolder(KeptArrays):
 
     def _seal(self, name: str, said: Mapping[str, str]) -> str:
         """Digest of all metadata of a file, which include the digests of its arrays."""
-        return hashlib.sha256(json.dumps([self.run, name, said["about"], said["arrays"]]).encode()).hexdigest()
+        return hashlib.sha256(
+            json.dumps([self.run, name, said["about"], said["arrays"]]).encode()
+        ).hexdigest()
 
     @contextmanager
     def _opened(self, name: str, key: str | None = None) -> Iterator[Any]:
@@ -161,9 +169,9 @@ class InFolder(KeptArrays):
             with safe_open(file, framework="numpy") as content:
                 said, right = content.metadata() or {}, True
                 if self._checked.get((name, None)) != stamp:
-                    right = said.keys() == {"about", "arrays", "sha256"} and said["sha256"] == self._seal(
-                        name, said
-                    )
+                    right = said.keys() == {"about", "arrays", "sha256"} and said[
+                        "sha256"
+                    ] == self._seal(name, said)
                 if right and key is not None and self._checked.get((name, key)) != stamp:
                     right = json.loads(said["arrays"])[key] == _digest(key, content.get_tensor(key))
                 if not right:
@@ -174,7 +182,9 @@ class InFolder(KeptArrays):
             raise
         except (OSError, SafetensorError, KeyError, TypeError, ValueError, RecursionError) as error:
             reason = str(error) or type(error).__name__
-            raise InputError(f"{file}: a part of an interrupted run cannot be read ({reason}); {ANEW}") from None
+            raise InputError(
+                f"{file}: a part of an interrupted run cannot be read ({reason}); {ANEW}"
+            ) from None
 
 
 def _digest(key: str, array: NDArray[Any]) -> str:

@@ -81,7 +81,11 @@ def write_npz(stream: BinaryIO, arrays: Mapping[str, Pieces | NDArray[Any]]) -> 
             array = each if isinstance(each, Pieces) else Pieces.of(np.asarray(each))
             # With a name instead of a file, all members get the same date.
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                header = {"descr": npy.dtype_to_descr(array.dtype), "fortran_order": False, "shape": array.shape}
+                header = {
+                    "descr": npy.dtype_to_descr(array.dtype),
+                    "fortran_order": False,
+                    "shape": array.shape,
+                }
                 npy.write_array_header_1_0(member, header)
                 for block in array.blocks():
                     member.write(block)
@@ -123,7 +127,9 @@ class NpzFile(ExitStack):
     """
 
     def __init__(self, file: Path, names: Collection[str], cure: str) -> None:
-        """Only arrays in `names` are read. InputError with the `cure` if the file cannot be opened."""
+        """Only arrays in `names` are read. InputError with the `cure` if the file cannot be
+        opened.
+        """
         super().__init__()
         self.file, self._cure = file, cure
         self._open: dict[str, _Member] = {}
@@ -171,7 +177,9 @@ class NpzFile(ExitStack):
             if len(index) == 0:
                 return array
             if index[-1] >= member.shape[0]:
-                raise ValueError(f"{name} has {member.shape[0]} rows, but row {index[-1]} was requested")
+                raise ValueError(
+                    f"{name} has {member.shape[0]} rows, but row {index[-1]} was requested"
+                )
             step = max(1, PIECE // max(member.row_bytes, 1))
             for first in range(int(index[0]), int(index[-1]) + 1, step):
                 count = min(step, int(index[-1]) + 1 - first)
@@ -195,8 +203,12 @@ class NpzFile(ExitStack):
             if dtype.kind not in "biufU":
                 raise ValueError(f"{info.filename} holds {dtype}, neither numbers nor text")
             if stream.tell() + math.prod(shape) * dtype.itemsize != info.file_size:
-                raise ValueError(f"{info.filename} is {shape}, which does not fit its {info.file_size} bytes")
-            self._open[name] = _Member(stream, stream.tell(), shape, dtype, fortran and len(shape) > 1)
+                raise ValueError(
+                    f"{info.filename} is {shape}, which does not fit its {info.file_size} bytes"
+                )
+            self._open[name] = _Member(
+                stream, stream.tell(), shape, dtype, fortran and len(shape) > 1
+            )
         return self._open[name]
 
     @contextmanager
@@ -209,7 +221,8 @@ class NpzFile(ExitStack):
         except Exception as error:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise InputError(
-                f"{self.file}: cannot be read as an .npz file without pickled objects ({reason}); {self._cure}"
+                f"{self.file}: cannot be read as an .npz file without pickled objects "
+                f"({reason}); {self._cure}"
             ) from None
 
 
@@ -217,7 +230,8 @@ def read_npy_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[
     """Shape, whether in Fortran order, and type of an array in NumPy's format; its values follow in
     the stream.
 
-    ValueError for other versions of the format than 1.0 and 2.0; NumPy raises many others for a damaged header.
+    ValueError for other versions of the format than 1.0 and 2.0; NumPy raises many others for a
+    damaged header.
     """
     version = npy.read_magic(stream)
     if version not in _HEADERS:
@@ -247,7 +261,9 @@ def _check_members(members: Sequence[zipfile.ZipInfo], size: int) -> None:
         raise ValueError("an array occurs twice")
     total = sum(member.file_size for member in members)
     if total > max(SMALL_BYTES, MOST_PACKED * size):
-        raise ValueError(f"its arrays would be {total >> 20} MiB large, {total // max(size, 1)} times the file")
+        raise ValueError(
+            f"its arrays would be {total >> 20} MiB large, {total // max(size, 1)} times the file"
+        )
 
 
 def _with_letters(name: str, array: NDArray[Any]) -> NDArray[Any]:
@@ -255,7 +271,9 @@ def _with_letters(name: str, array: NDArray[Any]) -> NDArray[Any]:
     printing.
     """
     if array.dtype.kind == "U" and array.size > 0 and array.dtype.itemsize > 0:
-        letters = np.frombuffer(array.tobytes(), np.dtype(np.uint32).newbyteorder(array.dtype.byteorder))
+        letters = np.frombuffer(
+            array.tobytes(), np.dtype(np.uint32).newbyteorder(array.dtype.byteorder)
+        )
         if np.any((letters > 0x10FFFF) | ((letters >= 0xD800) & (letters < 0xE000))):
             raise ValueError(f"{name}.npy holds invalid characters")
     return array

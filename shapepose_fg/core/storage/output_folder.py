@@ -15,7 +15,9 @@ _LOCK = ".lock"
 
 
 def prepare_output(folder: Path, names: Iterable[str] = ()) -> None:
-    """Make the folder, and test whether the files `names` can be written there; InputError if not."""
+    """Make the folder, and test whether the files `names` can be written there; InputError if
+    not.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder) as trial:
@@ -26,7 +28,9 @@ def prepare_output(folder: Path, names: Iterable[str] = ()) -> None:
     for name in names:
         if (folder / name).exists() and not (folder / name).is_file():
             what = "folder" if (folder / name).is_dir() else "pipe"
-            raise InputError(f"{folder / name}: this is a {what}, but a file must be written here; move it")
+            raise InputError(
+                f"{folder / name}: this is a {what}, but a file must be written here; move it"
+            )
 
 
 @contextmanager
@@ -49,7 +53,8 @@ def only_run_in(folder: Path, names: Iterable[str]) -> Iterator[None]:
         number = file.read_text().strip() if file.is_file() else ""
         whose = f" (process {number})" if number.isdecimal() else ""
         raise InputError(
-            f"{folder}: another run writes its results here{whose}; wait for it, or give another --output"
+            f"{folder}: another run writes its results here{whose}; wait for it, or give another "
+            "--output"
         ) from None
     try:
         file.write_text(f"{os.getpid()}\n")

@@ -17,7 +17,8 @@ from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.storage.npz import Pieces
 
 _ALLOWED = {"i": "iu", "u": "iu", "f": "f", "U": "U", "b": "b"}
-"""NumPy type kinds that are accepted for each kind of a column: integers, floats, text, booleans."""
+"""NumPy type kinds that are accepted for each kind of a column: integers, floats, text,
+booleans."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,9 @@ class Column:
 
     def shape(self, sizes: dict[str, int]) -> tuple[int, ...]:
         """Shape of the array for given lengths of the letters."""
-        return tuple(sizes.get(each, 0) if isinstance(each, str) else each for each in self._lengths)
+        return tuple(
+            sizes.get(each, 0) if isinstance(each, str) else each for each in self._lengths
+        )
 
     def checked(self, name: str, value: Any, sizes: dict[str, int]) -> NDArray[Any]:
         """Convert `value` to an array of the column's type; ValueError naming the column if shape
@@ -95,7 +98,9 @@ class Column:
             raise ValueError(f"{name} must not be negative, got {array.min()}")
         largest = max(np.fmax.reduce(array, axis=None), -np.fmin.reduce(array, axis=None))
         if largest > self.most:
-            raise ValueError(f"{name} must be at most {self.most:g} or unknown (NaN), got {largest:g}")
+            raise ValueError(
+                f"{name} must be at most {self.most:g} or unknown (NaN), got {largest:g}"
+            )
 
 
 def checked_columns(
@@ -113,7 +118,9 @@ def columns_of(kind: type) -> dict[str, Column]:
     """The columns of a table class, by the names of its fields, in their order."""
     hints = get_type_hints(kind, include_extras=True)
     marks = {name: getattr(hint, "__metadata__", ()) for name, hint in hints.items()}
-    return {name: mark for name, found in marks.items() for mark in found if isinstance(mark, Column)}
+    return {
+        name: mark for name, found in marks.items() for mark in found if isinstance(mark, Column)
+    }
 
 
 class Table(Rows):
@@ -151,7 +158,9 @@ class Table(Rows):
         columns = columns_of(cls)
         values = {name: columns[name].checked(name, value, sizes) for name, value in shared.items()}
         sizes["N"] = 0
-        rows = {name: np.zeros(columns[name].shape(sizes), columns[name].dtype) for name in cls.ROWS}
+        rows = {
+            name: np.zeros(columns[name].shape(sizes), columns[name].dtype) for name in cls.ROWS
+        }
         return cls(**values, **rows)
 
     @classmethod
@@ -177,13 +186,22 @@ class Table(Rows):
     def columns(self) -> dict[str, Pieces]:
         """The arrays of a file: columns with rows, shared columns, and meanings of codes."""
         stored = {name: column.stored for name, column in columns_of(type(self)).items()}
-        own = {name: Pieces.of(getattr(self, name), stored[name]) for name in (*self.ROWS, *self.shared())}
+        own = {
+            name: Pieces.of(getattr(self, name), stored[name])
+            for name in (*self.ROWS, *self.shared())
+        }
         return own | {name: Pieces.of(words) for name, words in self.meanings().items()}
 
     @classmethod
     def meanings(cls) -> dict[str, NDArray[np.str_]]:
-        """Meanings of codes, as arrays for readers of the file: `gate_names` for the column `gate`."""
-        coded = {name: column.codes for name, column in columns_of(cls).items() if column.codes is not None}
+        """Meanings of codes, as arrays for readers of the file: `gate_names` for the column
+        `gate`.
+        """
+        coded = {
+            name: column.codes
+            for name, column in columns_of(cls).items()
+            if column.codes is not None
+        }
         return {f"{name}_names": code_names(codes) for name, codes in coded.items()}
 
 

@@ -16,7 +16,8 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import read_json, write_content
 
 Figures = dict[str, Any]
-"""Figures of a case: numbers and texts by name, None if there is nothing to measure; saved as JSON."""
+"""Figures of a case: numbers and texts by name, None if there is nothing to measure; saved as
+JSON."""
 
 _POOLED = {"mean": np.average, "least": np.min, "most": np.max, "sum": np.sum}
 
@@ -42,7 +43,8 @@ class Column:
     decimals: int = 1
     """Number of digits after the point."""
     pool: Literal["mean", "least", "most", "sum"] = "mean"
-    """How the figures of a row's cases are combined. Shares of joints of a class are weighted by their count."""
+    """How the figures of a row's cases are combined. Shares of joints of a class are weighted by
+    their count."""
 
     def cell(self, cases: Sequence[Figures]) -> str:
         """Text in a row of these cases; a dash if none has the figure."""
@@ -53,7 +55,9 @@ class Column:
         if self.pool != "mean":
             return f"{_POOLED[self.pool](values):.{self.decimals}f}"
         count = f"joints_{self.figure.partition('_inside_')[0].removesuffix('_log_score')}"
-        weights = [case[count] for case in those] if all(case.get(count) for case in those) else None
+        weights = (
+            [case[count] for case in those] if all(case.get(count) for case in those) else None
+        )
         return f"{np.average(values, weights=weights):.{self.decimals}f}"
 
 
@@ -69,7 +73,8 @@ class Experiment:
     name: str
     """Name in the table's marks in the documentation."""
     rows: Mapping[str, Sequence[Case]]
-    """For each row, its name and the cases that are combined in it; a case may be in several rows."""
+    """For each row, its name and the cases that are combined in it; a case may be in several
+    rows."""
     columns: Sequence[Column]
     """Columns of the table after the first, which has the names of the rows."""
 
@@ -78,12 +83,16 @@ class Experiment:
         """Every case once, in the order of measurement. ValueError for two with one name."""
         every = list({id(case): case for row in self.rows.values() for case in row}.values())
         if len({case.name for case in every}) < len(every):
-            raise ValueError(f"{self.name}: two cases have one name: {sorted(case.name for case in every)}")
+            raise ValueError(
+                f"{self.name}: two cases have one name: {sorted(case.name for case in every)}"
+            )
         return every
 
     def only(self, wanted: Callable[[str], bool]) -> "Experiment":
         """Return the experiment with only those cases for which `wanted(name)` is true."""
-        rows = {label: [case for case in row if wanted(case.name)] for label, row in self.rows.items()}
+        rows = {
+            label: [case for case in row if wanted(case.name)] for label, row in self.rows.items()
+        }
         return replace(self, rows={label: row for label, row in rows.items() if len(row) > 0})
 
     def table(self, figures: Mapping[str, Figures]) -> list[str]:
@@ -94,12 +103,18 @@ class Experiment:
         ]
         for label, row in self.rows.items():
             those = [figures[case.name] for case in row]
-            lines.append(f"| {label} | {' | '.join(column.cell(those) for column in self.columns)} |")
+            lines.append(
+                f"| {label} | {' | '.join(column.cell(those) for column in self.columns)} |"
+            )
         return lines
 
 
 def measured(
-    experiment: Experiment, folder: Path, *, afresh: bool = False, told: Callable[[str], None] = print
+    experiment: Experiment,
+    folder: Path,
+    *,
+    afresh: bool = False,
+    told: Callable[[str], None] = print,
 ) -> tuple[dict[str, Figures], float]:
     """The figures of every case by name, and the total computing time in seconds, summed over
     interrupted runs.
@@ -109,14 +124,18 @@ def measured(
     """
     figures, seconds = dict[str, Figures](), 0.0
     for case in experiment.cases:
-        file = folder.joinpath(*(re.sub(r"[^A-Za-z0-9.+-]+", "_", each.name) for each in (experiment, case)))
+        file = folder.joinpath(
+            *(re.sub(r"[^A-Za-z0-9.+-]+", "_", each.name) for each in (experiment, case))
+        )
         file = file.with_name(f"{file.name}.json")
         if afresh or not file.is_file():
             began = time.perf_counter()
             found = {"figures": case.measure(), "seconds": time.perf_counter() - began}
             write_content(file, json.dumps(found, indent=1) + "\n")
             told(f"  {experiment.name}: {case.name}, {found['seconds']:.0f} s")
-        kept = read_json(file)  # after a round trip through JSON, so that a resumed run has equal values
+        kept = read_json(
+            file
+        )  # after a round trip through JSON, so that a resumed run has equal values
         try:
             figures[case.name] = dict(kept["figures"])
             seconds += float(kept["seconds"])

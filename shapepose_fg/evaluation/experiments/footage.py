@@ -32,12 +32,14 @@ ZHANG = {
     "Zhang et al. 2020, with time": (99.47, 99.47, 96.45, 98.46),
     "Zhang et al. 2020, without time": (96.34, 92.11, 96.13, 94.86),
 }
-"""The best other method: scores of its published results on these frames and detections, actors 1 to 3 and
-average."""
+"""The best other method: scores of its published results on these frames and detections, actors 1
+to 3 and average."""
 
 
 def shelf_footage(folder: Path) -> tuple[Rig, DetectionTable]:
-    """Shelf from its folder in the repository of Zhang et al. 2020. InputError for other folders."""
+    """Shelf from its folder in the repository of Zhang et al. 2020. InputError for other
+    folders.
+    """
     rig = read_rig(folder / "calibration.json")
     return rig, read_detections(folder, rig)
 
@@ -57,7 +59,9 @@ def shelf(scale: Scale) -> Experiment:
     if (folder := scale.recording("shelf")) is not None and not scale.quick:
         rows = {name: [Case(name, partial(_scores, folder, name))] for name in _SHELF}
         for name, (*actors, average) in ZHANG.items():
-            figures = {f"actor_{n}": value for n, value in enumerate(actors, 1)} | {"average": average}
+            figures = {f"actor_{n}": value for n, value in enumerate(actors, 1)} | {
+                "average": average
+            }
             rows[name] = [Case(name, partial(dict, figures))]
     return Experiment("shelf", rows, SHELF_COLUMNS)
 
@@ -69,9 +73,14 @@ def views(scale: Scale) -> Experiment:
     rows = {}
     if (folder := scale.recording("shelf")) is not None:
         names = shelf_footage(folder)[0].names
-        rows = {name: [Case(name, partial(_view, folder, scale.quick, n))] for n, name in enumerate(names)}
+        rows = {
+            name: [Case(name, partial(_view, folder, scale.quick, n))]
+            for n, name in enumerate(names)
+        }
     headings = (("inside the 95 % region, %", "inside"), ("of its candidates", "of", 0))
-    return Experiment("views", rows, columns(*headings, ("joints that the others do not place", "unmatched", 0)))
+    return Experiment(
+        "views", rows, columns(*headings, ("joints that the others do not place", "unmatched", 0))
+    )
 
 
 @cache
@@ -100,7 +109,11 @@ def _score(folder: Path, name: str) -> ShelfScore:
 
 def _scores(folder: Path, name: str) -> Figures:
     score = _score(folder, name)
-    shares = {"average": score.pcp_average, "pooled": score.pcp_pooled, "recall": 100 * score.recall}
+    shares = {
+        "average": score.pcp_average,
+        "pooled": score.pcp_pooled,
+        "recall": 100 * score.recall,
+    }
     actors = {f"actor_{actor + 1}": float(score.pcp[actor]) for actor in ACTORS}
     return actors | shares | {"mpjpe_mm": score.mpjpe_mm, "found": score.people_found}
 

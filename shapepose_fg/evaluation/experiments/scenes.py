@@ -1,4 +1,6 @@
-"""Simulated scenes reconstructed and scored against the truth: segments, and the tables of people over time."""
+"""Simulated scenes reconstructed and scored against the truth: segments, and the tables of people
+over time.
+"""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -24,7 +26,8 @@ SEGMENTS: dict[Split, dict[str, tuple[int, int]]] = {
     "report": {"salsa": (108, 618), "crossing": (0, 726), "crowd": (0, 826)},
     "tune": {"salsa": (0, 564), "crossing": (0, 564), "crowd": (241, 900)},
 }
-"""First frames of the segments of the named sequences; each segment has 300 frames without a cut."""
+"""First frames of the segments of the named sequences; each segment has 300 frames without a
+cut."""
 RECORDINGS = ("shelf", "cmu_mocap")
 """Folders of the recordings and of the recorded motions for experiments."""
 QUICK_FRAMES = 4
@@ -88,7 +91,8 @@ class Scale:
     """Size of the measurement, and its data."""
 
     quick: bool = False
-    """A few frames of the built-in scene instead of all segments: a test of all steps, in two minutes."""
+    """A few frames of the built-in scene instead of all segments: a test of all steps, in two
+    minutes."""
     data: Path | None = None
     """Folder with the `RECORDINGS`. None: there are none."""
     split: Split = "report"
@@ -103,7 +107,9 @@ class Scale:
             return (Segment("demo", range(QUICK_FRAMES)),)
         every = SEGMENTS[self.split].items() if self.mocap is not None else ()
         begins = ((name, start) for name, starts in every for start in starts)
-        return tuple(Segment(name, range(n, n + 300), self.split, mocap=self.mocap) for name, n in begins)
+        return tuple(
+            Segment(name, range(n, n + 300), self.split, mocap=self.mocap) for name, n in begins
+        )
 
     def recording(self, name: str) -> Path | None:
         """The folder of one of the `RECORDINGS`; None if it is missing."""
@@ -143,19 +149,20 @@ FRAME_BY_FRAME = replace(OVER_TIME, temporal=False)
 MODES = {"over time": OVER_TIME, "frame by frame": FRAME_BY_FRAME}
 
 COLUMNS = columns(
-    ("F1", "f1"), ("recall", "recall"), ("IDF1", "idf1"), ("MPJPE", "mpjpe_mm"), ("accel", "acceleration_error"),
-    ("FP", "false_positives", 0), ("missed", "people_missed", 0), ("switches", "switches", 0),
-    ("wrist", "fast_wrist_error_mm"), ("body", "body_mpjpe_mm"), ("b accel", "body_acceleration_error"),
-    ("50 %", "seen_inside_50"), ("95 %", "seen_inside_95"), ("u", "joints_unseen", 0),
-    ("u 50 %", "unseen_inside_50"), ("u 95 %", "unseen_inside_95"), ("v", "velocity_error", 2),
-    ("v 95 %", "velocity_inside_95"), ("ms", "cpu_ms", 0),
+    ("F1", "f1"), ("recall", "recall"), ("IDF1", "idf1"), ("MPJPE", "mpjpe_mm"),
+    ("accel", "acceleration_error"), ("FP", "false_positives", 0), ("missed", "people_missed", 0),
+    ("switches", "switches", 0), ("wrist", "fast_wrist_error_mm"), ("body", "body_mpjpe_mm"),
+    ("b accel", "body_acceleration_error"), ("50 %", "seen_inside_50"), ("95 %", "seen_inside_95"),
+    ("u", "joints_unseen", 0), ("u 50 %", "unseen_inside_50"), ("u 95 %", "unseen_inside_95"),
+    ("v", "velocity_error", 2), ("v 95 %", "velocity_inside_95"), ("ms", "cpu_ms", 0),
 )  # fmt: skip
 """Columns of the tables: lengths in mm, accelerations in m/s², velocities in m/s, `u`: joints that
 no view has seen for ten frames; ms: processor time per frame. Means over segments."""
 CLASSES = {"seen": "2 views", "one_view": "1", "no_view": "0", "unseen": "0 for ten frames"}
 THERE_COLUMNS = columns(
-    ("F1, mean", "f1", 2), ("least", "f1", 2, "least"), ("IDF1, mean", "idf1", 2), ("least", "idf1", 2, "least"),
-    ("missed", "people_missed", 0, "sum"), ("of", "people", 0, "sum"), ("FP", "false_positives", 0, "sum"),
+    ("F1, mean", "f1", 2), ("least", "f1", 2, "least"), ("IDF1, mean", "idf1", 2),
+    ("least", "idf1", 2, "least"), ("missed", "people_missed", 0, "sum"),
+    ("of", "people", 0, "sum"), ("FP", "false_positives", 0, "sum"),
     ("longest", "longest_false_positive", 0, "most"), ("ms", "cpu_ms", 0),
 ) + tuple(
     column
@@ -172,7 +179,9 @@ SECONDS, RATES, CAMERAS = 4.0, (10, 15, 20, 30, 60), (2, 3, 4, 6)
 
 
 def measure(segment: Segment, config: PipelineConfig) -> Figures:
-    """`TrackingScore.as_dict` of a segment, the number of people over all frames, and `cpu_ms` a frame."""
+    """`TrackingScore.as_dict` of a segment, the number of people over all frames, and `cpu_ms` a
+    frame.
+    """
     detections = segment.detections
     began = time.process_time()
     people = segment.reconstruct(config)
@@ -193,7 +202,9 @@ def with_mean(cases: Sequence[Case], label: str = "**mean**") -> dict[str, list[
 
 def in_time(scale: Scale) -> Experiment:
     """All segments, with `temporal = true`."""
-    return Experiment("time", with_mean([case(each.label, each) for each in scale.segments]), COLUMNS)
+    return Experiment(
+        "time", with_mean([case(each.label, each) for each in scale.segments]), COLUMNS
+    )
 
 
 def held_back(scale: Scale) -> Experiment:
@@ -213,8 +224,13 @@ def held_back(scale: Scale) -> Experiment:
 
 def held_back_segments(mocap: Path) -> list[Segment]:
     """The segments of `held_back`, from the recorded motions in a file."""
-    learnt_from = frozenset(subject for subject in Mocap.load(mocap).subjects if split_of(subject) != "test")
-    made = {name: replace(SEQUENCES[name], seed=HELD_BACK_SEED, without=learnt_from) for name in HELD_BACK}
+    learnt_from = frozenset(
+        subject for subject in Mocap.load(mocap).subjects if split_of(subject) != "test"
+    )
+    made = {
+        name: replace(SEQUENCES[name], seed=HELD_BACK_SEED, without=learnt_from)
+        for name in HELD_BACK
+    }
     return [
         Segment(name, range(start, start + 300), seed=HELD_BACK_SEED, made=made[name], mocap=mocap)
         for name, start in HELD_BACK.items()
@@ -225,8 +241,9 @@ def who_is_there(scale: Scale) -> Experiment:
     """Crowds of eight people and crossings of seven with 2 to 8 cameras, at 10 to 60 frames a
     second; and two people.
 
-    A row for each kind of recording, over its seeds, and for each number of cameras. Eight cameras, two people and
-    single frames are measured at 30 frames a second only: single frames are independent of the rate.
+    A row for each kind of recording, over its seeds, and for each number of cameras. Eight cameras,
+    two people and single frames are measured at 30 frames a second only: single frames are
+    independent of the rate.
     """
     rows, of_cameras = dict[str, list[Case]](), dict[str, list[Case]]()
     for (name, cameras, rate), drawn in _crowds(scale).items():
@@ -234,7 +251,9 @@ def who_is_there(scale: Scale) -> Experiment:
             if not config.temporal and rate != 30:
                 continue
             kind = f"{cameras} cameras {rate} Hz" + ("" if config.temporal else f", {mode}")
-            cases = [case(f"{name} {seed} {kind}", segment, config) for seed, segment in drawn.items()]
+            cases = [
+                case(f"{name} {seed} {kind}", segment, config) for seed, segment in drawn.items()
+            ]
             rows[f"{name}, {kind}"] = cases
             if config.temporal:
                 of_cameras.setdefault(f"**all, {cameras} cameras**", []).extend(cases)
@@ -244,13 +263,19 @@ def who_is_there(scale: Scale) -> Experiment:
 def _crowds(scale: Scale) -> Mapping[tuple[str, int, int], Mapping[int, Segment]]:
     """Recordings by name, cameras and frames a second, and by seed."""
     seeds = scale.seeds[:1] if scale.quick else scale.seeds
-    made = {(name, seed): replace(SEQUENCES[name], seed=seed) for name in ("crowd", "crossing") for seed in seeds}
+    made = {
+        (name, seed): replace(SEQUENCES[name], seed=seed)
+        for name in ("crowd", "crossing")
+        for seed in seeds
+    }
     kinds = [*((cameras, rate) for cameras in CAMERAS for rate in RATES), (8, 30)]
     found: dict[tuple[str, int, int], dict[int, Segment]] = {}
     for (name, seed), config in made.items() if not scale.quick and scale.mocap is not None else ():
         for cameras, rate in kinds:
             span = range(round(SECONDS * rate))
-            drawn = Segment(name, span, scale.split, cameras, seed, made=config, fps=rate, mocap=scale.mocap)
+            drawn = Segment(
+                name, span, scale.split, cameras, seed, made=config, fps=rate, mocap=scale.mocap
+            )
             found.setdefault((name, cameras, rate), {})[seed] = drawn
     frames = range(QUICK_FRAMES if scale.quick else round(SECONDS * 30))
     two = Segment("demo", frames, cameras=2, people=2, fps=30)

@@ -12,7 +12,14 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.lens import Lens
 from shapepose_fg.core.storage.files import LARGE, read_text
 from shapepose_fg.io.calibration.content import Content
-from shapepose_fg.io.calibration.written import Format, WrittenCamera, WrittenRig, intrinsics, pose, rotation_of
+from shapepose_fg.io.calibration.written import (
+    Format,
+    WrittenCamera,
+    WrittenRig,
+    intrinsics,
+    pose,
+    rotation_of,
+)
 from shapepose_fg.io.validation import is_number
 
 FILES = ("cameras.txt", "images.txt")
@@ -34,8 +41,10 @@ MODELS: dict[str, tuple[str, Lens]] = {
 """COLMAP's camera models that OpenCV supports, with their parameters (distortion coefficients in
 OpenCV's order) and lens model."""
 _CURES = {
-    "unit": "pass --unit (a model has no scale until colmap model_aligner or known distances between cameras"
-    " determine one)",
+    "unit": (
+        "pass --unit (a model has no scale until colmap model_aligner or known distances between "
+        "cameras determine one)"
+    ),
     "up": "pass --up with the axis of the model that points up",
 }
 
@@ -43,7 +52,9 @@ _CURES = {
 def _read(content: Content) -> WrittenRig | None:
     """A camera per image, in the order of images.txt; named after the image or its folder."""
     folder = content.path if content.syntax == "folder" else content.path.parent
-    names = [path.name for path in content.value] if content.syntax == "folder" else [content.path.name]
+    names = (
+        [path.name for path in content.value] if content.syntax == "folder" else [content.path.name]
+    )
     if content.syntax not in ("folder", "text") or not set(names) & {*FILES, *_BINARY}:
         return None
     for name, binary in zip(FILES, _BINARY, strict=True):
@@ -51,7 +62,8 @@ def _read(content: Content) -> WrittenRig | None:
             cure = "copy it into the same folder"
             if (folder / binary).is_file():
                 cure = (
-                    f"{binary} is COLMAP's binary format: convert it with colmap model_converter --output_type TXT"
+                    f"{binary} is COLMAP's binary format: convert it with colmap model_converter "
+                    "--output_type TXT"
                 )
             raise InputError(f"{folder / name}: this file of COLMAP's model is missing; {cure}")
     return WrittenRig(_images(folder / FILES[1], _lenses(folder / FILES[0])), None, None, _CURES)
@@ -70,7 +82,9 @@ def _lenses(path: Path) -> dict[str, WrittenCamera]:
         model = words[1] if len(words) > 1 else ""
         if model not in MODELS:
             known = " ".join(MODELS)
-            raise InputError(f"{place}: camera model {model or 'missing'} is not supported; use one of {known}")
+            raise InputError(
+                f"{place}: camera model {model or 'missing'} is not supported; use one of {known}"
+            )
         parameters, lens = MODELS[model]
         names = parameters.split()
         width, height, *values = _numbers(words[2:], 2 + len(names), place)
@@ -78,7 +92,9 @@ def _lenses(path: Path) -> dict[str, WrittenCamera]:
         fx, fy = (given.get(focal, given.get("f", 0.0)) for focal in ("fx", "fy"))
         K = intrinsics(fx, fy, given["cx"] - HALF_PIXEL, given["cy"] - HALF_PIXEL)
         distortion = values[names.index("cy") + 1 :]
-        lenses[words[0]] = WrittenCamera("", K, np.eye(4), (round(width), round(height)), distortion, lens)
+        lenses[words[0]] = WrittenCamera(
+            "", K, np.eye(4), (round(width), round(height)), distortion, lens
+        )
     return lenses
 
 
@@ -95,7 +111,8 @@ def _images(path: Path, lenses: dict[str, WrittenCamera]) -> list[WrittenCamera]
             points, text = next(lines, (0, ""))
             if len(text.split()) % 3 != 0 or not all(is_number(word) for word in text.split()):
                 problem = (
-                    f"line {points}: must hold the points of the image in the line before, three numbers each"
+                    f"line {points}: must hold the points of the image in the line before, three "
+                    "numbers each"
                 )
                 raise InputError(f"{path}: {problem}; leave an empty line if it has none")
     names = _names([words[9] if len(words) == 10 else "" for _, words in rows])
@@ -103,7 +120,9 @@ def _images(path: Path, lenses: dict[str, WrittenCamera]) -> list[WrittenCamera]
     for (number, words), name in zip(rows, names, strict=True):
         place = f"{path}: line {number}"
         if len(words) != 10 or words[8] not in lenses:
-            raise InputError(f"{place}: must hold id, quaternion, translation, camera id and name; export again")
+            raise InputError(
+                f"{place}: must hold id, quaternion, translation, camera id and name; export again"
+            )
         qw, qx, qy, qz, *t = _numbers(words[1:8], 7, place)
         wTc = pose(rotation_of([qx, qy, qz, qw], "QW QX QY QZ", place), t, "QW QX QY QZ", place)
         cameras.append(replace(lenses[words[8]], name=name, wTc=wTc))
@@ -122,7 +141,9 @@ def _names(files: Sequence[str]) -> list[str]:
 
 def _numbers(words: Sequence[str], count: int, place: str) -> list[float]:
     if len(words) != count or not all(map(is_number, words)):
-        raise InputError(f"{place}: must hold {count} finite numbers, got {len(words)} values; export it again")
+        raise InputError(
+            f"{place}: must hold {count} finite numbers, got {len(words)} values; export it again"
+        )
     return [float(word) for word in words]
 
 

@@ -30,7 +30,9 @@ from shapepose_fg.core.storage.files import (
 Syntax = Literal["JSON", "TOML", "XML", "OpenCV", "YAML", "text", "folder", "pickle"]
 """Syntax of a file; "OpenCV" is the YAML or XML of its FileStorage."""
 
-_TOML_LINE = re.compile(r"""\s*(\[\[?\s*[\w."' -]*[A-Za-z_."'][\w."' -]*\]\]?\s*(#.*)?$|[\w."'-]+\s*=)""")
+_TOML_LINE = re.compile(
+    r"""\s*(\[\[?\s*[\w."' -]*[A-Za-z_."'][\w."' -]*\]\]?\s*(#.*)?$|[\w."'-]+\s*=)"""
+)
 _YAML_LINE = re.compile(r"\s*(- )?[\w/.\"' -]+:(\s|$)")
 _MOST_OF_A_LINE = 1000
 """Number of characters that are used to recognise the syntax; the time of the patterns is quadratic
@@ -58,18 +60,28 @@ class Content:
 
 
 def load(path: Path) -> Content:
-    """Recognise the syntax of the file at `path`, and parse it; InputError naming the line that is wrong."""
+    """Recognise the syntax of the file at `path`, and parse it; InputError naming the line that is
+    wrong.
+    """
     if path.is_dir():
-        return Content(path, "folder", sorted(each for each in path.iterdir() if not each.name.startswith(".")))
+        return Content(
+            path, "folder", sorted(each for each in path.iterdir() if not each.name.startswith("."))
+        )
     if read_bytes(path, MIDDLE)[:1] == b"\x80":
         return Content(path, "pickle", None)
     text = read_text(path, most=MIDDLE)
-    lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    lines = [
+        line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")
+    ]
     first = lines[0][:_MOST_OF_A_LINE] if lines else ""
     if first.lstrip().startswith("<"):
         root = _parse_xml(path, text)
         storage = root.tag == "opencv_storage"
-        return Content(path, "OpenCV", _named(path, _of_xml(root))) if storage else Content(path, "XML", root)
+        return (
+            Content(path, "OpenCV", _named(path, _of_xml(root)))
+            if storage
+            else Content(path, "XML", root)
+        )
     if first.startswith("%YAML:") or "!!opencv-" in text:
         return Content(path, "OpenCV", _named(path, _parse_yaml(path, text)))
     if _TOML_LINE.match(first):
@@ -84,7 +96,9 @@ def load(path: Path) -> Content:
 def _named(path: Path, value: Any) -> dict[str, Any]:
     """All nodes of a FileStorage, by name."""
     if not isinstance(value, dict):
-        raise InputError(f"{path}: this OpenCV FileStorage has no named values; write the file again")
+        raise InputError(
+            f"{path}: this OpenCV FileStorage has no named values; write the file again"
+        )
     return {str(key): each for key, each in value.items()}
 
 
@@ -102,14 +116,17 @@ def _parse_yaml(path: Path, text: str) -> Any:
     except (yaml.YAMLError, RecursionError, ValueError, TypeError, OverflowError) as error:
         mark = getattr(error, "problem_mark", None)
         line = f"line {mark.line + 1} column {mark.column + 1}" if mark is not None else "the file"
-        raise InputError(f"{path}: {line} is not YAML; correct it or write the file again") from None
+        raise InputError(
+            f"{path}: {line} is not YAML; correct it or write the file again"
+        ) from None
     return bounded(documents[0], path) if documents else None
 
 
 def _refuse_long(path: Path, text: str) -> None:
     if len(text) > _MOST_CHARACTERS:
         raise InputError(
-            f"{path}: the file has {len(text)} characters, too many for a calibration; check the path"
+            f"{path}: the file has {len(text)} characters, too many for a calibration; check the "
+            "path"
         )
 
 
@@ -122,7 +139,9 @@ def _refuse_hostile(path: Path, text: str) -> None:
         line = f"{path}: line {event.start_mark.line + 1}"
         if isinstance(event, yaml.AliasEvent):
             raise InputError(f"{line} refers to a node by *name; write it out")
-        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(
+            event, yaml.CollectionEndEvent
+        )
         if depth > MOST_DEPTH:
             raise InputError(f"{line}: nodes are over {MOST_DEPTH} deep; write the file again")
 
@@ -132,7 +151,9 @@ def _parse_xml(path: Path, text: str) -> ET.Element:
     expand without limit.
     """
     if _XML_DECLARATION.search(text):
-        raise InputError(f"{path}: XML with a document type or entities is not accepted; delete the <!DOCTYPE")
+        raise InputError(
+            f"{path}: XML with a document type or entities is not accepted; delete the <!DOCTYPE"
+        )
     _refuse_long(path, text)
     try:
         root = ET.fromstring(text)
@@ -165,7 +186,9 @@ def _array_of_yaml(loader: Any, node: yaml.Node) -> Any:
 
 def _short_number(loader: Any, node: yaml.ScalarNode) -> Any:
     if len(node.value) > _MOST_DIGITS:
-        raise yaml.constructor.ConstructorError(problem="a number is too long", problem_mark=node.start_mark)
+        raise yaml.constructor.ConstructorError(
+            problem="a number is too long", problem_mark=node.start_mark
+        )
     make = loader.construct_yaml_int if node.tag.endswith("int") else loader.construct_yaml_float
     return make(node)
 
@@ -173,7 +196,9 @@ def _short_number(loader: Any, node: yaml.ScalarNode) -> Any:
 def _unique_keys(loader: Any, node: yaml.MappingNode) -> Iterator[dict[Any, Any]]:
     keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
     if max(Counter(keys).values(), default=0) > 1:
-        raise yaml.constructor.ConstructorError(problem="a key occurs twice", problem_mark=node.start_mark)
+        raise yaml.constructor.ConstructorError(
+            problem="a key occurs twice", problem_mark=node.start_mark
+        )
     yield from loader.construct_yaml_map(node)
 
 

@@ -19,7 +19,14 @@ from shapepose_fg.core.rig_file import RIG_FORMAT
 from shapepose_fg.core.storage.files import is_inside
 from shapepose_fg.core.trajectory import DRIFT, Trajectory
 from shapepose_fg.io.calibration.content import Content
-from shapepose_fg.io.calibration.written import Format, Node, Unit, WrittenCamera, WrittenRig, intrinsics
+from shapepose_fg.io.calibration.written import (
+    Format,
+    Node,
+    Unit,
+    WrittenCamera,
+    WrittenRig,
+    intrinsics,
+)
 from shapepose_fg.io.trajectories import read_trajectory
 from shapepose_fg.io.validation import describe, validated
 
@@ -29,15 +36,29 @@ _ROTATION = "write the 3x3 camera-from-world rotation row by row"
 _EXTRINSICS = "calibrate the extrinsics of this camera, too, or delete its table"
 _SIZE = "write width and height in pixels"
 _CURES = {
-    **{"K": _MATRIX, "matrix": _MATRIX, "RT": _CAMERA_FROM_WORLD, "cTw": _CAMERA_FROM_WORLD, "R": _ROTATION},
+    **{
+        "K": _MATRIX,
+        "matrix": _MATRIX,
+        "RT": _CAMERA_FROM_WORLD,
+        "cTw": _CAMERA_FROM_WORLD,
+        "R": _ROTATION,
+    },
     **{"bTc": "write the 4x4 carrier-from-camera matrix row by row"},
     **{"wTo": "write the 4x4 matrix from the trajectory's world to the cameras' world, metres"},
-    **{"drift": "write the error of the odometry as a share of the distance travelled, such as 0.01"},
-    **{"T": "write the 3 numbers of the translation", "wTc": "write the 4x4 world-from-camera matrix row by row"},
+    **{"drift": "write the odometry's error as a share of the distance travelled, such as 0.01"},
+    **{
+        "T": "write the 3 numbers of the translation",
+        "wTc": "write the 4x4 world-from-camera matrix row by row",
+    },
     **dict.fromkeys(("rotation", "translation"), _EXTRINSICS),
     **dict.fromkeys(("imgSize", "resolution", "size", "image_size"), _SIZE),
-    **dict.fromkeys(("distCoeff", "dist", "distCoef"), "write at most k1 k2 p1 p2 k3, as OpenCV orders them"),
-    **dict.fromkeys(("distortion", "distortions"), "write k1 k2 p1 p2 k3 as OpenCV does, or k1 to k4 of fisheyes"),
+    **dict.fromkeys(
+        ("distCoeff", "dist", "distCoef"), "write at most k1 k2 p1 p2 k3, as OpenCV orders them"
+    ),
+    **dict.fromkeys(
+        ("distortion", "distortions"),
+        "write k1 k2 p1 p2 k3 as OpenCV does, or k1 to k4 of fisheyes",
+    ),
     "lens": "write perspective or fisheye",
 }
 """Advice for error messages, by the name of the value in any of the formats."""
@@ -84,7 +105,8 @@ def _read_rig_file(content: Content) -> WrittenRig | None:
     if content.value["format"] != RIG_FORMAT:
         got = describe(content.value["format"])
         raise InputError(
-            f'{content.path}: format must be "{RIG_FORMAT}", got {got}; this version cannot read others'
+            f'{content.path}: format must be "{RIG_FORMAT}", got {got}; this version cannot read '
+            "others"
         )
     rig = validated(_Rig, content.value, content.path, _CURES)
     cures = {
@@ -97,7 +119,9 @@ def _read_rig_file(content: Content) -> WrittenRig | None:
         given = [key for key in ("wTc", "cTw", "trajectory") if getattr(camera, key) is not None]
         if len(given) != 1 or (camera.bTc is not None and camera.trajectory is None):
             moves = "or, of a moving camera, trajectory and bTc"
-            raise InputError(f"{node.place}: give exactly one of wTc and cTw, {moves}; {_CURES['wTc']}")
+            raise InputError(
+                f"{node.place}: give exactly one of wTc and cTw, {moves}; {_CURES['wTc']}"
+            )
         if camera.trajectory is not None:
             wTc = np.eye(4) if camera.bTc is None else node.pose_of_matrix("bTc")
         else:
@@ -113,7 +137,8 @@ def _trajectory(path: Path, name: str, about: _Trajectory | None) -> Trajectory:
     """Read the trajectory in the file `name` beside the rig file; poses in the world of the rig."""
     if Path(name).is_absolute() or not is_inside(path.parent, name):
         raise InputError(
-            f"{path}: trajectory {name[:80]} must be in the folder of the rig file or below; move it there"
+            f"{path}: trajectory {name[:80]} must be in the folder of the rig file or below; "
+            "move it there"
         )
     about = _Trajectory() if about is None else about
     found = read_trajectory(path.parent / name, name)
@@ -127,14 +152,18 @@ def _read_association(content: Content) -> WrittenRig | None:
     tools are ignored.
     """
     members, known = _members(content).values(), {"K", "RT", "R", "T", "imgSize"}
-    if not all(isinstance(each, dict) for each in members) or not any(known & each.keys() for each in members):
+    if not all(isinstance(each, dict) for each in members) or not any(
+        known & each.keys() for each in members
+    ):
         return None
     cameras = []
     for name, value in content.value.items():
         node = Node(value, f'{content.path}: camera "{name}"', _CURES)
         turned = node.named("RT") is None and node.named("R") is not None
         wTc = node.pose("R", "T") if turned else node.pose_of_rows("RT")
-        cameras.append(node.camera(name, "K", wTc, ["imgSize"], "distCoeff dist distortion", most=5))
+        cameras.append(
+            node.camera(name, "K", wTc, ["imgSize"], "distCoeff dist distortion", most=5)
+        )
     return WrittenRig(cameras, "m", "z")
 
 
@@ -152,9 +181,13 @@ def _read_panoptic(content: Content) -> WrittenRig | None:
             raise node.refuse("name", f"must be text, got {describe(value.get('name'))}")
         wTc = node.pose("R", "t")
         cameras.append(node.camera(value["name"], "K", wTc, ["resolution"], "distCoef", most=5))
-    if "calibDataSource" in content.value or any({"type", "panel", "node"} & each.keys() for each in listed):
+    if "calibDataSource" in content.value or any(
+        {"type", "panel", "node"} & each.keys() for each in listed
+    ):
         return WrittenRig(cameras, "cm", "-y")
-    return WrittenRig(cameras, None, None, {"unit": "pass --unit (CMU Panoptic uses cm)", "up": _UP})
+    return WrittenRig(
+        cameras, None, None, {"unit": "pass --unit (CMU Panoptic uses cm)", "up": _UP}
+    )
 
 
 def _read_voxelpose(content: Content) -> WrittenRig | None:
@@ -172,11 +205,15 @@ def _read_voxelpose(content: Content) -> WrittenRig | None:
         return None
     cameras = []
     for name, camera in value.items():
-        node = Node(camera, f'{content.path}: camera "{name}"', {"": "write it in VoxelPose's format"})
+        node = Node(
+            camera, f'{content.path}: camera "{name}"', {"": "write it in VoxelPose's format"}
+        )
         fx, fy, cx, cy = (float(node.needed(key, 1)[0]) for key in ("fx", "fy", "cx", "cy"))
         (k1, k2, k3), (p1, p2) = node.needed("k", 3).tolist(), node.needed("p", 2).tolist()
         wTc = node.pose("R", "T", centre=True)
-        cameras.append(WrittenCamera(name, intrinsics(fx, fy, cx, cy), wTc, None, [k1, k2, p1, p2, k3]))
+        cameras.append(
+            WrittenCamera(name, intrinsics(fx, fy, cx, cy), wTc, None, [k1, k2, p1, p2, k3])
+        )
     return WrittenRig(cameras, "mm", "z")
 
 
@@ -191,13 +228,17 @@ def _program(tables: Mapping[str, dict[str, Any]], metadata: Mapping[str, Any]) 
     every = list(tables.values())
     if any("cam_id" in table or "port" in table for table in every):
         return "Caliscope"
-    if any(key.startswith(_FREEMOCAP) for key in metadata) or any("world_position" in table for table in every):
+    if any(key.startswith(_FREEMOCAP) for key in metadata) or any(
+        "world_position" in table for table in every
+    ):
         return "FreeMoCap"
     if all(table.get("fisheye") is False for table in every) and all(
         list(table)[-1] == "fisheye" or _floats(table.get("size")) for table in every
     ):
         return "Pose2Sim"
-    called = all(_CALISCOPE_KEY.fullmatch(key) and table.get("name") == key for key, table in tables.items())
+    called = all(
+        _CALISCOPE_KEY.fullmatch(key) and table.get("name") == key for key, table in tables.items()
+    )
     return "Caliscope" if called and metadata == {"adjusted": False, "error": 0.0} else "AniPose"
 
 
@@ -207,7 +248,8 @@ def _floats(value: Any) -> bool:
 
 _CALISCOPE_KEY = re.compile(r"cam_\d+")
 _FREEMOCAP = ("charuco_", "freemocap", "groundplane_", "solver_method", "board")
-"""Prefixes of names in [metadata] that only FreeMoCap writes; the last three since its version 2."""
+"""Prefixes of names in [metadata] that only FreeMoCap writes; the last three since its version
+2."""
 
 
 def _said_by_freemocap(metadata: Mapping[str, Any]) -> tuple[Unit | None, Axis | None]:
@@ -216,22 +258,30 @@ def _said_by_freemocap(metadata: Mapping[str, Any]) -> tuple[Unit | None, Axis |
     """
     board = metadata.get("board")
     sizes = [*metadata, *(board if isinstance(board, dict) else ())]
-    grounded = any(metadata.get(key) is True for key in ("groundplane_applied", "groundplane_calibration"))
-    return ("mm" if any(key.endswith("_length_mm") for key in sizes) else None), ("z" if grounded else None)
+    grounded = any(
+        metadata.get(key) is True for key in ("groundplane_applied", "groundplane_calibration")
+    )
+    return ("mm" if any(key.endswith("_length_mm") for key in sizes) else None), (
+        "z" if grounded else None
+    )
 
 
 def _tables(value: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """The tables of cameras in a TOML file, by key."""
     inner = value.get("cameras")
     every = inner if isinstance(inner, dict) else value
-    return {key: table for key, table in every.items() if isinstance(table, dict) and "matrix" in table}
+    return {
+        key: table for key, table in every.items() if isinstance(table, dict) and "matrix" in table
+    }
 
 
 def wanted_tables(value: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """The tables of cameras that are read: without ignored ones, and, if any camera has a pose,
     only those with a pose.
     """
-    tables = {key: table for key, table in _tables(value).items() if table.get("ignore") is not True}
+    tables = {
+        key: table for key, table in _tables(value).items() if table.get("ignore") is not True
+    }
     return {key: table for key, table in tables.items() if _POSE & table.keys()} or tables
 
 

@@ -13,7 +13,14 @@ from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.lens import Lens
 from shapepose_fg.io.calibration.content import Content, load
-from shapepose_fg.io.calibration.written import Format, Node, WrittenCamera, WrittenRig, pose, rotation_of
+from shapepose_fg.io.calibration.written import (
+    Format,
+    Node,
+    WrittenCamera,
+    WrittenRig,
+    pose,
+    rotation_of,
+)
 
 _FISHEYE = 1
 """OpenCV's CALIB_MODEL_FISHEYE."""
@@ -30,10 +37,20 @@ _EASYMOCAP = {"": "write it with EasyMocap again"}
 
 _STEREO = {"": "save it as OpenCV's stereo_calib sample does"}
 _HALF = "this is only one file of OpenCV's stereo calibration"
-_STEREO_UP = "pass the axis of the first camera that points up with --up; it is -y if that camera was level"
+_STEREO_UP = (
+    "pass the axis of the first camera that points up with --up; it is -y if that camera was level"
+)
 _SIDES = (("1", "2"), ("left", "right"), ("l", "r"), ("0", "1"))
 _MATRICES = ("m", "k", "cameramatrix", "camera_matrix", "mtx", "intrinsic", "intrinsic_matrix")
-_BENDS = ("d", "distcoeffs", "dist_coeffs", "distortion_coefficients", "distortion", "dist", "distcoeff")
+_BENDS = (
+    "d",
+    "distcoeffs",
+    "dist_coeffs",
+    "distortion_coefficients",
+    "distortion",
+    "dist",
+    "distcoeff",
+)
 """Lower-case names of the distortion coefficients of a stereo pair."""
 _GAP = ("none", "null", "")
 """Names that EasyMocap uses for empty places in its list of cameras."""
@@ -51,7 +68,11 @@ POSE = "camera_pose_matrix"
 
 def _loaded(content: Content, suffixes: str) -> dict[Path, Content]:
     """The files of a folder with these suffixes."""
-    return {path: load(path) for path in content.value if path.suffix in suffixes.split() and path.is_file()}
+    return {
+        path: load(path)
+        for path in content.value
+        if path.suffix in suffixes.split() and path.is_file()
+    }
 
 
 def _read_multiview(content: Content) -> WrittenRig | None:
@@ -66,7 +87,10 @@ def _read_multiview(content: Content) -> WrittenRig | None:
     if count == 0 or len(flat) != 9 * count:
         raise nodes.refuse("Ks", "must hold 9 numbers per camera")
     Ks = flat.reshape(count, 3, 3)
-    Rs, Ts = nodes.needed("Rs", 9 * count, 3 * count).reshape(count, -1), nodes.needed("Ts", 3 * count)
+    Rs, Ts = (
+        nodes.needed("Rs", 9 * count, 3 * count).reshape(count, -1),
+        nodes.needed("Ts", 3 * count),
+    )
     sizes = nodes.needed("image_sizes", 2 * count).reshape(count, 2)
     models, ids = nodes.numbers("models", count), content.value.get("cam_ids")
     fisheye = np.zeros(count, dtype=bool) if models is None else models == _FISHEYE
@@ -76,7 +100,8 @@ def _read_multiview(content: Content) -> WrittenRig | None:
     plain = (len(numbers) - 4 * fisheye.sum()) / max(1, (~fisheye).sum())
     if plain != int(plain) or plain < 0:
         raise nodes.refuse(
-            "distortions", f"must hold the same number of values for every camera, got {len(numbers)}"
+            "distortions",
+            f"must hold the same number of values for every camera, got {len(numbers)}",
         )
     ends = np.cumsum(np.where(fisheye, 4, int(plain)))
     names = ids.split(",") if isinstance(ids, str) else []
@@ -84,10 +109,14 @@ def _read_multiview(content: Content) -> WrittenRig | None:
     cameras = []
     for index, coefficients in enumerate(np.split(numbers, ends[:-1])):
         lens: Lens = "fisheye" if fisheye[index] else "perspective"
-        wTc = pose(Rs[index], Ts.reshape(count, 3)[index], "Rs", f'{content.path}: camera "{names[index]}"')
+        wTc = pose(
+            Rs[index], Ts.reshape(count, 3)[index], "Rs", f'{content.path}: camera "{names[index]}"'
+        )
         width, height = sizes[index].tolist()
         size = round(width), round(height)
-        cameras.append(WrittenCamera(names[index], Ks[index], wTc, size, coefficients.tolist(), lens))
+        cameras.append(
+            WrittenCamera(names[index], Ks[index], wTc, size, coefficients.tolist(), lens)
+        )
     return WrittenRig(cameras, None, None, _ASK)
 
 
@@ -102,14 +131,22 @@ def _read_stereo(content: Content) -> WrittenRig | None:
     values, places = dict[str, Any](), [content.path]
     if content.syntax in ("OpenCV", "YAML", "JSON") and isinstance(content.value, dict):
         values = {str(key).lower(): each for key, each in content.value.items()}
-        halves = [path for path in content.path.parent.glob("*.y*ml") if re.match("(in|ex)trinsics?$", path.stem)]
+        halves = [
+            path
+            for path in content.path.parent.glob("*.y*ml")
+            if re.match("(in|ex)trinsics?$", path.stem)
+        ]
         places += [path for path in halves if path.name != content.path.name and len(halves) == 2]
         places = places if content.path in halves else places[:1]
     elif content.syntax == "folder":
-        places = [path for path in content.value if re.match(r"(in|ex)trinsics?\.(ya?ml|xml)$", path.name)]
+        places = [
+            path for path in content.value if re.match(r"(in|ex)trinsics?\.(ya?ml|xml)$", path.name)
+        ]
     for path in places if content.syntax == "folder" else places[1:]:
         half = load(path).value
-        values |= {str(key).lower(): each for key, each in half.items()} if isinstance(half, dict) else {}
+        values |= (
+            {str(key).lower(): each for key, each in half.items()} if isinstance(half, dict) else {}
+        )
     sides = next((each for each in _SIDES if _of_side(values, _MATRICES, each[0])), None)
     where = str(content.path)
     if sides is None or not _of_side(values, _MATRICES, sides[1]):
@@ -119,10 +156,16 @@ def _read_stereo(content: Content) -> WrittenRig | None:
     node = Node(values, where, _STEREO)
     if node.named("r") is None or node.named("t") is None:
         raise InputError(f"{where}: {_HALF}; put extrinsics.yml with R and T beside it")
-    size = [["image_size", "imagesize", "img_size"]] if node.named("image_size imagesize img_size") else _SIZE
+    size = (
+        [["image_size", "imagesize", "img_size"]]
+        if node.named("image_size imagesize img_size")
+        else _SIZE
+    )
     cameras = []
     for side, wTc in zip(sides, (np.eye(4), node.pose("r", "t")), strict=True):
-        K, bend = (_of_side(values, names, side) or names[0] + side for names in (_MATRICES, _BENDS))
+        K, bend = (
+            _of_side(values, names, side) or names[0] + side for names in (_MATRICES, _BENDS)
+        )
         cameras.append(node.camera(side, [K], wTc, size, [bend]))
     note = f"OpenCV's stereo calibration: the cameras are named {sides[0]} and {sides[1]}"
     return WrittenRig(cameras, None, None, _ASK | {"up": _STEREO_UP}, notes=[note])
@@ -141,7 +184,9 @@ def _read_nodes(content: Content) -> WrittenRig | None:
         files = _loaded(content, ".yml .yaml .xml").values()
         nodes = {each.path.stem: each.value if each.syntax == "OpenCV" else None for each in files}
     known = {
-        name: node for name, node in nodes.items() if isinstance(node, dict) and Node(node, "").named(INTRINSIC)
+        name: node
+        for name, node in nodes.items()
+        if isinstance(node, dict) and Node(node, "").named(INTRINSIC)
     }
     if content.syntax != "OpenCV" and (len(known) == 0 or len(known) < len(nodes)):
         return None
@@ -151,7 +196,9 @@ def _read_nodes(content: Content) -> WrittenRig | None:
         if node.named(POSE) is not None:
             wTc = node.pose_of_matrix(POSE)
         elif node.named(TURN) is None or node.named(SHIFT) is None:
-            raise InputError(f"{node.place}: R and T, the camera's pose, are missing; {_ONE_CAMERA}")
+            raise InputError(
+                f"{node.place}: R and T, the camera's pose, are missing; {_ONE_CAMERA}"
+            )
         else:
             wTc = node.pose(TURN, SHIFT)
         fisheye = values.get("distortion_type") == 1 or values.get("fisheye") in (1, "true")
@@ -161,8 +208,12 @@ def _read_nodes(content: Content) -> WrittenRig | None:
         named = " ".join(list(content.value)[:5]) or "nothing"
         if Node(content.value, "").named(INTRINSIC) is not None:
             what = "this file has the intrinsics of one camera only"
-            raise InputError(f"{content.path}: {what}; {_ONE_CAMERA}, for example a file per camera with R and T")
-        raise InputError(f"{content.path}: there is no camera with a pose, only {named}; {_ONE_CAMERA}")
+            raise InputError(
+                f"{content.path}: {what}; {_ONE_CAMERA}, for example a file per camera with R and T"
+            )
+        raise InputError(
+            f"{content.path}: there is no camera with a pose, only {named}; {_ONE_CAMERA}"
+        )
     return WrittenRig(cameras, None, None, _ASK)
 
 
@@ -180,7 +231,9 @@ def _read_easymocap(content: Content) -> WrittenRig | None:
     values = [content.value] if content.syntax == "OpenCV" else []
     values += [load(path).value for path in halves_of] if content.syntax == "folder" else []
     named = any(isinstance(value, dict) and "names" in value for value in values)
-    if len(halves_of) == 0 or not (named or any(path.stem in ("intri", "extri") for path in halves_of)):
+    if len(halves_of) == 0 or not (
+        named or any(path.stem in ("intri", "extri") for path in halves_of)
+    ):
         return None
     one = halves_of[0]
     halves = []
@@ -189,7 +242,9 @@ def _read_easymocap(content: Content) -> WrittenRig | None:
         one.with_name(one.name.replace("intri", "extri")),
     ):
         if not path.is_file():
-            raise InputError(f"{path}: this file of EasyMocap's calibration is missing; put both into one folder")
+            raise InputError(
+                f"{path}: this file of EasyMocap's calibration is missing; put both into one folder"
+            )
         value = load(path).value
         halves.append(Node(value if isinstance(value, dict) else {}, str(path), _EASYMOCAP))
     inner, outer = halves
@@ -197,7 +252,9 @@ def _read_easymocap(content: Content) -> WrittenRig | None:
     if not isinstance(names, list) or not all(isinstance(name, str | int | None) for name in names):
         raise inner.refuse("names", "must be a list of the cameras' names")
     # EasyMocap marks gaps in its list of cameras with this name, and ignores them.
-    wanted = [str(name) for name in names if str(name).lower() not in _GAP or _named(inner, str(name))]
+    wanted = [
+        str(name) for name in names if str(name).lower() not in _GAP or _named(inner, str(name))
+    ]
     cameras = []
     for number, name in enumerate(wanted, 1):
         # EasyMocap writes K_<name>; Pose2Sim's writer numbers the cameras from 1.
@@ -218,13 +275,18 @@ _LENSES: dict[str, Lens] = {
     **dict.fromkeys(("equidistant", "fisheye"), "fisheye"),
 }
 """ROS distortion models that OpenCV supports."""
-_POSE_CURE = "write <camera>_pose.yaml with translation and rotation (x y z w) of the optical frame in the world"
+_POSE_CURE = (
+    "write <camera>_pose.yaml with translation and rotation (x y z w) of the optical frame in "
+    "the world"
+)
 
 
 def is_info(value: Any) -> bool:
     """Whether the content is a file of ROS camera_calibration, or an echoed CameraInfo message."""
     known = isinstance(value, dict)
-    return known and ("camera_matrix" in value or {"distortion_model", "height", "width"} <= value.keys())
+    return known and (
+        "camera_matrix" in value or {"distortion_model", "height", "width"} <= value.keys()
+    )
 
 
 def _read_ros(content: Content) -> WrittenRig | None:
@@ -233,15 +295,23 @@ def _read_ros(content: Content) -> WrittenRig | None:
     `<camera>.yaml` is camera_info. `<camera>_pose.yaml` is a Pose, PoseStamped, Transform or
     TransformStamped: the pose of the camera's optical frame in the world (world from camera).
     """
-    if content.syntax == "YAML" and (is_info(content.value) or message_of(content.value) is not None):
+    if content.syntax == "YAML" and (
+        is_info(content.value) or message_of(content.value) is not None
+    ):
         what = "the intrinsics" if is_info(content.value) else "the pose"
         cure = "give the folder with <camera>.yaml and <camera>_pose.yaml of every camera"
         raise InputError(f"{content.path}: this file has {what} of one camera of ROS only; {cure}")
     files = _loaded(content, ".yaml .yml") if content.syntax == "folder" else {}
-    values: dict[Path, Any] = {path: each.value if each.syntax == "YAML" else None for path, each in files.items()}
+    values: dict[Path, Any] = {
+        path: each.value if each.syntax == "YAML" else None for path, each in files.items()
+    }
     if not any(map(is_info, values.values())):
         return None
-    poses = {path.stem.removesuffix("_pose"): path for path, value in values.items() if not is_info(value)}
+    poses = {
+        path.stem.removesuffix("_pose"): path
+        for path, value in values.items()
+        if not is_info(value)
+    }
     cameras = []
     for path, value in values.items():
         if not is_info(value):
@@ -254,14 +324,18 @@ def _read_ros(content: Content) -> WrittenRig | None:
         model = str(value.get("distortion_model", ""))
         if model not in _LENSES:
             raise InputError(
-                f"{path}: distortion_model {model} is not supported; use plumb_bob, rational_polynomial or"
-                " equidistant"
+                f"{path}: distortion_model {model} is not supported; use plumb_bob, "
+                "rational_polynomial or equidistant"
             )
         # A matrix is a list of values, or an object with the list under `data`.
-        plain = {key: each.get("data") if isinstance(each, dict) else each for key, each in value.items()}
+        plain = {
+            key: each.get("data") if isinstance(each, dict) else each for key, each in value.items()
+        }
         node = Node(plain, str(path), {"": "run the calibration again"})
         size = "image_width width", "image_height height"
-        found = node.camera(name, "camera_matrix k K", wTc, size, "distortion_coefficients d D", _LENSES[model])
+        found = node.camera(
+            name, "camera_matrix k K", wTc, size, "distortion_coefficients d D", _LENSES[model]
+        )
         cameras.append(found)
     return WrittenRig(cameras, "m", "z")
 
@@ -274,8 +348,8 @@ def _ros_pose(path: Path, value: Any) -> Array:
     child = str(value.get("child_frame_id", ""))
     if child and "optical" not in child:
         raise InputError(
-            f"{path}: child_frame_id {child} is not an optical frame (x right, y down, z forward); give the"
-            f" pose of the optical frame, such as {child}_optical_frame"
+            f"{path}: child_frame_id {child} is not an optical frame (x right, y down, z "
+            f"forward); give the pose of the optical frame, such as {child}_optical_frame"
         )
 
     def of(part: Any, word: str, axes: str) -> list[float]:
@@ -283,7 +357,9 @@ def _ros_pose(path: Path, value: Any) -> Array:
         return [float(node.needed(axis, 1)[0]) for axis in axes]
 
     t, q = of(message[0], "translation", "xyz"), of(message[1], "rotation", "xyzw")
-    return pose(rotation_of(q, "rotation", str(path)), t, "rotation", str(path), world_from_camera=True)
+    return pose(
+        rotation_of(q, "rotation", str(path)), t, "rotation", str(path), world_from_camera=True
+    )
 
 
 def message_of(value: Any) -> tuple[Any, Any] | None:

@@ -58,8 +58,8 @@ def read_rig(
     content = load(path)
     if content.syntax == "pickle":
         raise InputError(
-            f"{path}: this is a Python pickle (as OpenCap writes), which could run any program when opened; if"
-            " you trust it, convert it to a rig file as in docs/conventions.md"
+            f"{path}: this is a Python pickle (as OpenCap writes), which could run any program "
+            "when opened; if you trust it, convert it to a rig file as in docs/conventions.md"
         )
     if (known := recognised(content)) is None:
         raise InputError(_unknown(content))
@@ -73,7 +73,9 @@ def read_rig(
     up, unit = up or written.up, unit or written.unit
     sizes_missing = any(camera.image_size is None for camera in written.cameras)
     if image_size is not None and not sizes_missing:
-        raise InputError(f"{path}: this format ({form.name}) contains the picture sizes; leave out --image-size")
+        raise InputError(
+            f"{path}: this format ({form.name}) contains the picture sizes; leave out --image-size"
+        )
     given = {"unit": unit, "up": up, "image_size": image_size if sizes_missing else True}
     missing = [name for name, value in given.items() if value is None]
     if up is None or unit is None or missing:
@@ -81,11 +83,15 @@ def read_rig(
         names = f"{' and '.join(missing)} {'is' if len(missing) == 1 else 'are'}"
         raise InputError(f"{path}: recognised as {form.name}, where {names} missing; {cures}")
     with naming(path):
-        finished = tuple(camera.finished(METRES[unit], image_size, path) for camera in written.cameras)
+        finished = tuple(
+            camera.finished(METRES[unit], image_size, path) for camera in written.cameras
+        )
         carriers = {camera.carrier for camera in finished}
         trajectories = tuple(each for each in written.trajectories if each.name in carriers)
         notes = tuple(f"{path}: {each}" for each in written.notes)
-        return carried(Rig(finished, up, trajectories=trajectories, notes=notes, unwanted=tuple(unwanted)))
+        return carried(
+            Rig(finished, up, trajectories=trajectories, notes=notes, unwanted=tuple(unwanted))
+        )
 
 
 def recognised(content: Content) -> tuple[Format, WrittenRig] | None:
@@ -101,7 +107,10 @@ def carried(rig: Rig) -> Rig:
     if not rig.moves:
         return rig
     first = {each.name: each.wTb[0] for each in rig.trajectories}
-    cameras = (replace(each, wTc=first[each.carrier] @ each.bTc) if each.carrier else each for each in rig.cameras)
+    cameras = (
+        replace(each, wTc=first[each.carrier] @ each.bTc) if each.carrier else each
+        for each in rig.cameras
+    )
     return replace(rig, cameras=tuple(cameras))
 
 
@@ -117,8 +126,13 @@ def with_trajectories(rig: Rig, given: Sequence[str]) -> Rig:
         if name not in cameras or not file:
             cure = f"write CAMERA=FILE with one of {listing(list(rig.names))}"
             raise InputError(f"--trajectory {each[:80]}: must name a camera and a file; {cure}")
-        if cameras[name].carrier or any(file == other.partition("=")[2] for other in given if other is not each):
-            cure = 'give the pose of each camera on its carrier in a rig file, with "trajectory" and "bTc"'
+        if cameras[name].carrier or any(
+            file == other.partition("=")[2] for other in given if other is not each
+        ):
+            cure = (
+                'give the pose of each camera on its carrier in a rig file, with "trajectory" '
+                'and "bTc"'
+            )
             raise InputError(
                 f"--trajectory {each[:80]}: a camera can have one trajectory, and it belongs to"
                 f" this camera only; {cure}"
@@ -126,7 +140,9 @@ def with_trajectories(rig: Rig, given: Sequence[str]) -> Rig:
         trajectories.append(read_trajectory(file, name))
         cameras[name] = replace(cameras[name], carrier=name, bTc=np.eye(4))
     with naming("--trajectory"):
-        return carried(replace(rig, cameras=tuple(cameras.values()), trajectories=tuple(trajectories)))
+        return carried(
+            replace(rig, cameras=tuple(cameras.values()), trajectories=tuple(trajectories))
+        )
 
 
 @np.errstate(over="ignore", invalid="ignore")
@@ -149,8 +165,9 @@ def _unknown(content: Content) -> str:
     value = content.value
     if content.syntax == "folder":
         return (
-            f"{content.path}: this is a folder; give the file inside it, or the folder with the files of"
-            f" EasyMocap, COLMAP or ROS; it contains {listing([path.name for path in value])}"
+            f"{content.path}: this is a folder; give the file inside it, or the folder with the "
+            "files of EasyMocap, COLMAP or ROS; it contains "
+            f"{listing([path.name for path in value])}"
         )
     about = f"<{value.tag}>" if hasattr(value, "tag") else describe(value)
     if isinstance(value, dict):
@@ -158,6 +175,6 @@ def _unknown(content: Content) -> str:
     found = content.syntax if content.syntax == "text" else f"{content.syntax} ({about})"
     known = ", ".join(form.name for form in FORMATS)
     return (
-        f"{content.path}: recognised as {found}, but this is not a known calibration format; give one of"
-        f" {known} (docs/conventions.md)"
+        f"{content.path}: recognised as {found}, but this is not a known calibration format; "
+        f"give one of {known} (docs/conventions.md)"
     )

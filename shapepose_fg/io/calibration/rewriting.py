@@ -63,8 +63,15 @@ def _qualisys(content: Content, rig: Rig, metres: float) -> Files:
     for element, camera in zip(chosen(content.value, *QTM_CAMERAS), rig.cameras, strict=True):
         scale = scale_of(element)
         window = element.find("fov_video")
-        first = [float("nan") if window is None else float(window.get(side, "nan")) for side in ("left", "top")]
-        _set(element.find("transform"), "r11 r12 r13 r21 r22 r23 r31 r32 r33", TO_OPENCV @ camera.cTw[:, :3])
+        first = [
+            float("nan") if window is None else float(window.get(side, "nan"))
+            for side in ("left", "top")
+        ]
+        _set(
+            element.find("transform"),
+            "r11 r12 r13 r21 r22 r23 r31 r32 r33",
+            TO_OPENCV @ camera.cTw[:, :3],
+        )
         _set(element.find("transform"), "x y z", camera.centre / metres)
         inner, K = element.find("intrinsic"), camera.K / scale
         _set(inner, "focalLengthU focalLengthV", SUBPIXEL * K[[0, 1], [0, 1]])
@@ -86,7 +93,9 @@ def _vicon(content: Content, rig: Rig, metres: float) -> Files:
         frame.set("POSITION", _numbers(camera.centre / metres))
         words = frame.get("VICON_RADIAL2", "").split()
         if len(words) >= 3:  # a name, a centre, and radial coefficients
-            frame.set("VICON_RADIAL2", " ".join([*words[:3], _numbers(camera.distortion[[0, 1, 4]])]))
+            frame.set(
+                "VICON_RADIAL2", " ".join([*words[:3], _numbers(camera.distortion[[0, 1, 4]])])
+            )
     return {content.path: ET.tostring(content.value, encoding="unicode")}
 
 
@@ -119,7 +128,9 @@ def _matrices_of_xml(text: str, value: Callable[[tuple[str, ...], int], ArrayLik
 
     def fill(element: ET.Element, keys: tuple[str, ...]) -> None:
         for child in element:
-            data = child.find("data") if str(child.get("type_id", "")).startswith("opencv-") else None
+            data = (
+                child.find("data") if str(child.get("type_id", "")).startswith("opencv-") else None
+            )
             if data is None:
                 fill(child, (*keys, child.tag))
                 continue
@@ -137,9 +148,17 @@ def numbers_of(name: str, camera: Camera, metres: float, count: int) -> ArrayLik
     R, cTw, wTc = camera.cTw[:, :3], camera.cTw.copy(), camera.wTc.copy()
     cTw[:, 3] /= metres
     wTc[:3, 3] /= metres
-    kinds = {f"{INTRINSIC} matrix": camera.K, TURN: R if count == 9 else cv2.Rodrigues(R)[0], SHIFT: cTw[:, 3]}
+    kinds = {
+        f"{INTRINSIC} matrix": camera.K,
+        TURN: R if count == 9 else cv2.Rodrigues(R)[0],
+        SHIFT: cTw[:, 3],
+    }
     kinds |= {"RT cTw": cTw, f"{POSE} wTc": wTc}
-    kinds |= {f"{BEND} distortion distortions distCoeff distCoef": np.r_[camera.distortion, np.zeros(14)][:count]}
+    kinds |= {
+        f"{BEND} distortion distortions distCoeff distCoef": np.r_[camera.distortion, np.zeros(14)][
+            :count
+        ]
+    }
     return next((each for names, each in kinds.items() if name in names.split()), None)
 
 
@@ -159,7 +178,10 @@ def _opencv(content: Content, rig: Rig, metres: float) -> Files:
         if whose in cameras or key not in of_all:
             return numbers_of(key, cameras[whose], metres, count) if whose in cameras else None
         # Four coefficients per fisheye camera, and an equal number for each other camera.
-        kind, four = of_all[key], [key == "distortions" and camera.lens == "fisheye" for camera in rig.cameras]
+        kind, four = (
+            of_all[key],
+            [key == "distortions" and camera.lens == "fisheye" for camera in rig.cameras],
+        )
         each, rest = divmod(count - 4 * sum(four), max(V - sum(four), 1))
         counts = zip(rig.cameras, [4 if short else each for short in four], strict=True)
         numbers = [numbers_of(kind.split()[0], camera, metres, own) for camera, own in counts]
@@ -171,7 +193,9 @@ def _opencv(content: Content, rig: Rig, metres: float) -> Files:
     files = files if whole or content.path in files else {content.path}
     files |= {path for path in beside if path.stem in cameras} if whole else set()
     return {
-        path: _matrices(read_text(path), lambda keys, count, stem=path.stem: value((stem, *keys), count))
+        path: _matrices(
+            read_text(path), lambda keys, count, stem=path.stem: value((stem, *keys), count)
+        )
         for path in sorted(files)
     }
 
@@ -194,10 +218,14 @@ def _ros(content: Content, rig: Rig, metres: float) -> Files:
                 new = next(each for names, each in kinds.items() if key in names.split())
                 old = value[key]["data"] if isinstance(value[key], dict) else value[key]
                 numbers = np.r_[np.ravel(new), np.zeros(14)][: np.size(old)].tolist()
-                value[key] = value[key] | {"data": numbers} if isinstance(value[key], dict) else numbers
+                value[key] = (
+                    value[key] | {"data": numbers} if isinstance(value[key], dict) else numbers
+                )
         elif camera is not None and (parts := message_of(value)) is not None:
             turn = Rotation.from_matrix(camera.wTc[:3, :3]).as_quat()
-            for part, axes, numbers in zip(parts, ("xyz", "xyzw"), (camera.centre / metres, turn), strict=True):
+            for part, axes, numbers in zip(
+                parts, ("xyz", "xyzw"), (camera.centre / metres, turn), strict=True
+            ):
                 part |= dict(zip(axes, numbers.tolist(), strict=True))
         else:
             continue

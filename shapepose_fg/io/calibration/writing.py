@@ -80,10 +80,14 @@ def check_target(source: Path, target: Path) -> None:
     ending, own = target.suffix.lower(), source.suffix.lower()
     same = ending == own or (ending in _YAML and own in _YAML)
     if ending not in ("", ".json") and (several or not same):
-        name = "a folder (without a suffix)" if several else f"FILE{''.join(source.suffixes[-2:]) or '.json'}"
+        name = (
+            "a folder (without a suffix)"
+            if several
+            else f"FILE{''.join(source.suffixes[-2:]) or '.json'}"
+        )
         raise InputError(
-            f"{target}: cameras read as {form.name} can be written as that, or as a rig file; name the output"
-            f" {name} or FILE.json"
+            f"{target}: cameras read as {form.name} can be written as that, or as a rig file; "
+            f"name the output {name} or FILE.json"
         )
 
 
@@ -134,7 +138,9 @@ def _entries(value: Any) -> list[dict[str, Any]]:
     """
     if isinstance(value, dict):
         lists = [
-            each for key, each in value.items() if isinstance(each, list) and (key == "cameras" or len(value) == 1)
+            each
+            for key, each in value.items()
+            if isinstance(each, list) and (key == "cameras" or len(value) == 1)
         ]
         value = lists[0] if lists else list(value.values())
     return value

@@ -141,7 +141,9 @@ class Node:
         """Like `numbers`, but InputError if they are missing."""
         found = self.numbers(names, *counts, most=most)
         if found is None:
-            raise self.refuse(names.split()[0] if isinstance(names, str) else names[0], "is missing")
+            raise self.refuse(
+                names.split()[0] if isinstance(names, str) else names[0], "is missing"
+            )
         return found
 
     def camera(
@@ -186,7 +188,9 @@ class Node:
     def _flat(self, name: str, value: Any) -> Iterator[float]:
         """All numbers in a value; `name` is used in messages."""
         if isinstance(value, list | np.ndarray):
-            for index, each in enumerate(value.tolist() if isinstance(value, np.ndarray) else value):
+            for index, each in enumerate(
+                value.tolist() if isinstance(value, np.ndarray) else value
+            ):
                 yield from self._flat(f"{name}[{index}]", each)
         elif isinstance(value, bool) or not isinstance(value, int | float):
             raise self.refuse(name, f"must be a number, got {describe(value)}")
@@ -197,9 +201,16 @@ class Node:
 
 
 def pose(
-    R: ArrayLike, t: ArrayLike, key: str, place: str, *, world_from_camera: bool = False, centre: bool = False
+    R: ArrayLike,
+    t: ArrayLike,
+    key: str,
+    place: str,
+    *,
+    world_from_camera: bool = False,
+    centre: bool = False,
 ) -> Array:
-    """The world-from-camera matrix (4, 4) of a rotation and a translation (3), or the camera's `centre`.
+    """The world-from-camera matrix (4, 4) of a rotation and a translation (3), or the camera's
+    `centre`.
 
     They are camera-from-world, unless `world_from_camera` is set. `R` is a matrix (nine values in
     any shape, row by row) or a rotation vector (three values, axis-angle). InputError if it is no
@@ -225,7 +236,9 @@ def rotation_of(quaternion: ArrayLike, key: str, place: str) -> Array:
     """The rotation matrix (3, 3) of a quaternion x y z w; InputError if its norm is not 1."""
     length = float(np.sqrt(np.square(quaternion).sum()))
     if not abs(length - 1) <= ROTATION_TOLERANCE:
-        raise InputError(f"{place}: the quaternion {key} must have length 1, got {length:.4g}; write it again")
+        raise InputError(
+            f"{place}: the quaternion {key} must have length 1, got {length:.4g}; write it again"
+        )
     x, y, z, w = np.asarray(quaternion, dtype=np.float64) / length
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + 2 * w * cross + 2 * cross @ cross

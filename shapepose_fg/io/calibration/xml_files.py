@@ -1,4 +1,6 @@
-"""Calibrations in XML, millimetres and z up: Qualisys' .qca.txt, which QTM exports, and Vicon's .xcp."""
+"""Calibrations in XML, millimetres and z up: Qualisys' .qca.txt, which QTM exports, and Vicon's
+.xcp.
+"""
 
 import re
 import xml.etree.ElementTree as ET
@@ -23,13 +25,17 @@ from shapepose_fg.io.camera_names import listing
 from shapepose_fg.io.validation import is_number
 
 _RESOLUTION = "video_resolution"
-_QTM, _NEXUS = "export the calibration from QTM again", "export the calibration from Nexus or Shogun again"
+_QTM, _NEXUS = (
+    "export the calibration from QTM again",
+    "export the calibration from Nexus or Shogun again",
+)
 QTM_CAMERAS, NEXUS_CAMERAS = ("cameras/camera", "model"), ("Camera", "TYPE")
 """XML paths of cameras, and the attribute that identifies video cameras."""
 SUBPIXEL = 64.0
 """Units per pixel of QTM's focal lengths and principal points."""
 _FULL = (1080, 1440, 2160)
-"""Numbers of lines of full sensors in QTM's resolution names; no video camera has a smaller sensor."""
+"""Numbers of lines of full sensors in QTM's resolution names; no video camera has a smaller
+sensor."""
 _CROPPED = 8
 """Largest difference between the number of lines of a picture and that in its resolution's name:
 1080p has 1088 lines."""
@@ -38,16 +44,28 @@ _VIDEO = ("video", "hybrid", "none")
 """Words in the models of video cameras: Miqus Video (Plus), Miqus Hybrid; "none" means unknown."""
 TO_OPENCV = np.diag([1.0, -1.0, -1.0])
 """Conversion from QTM's camera axes (y up, looking along -z) to OpenCV's."""
-DISTORTION = "radialDistortion1 radialDistortion2 tangentalDistortion1 tangentalDistortion2 radialDistortion3"
+DISTORTION = (
+    "radialDistortion1 radialDistortion2 tangentalDistortion1 tangentalDistortion2 "
+    "radialDistortion3"
+)
 
 
 def _cameras(
-    content: Content, root: str, path: str, model: str, name: str, read: Callable[[ET.Element, str], WrittenCamera]
+    content: Content,
+    root: str,
+    path: str,
+    model: str,
+    name: str,
+    read: Callable[[ET.Element, str], WrittenCamera],
 ) -> WrittenRig | None:
     """Read the video cameras if `model` distinguishes them from marker cameras, otherwise all
     cameras.
     """
-    if content.syntax != "XML" or content.value.tag != root or content.value.find(path.split("/")[0]) is None:
+    if (
+        content.syntax != "XML"
+        or content.value.tag != root
+        or content.value.find(path.split("/")[0]) is None
+    ):
         return None
     cameras, used = [], chosen(content.value, path, model)
     notes, unnamed = list[str](), dict[str, list[str]]()
@@ -63,7 +81,11 @@ def _cameras(
         notes.append(f"{_RESOLUTION} is {said!r} of camera {listing(names)}; {size}")
     for camera in content.value.findall(path):
         if camera not in used:
-            why = "it is not calibrated" if _takes_video(camera, model) else "it does not record video"
+            why = (
+                "it is not calibrated"
+                if _takes_video(camera, model)
+                else "it does not record video"
+            )
             kind = f" ({camera.get(model, '')[:40]})" if camera.get(model) else ""
             notes.append(f"camera {camera.get(name, '?')[:40]}{kind} is left out: {why}")
     return WrittenRig(cameras, "mm", "z", notes=notes)
@@ -76,7 +98,9 @@ def _takes_video(camera: ET.Element, model: str) -> bool:
 def chosen(root: ET.Element, path: str, model: str) -> list[ET.Element]:
     """The elements of the cameras that are read."""
     every = root.findall(path)
-    known = [each for each in every if each.get("calibrated", "true") != "false" and len(each) > 0] or every
+    known = [
+        each for each in every if each.get("calibrated", "true") != "false" and len(each) > 0
+    ] or every
     return [each for each in known if _takes_video(each, model)] or known
 
 
@@ -106,7 +130,9 @@ def _qualisys(camera: ET.Element, place: str) -> WrittenCamera:
     # R = diag(1, -1, -1) M; the centre is x y z.
     R = TO_OPENCV @ turn
     wTc = pose(R, values("transform", "x y z"), "transform", place, centre=True)
-    fx, fy, cx, cy = values("intrinsic", "focalLengthU focalLengthV centerPointU centerPointV") / SUBPIXEL
+    fx, fy, cx, cy = (
+        values("intrinsic", "focalLengthU focalLengthV centerPointU centerPointV") / SUBPIXEL
+    )
     scale = scale_of(camera)
     K = intrinsics(fx * scale, fy * scale, (cx - window[0]) * scale, (cy - window[1]) * scale)
     distortion = values("intrinsic", DISTORTION, dict.fromkeys(DISTORTION.split(), 0.0)).tolist()
@@ -124,7 +150,9 @@ def scale_of(camera: ET.Element) -> float:
     named = _LINES.fullmatch(camera.get(_RESOLUTION, ""))
     if named is None:
         return 1.0
-    window, *whole = [_lines(camera, tag) for tag in ("fov_video", "fov_video_max", "fov_marker_max")]
+    window, *whole = [
+        _lines(camera, tag) for tag in ("fov_video", "fov_video_max", "fov_marker_max")
+    ]
     sensor = max([lines for lines in (window, *whole) if lines is not None], default=0.0)
     full, lines = max(each for each in _FULL if each <= max(sensor, _FULL[0])), int(named[1])
     cropped = full > _FULL[0] and window is not None and 0 <= window - lines <= _CROPPED
@@ -134,7 +162,11 @@ def scale_of(camera: ET.Element) -> float:
 def _lines(camera: ET.Element, tag: str) -> float | None:
     """Shorter side of the sensor's region of interest, pixels; None if it is not in the file."""
     found = camera.find(tag)
-    sides = [] if found is None else [found.get(side, "") for side in ("left", "right", "top", "bottom")]
+    sides = (
+        []
+        if found is None
+        else [found.get(side, "") for side in ("left", "right", "top", "bottom")]
+    )
     if len(sides) == 0 or not all(map(is_number, sides)):
         return None
     left, right, top, bottom = map(float, sides)
@@ -147,7 +179,9 @@ def _vicon(camera: ET.Element, place: str) -> WrittenCamera:
     """
     key_frame = camera.find("KeyFrames/KeyFrame")
     if key_frame is None:
-        raise InputError(f"{place}: it has no <KeyFrame>, so it is not calibrated; calibrate or delete it")
+        raise InputError(
+            f"{place}: it has no <KeyFrame>, so it is not calibrated; calibrate or delete it"
+        )
     whole, frame = _node(camera, place, _NEXUS), _node(key_frame, place, _NEXUS)
     width, height = whole.needed("SENSOR_SIZE", 2)
     ratio = whole.numbers("PIXEL_ASPECT_RATIO", 1)
@@ -164,16 +198,25 @@ def _vicon(camera: ET.Element, place: str) -> WrittenCamera:
     # zero.
     name, _, radial = key_frame.get("VICON_RADIAL2", "").strip().partition(" ")
     if name:
-        numbers = _node(ET.Element("", VICON_RADIAL2=radial), place, _NEXUS).needed("VICON_RADIAL2", 5)
+        numbers = _node(ET.Element("", VICON_RADIAL2=radial), place, _NEXUS).needed(
+            "VICON_RADIAL2", 5
+        )
         distortion = [*numbers[2:4], 0.0, 0.0, numbers[4]]
-    elif not all(is_number(word) and float(word) == 0 for word in key_frame.get("VICON_RADIAL", "").split()[-2:]):
+    elif not all(
+        is_number(word) and float(word) == 0
+        for word in key_frame.get("VICON_RADIAL", "").split()[-2:]
+    ):
         cure = "calibrate with Nexus 2 or newer, or undistort the pictures and write 0 0"
         raise InputError(f"{place}: VICON_RADIAL without VICON_RADIAL2 is not supported; {cure}")
-    return WrittenCamera(camera.attrib["DEVICEID"], K, wTc, (round(width), round(height)), distortion)
+    return WrittenCamera(
+        camera.attrib["DEVICEID"], K, wTc, (round(width), round(height)), distortion
+    )
 
 
 QUALISYS = Format(
     "Qualisys' .qca.txt",
     lambda content: _cameras(content, "calibration", *QTM_CAMERAS, "serial", _qualisys),
 )
-VICON = Format("Vicon's .xcp", lambda content: _cameras(content, "Cameras", *NEXUS_CAMERAS, "DEVICEID", _vicon))
+VICON = Format(
+    "Vicon's .xcp", lambda content: _cameras(content, "Cameras", *NEXUS_CAMERAS, "DEVICEID", _vicon)
+)

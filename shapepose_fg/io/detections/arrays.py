@@ -18,7 +18,11 @@ from shapepose_fg.io.detection_table import BLOCK_FRAMES
 from shapepose_fg.io.detections.csv_people import BLAZEPOSE, body_parts, taken
 from shapepose_fg.io.detections.people import CameraPeople, PeopleBlock
 
-_FREEMOCAP, _SLEAP, _DEEPLABCUT = "FreeMoCap's 2D points", "SLEAP's analysis HDF5", "DeepLabCut's HDF5"
+_FREEMOCAP, _SLEAP, _DEEPLABCUT = (
+    "FreeMoCap's 2D points",
+    "SLEAP's analysis HDF5",
+    "DeepLabCut's HDF5",
+)
 _RERUN = "write the detections again, in pixels"
 _MOST_VALUES = 2**29
 """Maximum number of values in a file: as many as one hour of four cameras with MediaPipe's 553
@@ -29,13 +33,19 @@ _TABLE = "df_with_missing/table"
 """Path of the table in files of DeepLabCut and AniPose."""
 _RECORD = np.dtype([("length", "<u4"), ("heap", "<u8"), ("index", "<u4")])
 """HDF5's reference to a text of variable length: its length and its address."""
-_HDF5 = "an HDF5 file, of which only SLEAP's analysis files and DeepLabCut's tables are supported; give the CSV"
+_HDF5 = (
+    "an HDF5 file, of which only SLEAP's analysis files and DeepLabCut's tables are supported; "
+    "give the CSV"
+)
 _FREEMOCAP_3D = (
     "FreeMoCap's table of 3D points, but its 2D points are needed; give the recording's folder, or"
     " output_data/raw_data/..._pixelXY.npy in it"
 )
 _OTHERS = {
-    ".npy": "a NumPy array, of which only FreeMoCap's (cameras, frames, points, 2 or 3) in pixels is supported",
+    ".npy": (
+        "a NumPy array, of which only FreeMoCap's (cameras, frames, points, 2 or 3) in pixels is "
+        "supported"
+    ),
     ".npz": "a NumPy archive, which has no standard layout",
     ".mat": "a MATLAB file, which has no standard layout",
     ".pkl": "a Python pickle, which could run code and is not opened",
@@ -55,7 +65,9 @@ def what_it_is(path: Path) -> str | None:
     """A sentence that identifies an unsupported file and names a way to convert it; None if its
     suffix is unknown.
     """
-    known = next((what for ending, what in _OTHERS.items() if path.name.lower().endswith(ending)), None)
+    known = next(
+        (what for ending, what in _OTHERS.items() if path.name.lower().endswith(ending)), None
+    )
     if known is None:
         return None
     cure = "" if ";" in known else "; convert it to <camera>.json, COCO's keypoint results"
@@ -63,7 +75,8 @@ def what_it_is(path: Path) -> str | None:
 
 
 def read_freemocap(path: Path, camera: int, cameras: int) -> CameraPeople:
-    """Detections of one person in camera number `camera` of `cameras`, in the order of the calibration.
+    """Detections of one person in camera number `camera` of `cameras`, in the order of the
+    calibration.
 
     The file is (cameras, frames, points, 2 or 3): pixels, NaN for points that were not detected. A
     third number is a score if all are between 0 and 1, otherwise MediaPipe's depth, which is
@@ -73,8 +86,8 @@ def read_freemocap(path: Path, camera: int, cameras: int) -> CameraPeople:
         shape, dtype, fortran, offset = _header(path, stream)
         if shape[0] != cameras:
             raise InputError(
-                f"{path}: has {shape[0]} cameras, but {cameras} are expected; give the calibration of the same"
-                " recording, with all cameras in the same order"
+                f"{path}: has {shape[0]} cameras, but {cameras} are expected; give the "
+                "calibration of the same recording, with all cameras in the same order"
             )
         if np.prod(shape, dtype=float) > _MOST_VALUES:
             raise InputError(f"{path}: its arrays {shape} are too large; split the recording")
@@ -86,7 +99,11 @@ def read_freemocap(path: Path, camera: int, cameras: int) -> CameraPeople:
     own = every[camera]
     body = BLAZEPOSE if "mediapipe" in path.name.lower() and shape[2] >= BLAZEPOSE else shape[2]
     third = own[:, :body, 2] if shape[3] == 3 else None
-    scored = third is not None and not ((third < 0) | (third > 1)).any() and bool(np.isfinite(third).any())
+    scored = (
+        third is not None
+        and not ((third < 0) | (third > 1)).any()
+        and bool(np.isfinite(third).any())
+    )
 
     def blocks() -> Iterator[PeopleBlock]:
         for start in range(0, shape[1], BLOCK_FRAMES):
@@ -111,7 +128,9 @@ def _header(path: Path, stream: Any) -> tuple[tuple[int, ...], np.dtype[Any], bo
     """Shape, type and memory order of the array in an .npy file, and the offset of its values."""
     try:
         shape, fortran, dtype = read_npy_header(stream)
-    except Exception:  # NumPy evaluates the header as a Python literal, which raises many kinds of errors
+    except (
+        Exception
+    ):  # NumPy evaluates the header as a Python literal, which raises many kinds of errors
         raise InputError(f"{path}: this is not a NumPy array, but {what_it_is(path)}") from None
     if dtype.hasobject:
         raise InputError(f"{path}: holds Python objects, which could run code; save it as numbers")
@@ -133,10 +152,20 @@ def read_hdf5(path: Path) -> CameraPeople:
         with h5py.File(path, "r") as file:
             table = _dataset(h5py, file, _TABLE)
             return _sleap(path, h5py, file) if table is None else _deeplabcut(path, table)
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError, IndexError) as error:
+    except (
+        OSError,
+        RuntimeError,
+        KeyError,
+        ValueError,
+        TypeError,
+        OverflowError,
+        IndexError,
+    ) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f"{path}: damaged HDF5 ({' '.join(str(error).split())[:100]}); export it again") from None
+        raise InputError(
+            f"{path}: damaged HDF5 ({' '.join(str(error).split())[:100]}); export it again"
+        ) from None
 
 
 def _deeplabcut(path: Path, table: Any) -> CameraPeople:
@@ -148,11 +177,15 @@ def _deeplabcut(path: Path, table: Any) -> CameraPeople:
     known = table.ndim == 1 and not table.dtype.hasobject and "index" in (table.dtype.names or ())
     if not known or any(len(row) not in (3, 4) for row in columns):
         raise InputError(f"{path}: {what_it_is(path)}")
-    joints, picked = body_parts(path, ((row[1] if len(row) == 4 else "", row[-2], row[-1]) for row in columns))
+    joints, picked = body_parts(
+        path, ((row[1] if len(row) == 4 else "", row[-2], row[-1]) for row in columns)
+    )
     _check_size(path, table.size * table.dtype.itemsize / 8, table.shape)
     rows = table[:]
     frame, *blocks = (np.asarray(rows[name]) for name in ("index", *names))
-    values = np.concatenate([np.zeros((len(rows), 1)), *(each.reshape(len(rows), -1) for each in blocks)], axis=1)
+    values = np.concatenate(
+        [np.zeros((len(rows), 1)), *(each.reshape(len(rows), -1) for each in blocks)], axis=1
+    )
     if (
         frame.dtype.kind not in "iu"
         or (np.diff(frame, prepend=-1) <= 0).any()
@@ -161,7 +194,8 @@ def _deeplabcut(path: Path, table: Any) -> CameraPeople:
         raise InputError(f"{path}: frame numbers must be increasing whole numbers; {_RERUN}")
     if len(rows) == 0 or values.shape[1] != 1 + len(columns):
         raise InputError(
-            f"{path}: has {len(rows)} frames, and its columns do not match their names; export it again"
+            f"{path}: has {len(rows)} frames, and its columns do not match their names; export "
+            "it again"
         )
     block = PeopleBlock.dense(frame.astype(np.intp), taken(values.astype(np.float64), picked))
     return CameraPeople(
@@ -201,7 +235,13 @@ def _sleap(path: Path, h5py: Any, file: Any) -> CameraPeople:
     """Read SLEAP's analysis file: each track is one person, and nodes have names."""
     tracks = _dataset(h5py, file, "tracks")
     names = _dataset(h5py, file, "node_names")
-    if tracks is None or names is None or tracks.ndim != 4 or names.ndim != 1 or len(names) > _MOST_NAMES:
+    if (
+        tracks is None
+        or names is None
+        or tracks.ndim != 4
+        or names.ndim != 1
+        or len(names) > _MOST_NAMES
+    ):
         raise InputError(f"{path}: {what_it_is(path)}")
     joints = _names(path, names)
     xy, score = _numbers(path, tracks), None
@@ -213,7 +253,8 @@ def _sleap(path: Path, h5py: Any, file: Any) -> CameraPeople:
     score = np.ones(xy.shape[:3]) if score is None else score
     if xy.shape[3] != 2 or xy.shape[2] != len(joints) or score.shape != xy.shape[:3]:
         raise InputError(
-            f"{path}: tracks are {xy.shape}, but there are {len(joints)} node_names; export it again with SLEAP"
+            f"{path}: tracks are {xy.shape}, but there are {len(joints)} node_names; export it "
+            "again with SLEAP"
         )
     points = np.concatenate([xy, np.where(np.isfinite(score), score, 1.0)[..., None]], axis=3)
     parts = (slice(start, start + BLOCK_FRAMES) for start in range(0, len(points), BLOCK_FRAMES))
@@ -227,7 +268,9 @@ def _dataset(h5py: Any, file: Any, name: str) -> Any:
     """
     found = file
     for part in name.split("/"):
-        if not isinstance(found, h5py.Group) or not isinstance(found.get(part, getlink=True), h5py.HardLink):
+        if not isinstance(found, h5py.Group) or not isinstance(
+            found.get(part, getlink=True), h5py.HardLink
+        ):
             return None
         found = found[part]
     if not isinstance(found, h5py.Dataset) or found.is_virtual or found.external:
@@ -247,7 +290,9 @@ def _names(path: Path, names: Any) -> tuple[str, ...]:
     with open_regular(path) as stream:
         stream.seek(begin)
         records = np.frombuffer(stream.read(len(names) * _RECORD.itemsize), dtype=_RECORD)
-        return tuple(_from_heap(stream, *map(int, record)).decode("utf-8") for record in records.tolist())
+        return tuple(
+            _from_heap(stream, *map(int, record)).decode("utf-8") for record in records.tolist()
+        )
 
 
 def _from_heap(stream: BinaryIO, length: int, address: int, index: int) -> bytes:
@@ -285,4 +330,6 @@ def _numbers(path: Path, dataset: Any) -> Array:
 def _check_size(path: Path, count: float, shape: tuple[int, ...]) -> None:
     """InputError if the file is too small for this number of values."""
     if 8 * count > max(SMALL_BYTES, MOST_PACKED * path.stat().st_size):
-        raise InputError(f"{path}: its arrays {shape} are too large; export a part of the recording")
+        raise InputError(
+            f"{path}: its arrays {shape} are too large; export a part of the recording"
+        )

@@ -1,7 +1,7 @@
 """The detection text of 4D Association: joint candidates of one camera, with part affinities.
 
-Zhang et al., "4D Association Graph for Realtime Multi-person Motion Capture", CVPR 2020. The file is a
-stream of numbers; docs/conventions.md gives their order.
+Zhang et al., "4D Association Graph for Realtime Multi-person Motion Capture", CVPR 2020. The file
+is a stream of numbers; docs/conventions.md gives their order.
 """
 
 from collections.abc import Iterator
@@ -24,7 +24,16 @@ from shapepose_fg.proposal.assignment import match_best_first
 _SPACE = " \n\t"
 """Characters at which pieces of text end, so that no number, multi-byte character or line end is
 split."""
-SKELETON_TYPES = ("SKEL19", "SKEL17", "SKEL15", "COCO18", "BODY25", "OPTITRACK21", "SHELF15", "MPIIHAND21")
+SKELETON_TYPES = (
+    "SKEL19",
+    "SKEL17",
+    "SKEL15",
+    "COCO18",
+    "BODY25",
+    "OPTITRACK21",
+    "SHELF15",
+    "MPIIHAND21",
+)
 """Names of the format's skeleton types, by number."""
 
 
@@ -37,7 +46,8 @@ class TextSkeleton:
     number: int
     """Number of the skeleton in the file's first line."""
     joints: tuple[str, ...]
-    """The joints with candidates in the file, in order; these are the first joints of `skeleton`."""
+    """The joints with candidates in the file, in order; these are the first joints of
+    `skeleton`."""
     limbs: tuple[tuple[int, int], ...]
     """The limbs with affinities in the file, in order."""
     skeleton: Skeleton
@@ -51,7 +61,9 @@ class TextSkeleton:
         return table
 
 
-_COCO_LIMBS = "1-8 8-9 9-10 1-11 11-12 12-13 1-2 2-3 3-4 2-16 1-5 5-6 6-7 5-17 1-0 0-14 0-15 14-16 15-17"
+_COCO_LIMBS = (
+    "1-8 8-9 9-10 1-11 11-12 12-13 1-2 2-3 3-4 2-16 1-5 5-6 6-7 5-17 1-0 0-14 0-15 14-16 15-17"
+)
 
 TEXT_SKELETONS = {
     each.skeleton.name: each
@@ -138,7 +150,9 @@ class NumberStream:
         return values
 
     def _line(self, index: int | None) -> int:
-        """The line, counted from 1, of a value; the last line for None or a value behind the last."""
+        """The line, counted from 1, of a value; the last line for None or a value behind the
+        last.
+        """
         lines, numbers, last = 0, 0, 1
         for text in _whole_words(self.path):
             counts = [len(line.split()) for line in text.splitlines()]
@@ -178,11 +192,18 @@ def _blocks(
         yield with_middles(view, kind.skeleton) if kind.skeleton.middles else view
     if numbers.reaches(position + 1):
         what = f"there are more numbers after the last of the {frame_count} frames"
-        raise numbers.refuse(position, what, "correct the number of frames in line 1, or write it again")
+        raise numbers.refuse(
+            position, what, "correct the number of frames in line 1, or write it again"
+        )
 
 
 def _candidates(
-    numbers: NumberStream, kind: TextSkeleton, counts: Index, starts: Index, start: int, camera: Camera
+    numbers: NumberStream,
+    kind: TextSkeleton,
+    counts: Index,
+    starts: Index,
+    start: int,
+    camera: Camera,
 ) -> ViewCandidates:
     """The candidates of the frames from `start` on; `starts` are indices into `numbers.values`."""
     block, within = _expand(counts.ravel())
@@ -203,7 +224,10 @@ def _candidates(
         index = int(np.argmax(bad))
         raise numbers.refuse(
             numbers.first + int(rows[index]),
-            f"a candidate is at ({fractions[index, 0]:g}, {fractions[index, 1]:g}) of the picture's size",
+            (
+                f"a candidate is at ({fractions[index, 0]:g}, {fractions[index, 1]:g}) of the "
+                "picture's size"
+            ),
             "divide x by width - 1 and y by height - 1",
         )
     xy = fractions * (np.array(camera.image_size) - 1.0)
@@ -214,7 +238,9 @@ def _candidates(
 def _header(numbers: NumberStream) -> tuple[TextSkeleton, int]:
     """The skeleton, which must be supported, and the number of frames."""
     if not numbers.reaches(2):
-        raise numbers.refuse(0, "the first line must hold skeleton type and number of frames", "write both")
+        raise numbers.refuse(
+            0, "the first line must hold skeleton type and number of frames", "write both"
+        )
     number, frame_count = numbers.values[:2]
     kind = next((each for each in TEXT_SKELETONS.values() if each.number == number), None)
     if kind is None:
@@ -225,7 +251,9 @@ def _header(numbers: NumberStream) -> tuple[TextSkeleton, int]:
             "run the detector with its BODY_25 model",
         )
     if frame_count < 1 or frame_count != int(frame_count):
-        raise numbers.refuse(1, f"the number of frames must be 1 or more, got {frame_count:g}", "correct it")
+        raise numbers.refuse(
+            1, f"the number of frames must be 1 or more, got {frame_count:g}", "correct it"
+        )
     return kind, int(frame_count)
 
 
@@ -257,7 +285,10 @@ def _layout(
                 raise numbers.refuse(
                     position,
                     f"frame {frame} must give the number of candidates of {name}, got {n:g}",
-                    "there is a number too few or too many before this line; write the detections again",
+                    (
+                        "there is a number too few or too many before this line; write the "
+                        "detections again"
+                    ),
                 )
             frame_counts.append(int(n))
             frame_starts.append(position + 1)
@@ -285,7 +316,9 @@ def _pairs(values: Array, kind: TextSkeleton, counts: Index, starts: Index) -> t
     affinity = values[block_start.ravel()[block] + within]
     used = affinity > 0
     block, within = block[used], within[used]
-    row, column = np.divmod(within, counts[:, second].ravel()[block])  # matrices are (A, B), row by row
+    row, column = np.divmod(
+        within, counts[:, second].ravel()[block]
+    )  # matrices are (A, B), row by row
     candidate_start = (np.cumsum(counts) - counts.ravel()).reshape(counts.shape)
     a = candidate_start[:, first].ravel()[block] + row
     b = candidate_start[:, second].ravel()[block] + column
@@ -318,14 +351,20 @@ def with_middles(view: ViewCandidates, skeleton: Skeleton) -> ViewCandidates:
     known[tuple(np.array(skeleton.limbs).T)] = True
     there = np.flatnonzero(known[tuple(seen.joint[seen.pairs].T)])
     there = there[np.argsort(seen.pairs[there, 0], kind="stable")]
-    return ViewCandidates(view.frame[order], replace(seen, pairs=seen.pairs[there], affinity=seen.affinity[there]))
+    return ViewCandidates(
+        view.frame[order], replace(seen, pairs=seen.pairs[there], affinity=seen.affinity[there])
+    )
 
 
 def _with_middle(view: ViewCandidates, middle: int, first: int, second: int) -> ViewCandidates:
-    """`view` with candidates of the joint `middle`, the midpoint of `first` and `second`, appended."""
+    """`view` with candidates of the joint `middle`, the midpoint of `first` and `second`,
+    appended.
+    """
     frame, seen = view.frame, view.seen
     one, other = seen.joint[seen.pairs].T
-    to_first, to_second = (np.flatnonzero(np.asarray(other == end) & (one != middle)) for end in (first, second))
+    to_first, to_second = (
+        np.flatnonzero(np.asarray(other == end) & (one != middle)) for end in (first, second)
+    )
     # Links of a neighbour to one end, combined with its links to the other end.
     left, right = _equal_pairs(seen.pairs[to_first, 0], seen.pairs[to_second, 0])
     left, right = to_first[left], to_second[right]
@@ -346,7 +385,9 @@ def _with_middle(view: ViewCandidates, middle: int, first: int, second: int) -> 
         np.concatenate([frame, frame[a_made]]),
         np.concatenate([seen.joint, np.full(len(made), middle)]),
         np.concatenate([seen.xy, (seen.xy[a_made] + seen.xy[b_made]) / 2]),
-        np.concatenate([seen.confidence, np.minimum(seen.confidence[a_made], seen.confidence[b_made])]),
+        np.concatenate(
+            [seen.confidence, np.minimum(seen.confidence[a_made], seen.confidence[b_made])]
+        ),
         np.concatenate([seen.pairs, np.column_stack([starts, ends])]),
         np.concatenate([seen.affinity, np.ones(2 * len(made)), means]),
     )

@@ -58,7 +58,8 @@ def read_deeplabcut(path: Path) -> CameraPeople:
             break
     if "bodyparts" not in heads or "coords" not in heads:
         raise InputError(
-            f"{path}: there are no rows bodyparts and coords below scorer, as DeepLabCut writes; {_RERUN}"
+            f"{path}: there are no rows bodyparts and coords below scorer, as DeepLabCut writes; "
+            f"{_RERUN}"
         )
     count = min(len(heads["bodyparts"]), len(heads["coords"]))
     whose = heads.get("individuals", [""] * count)
@@ -67,7 +68,9 @@ def read_deeplabcut(path: Path) -> CameraPeople:
 
     blocks, first, last = list[PeopleBlock](), 0, -1
     while len(some := list(islice(rows, _LINES))) > 0:
-        numbers = np.array([[_frame(path, line, row[0])] for line, row in some], dtype=np.intp)[:, 0]
+        numbers = np.array([[_frame(path, line, row[0])] for line, row in some], dtype=np.intp)[
+            :, 0
+        ]
         if (np.diff(numbers, prepend=last) <= 0).any():
             line = some[int(np.argmax(np.diff(numbers, prepend=last) <= 0))][0]
             raise InputError(f"{path}: line {line}: frame numbers must increase; {_RERUN}")
@@ -79,7 +82,9 @@ def read_deeplabcut(path: Path) -> CameraPeople:
     return CameraPeople(path, _DEEPLABCUT, iter(blocks), first, last, rerun=_RERUN, joints=joints)
 
 
-def body_parts(path: Path, columns: Iterable[tuple[str, str, str]]) -> tuple[tuple[str, ...], Index]:
+def body_parts(
+    path: Path, columns: Iterable[tuple[str, str, str]]
+) -> tuple[tuple[str, ...], Index]:
     """DeepLabCut's body parts, and (P, J, 3) column numbers of x, y and likelihood of each
     individual; 0 if missing.
 
@@ -139,24 +144,30 @@ def _points(path: Path) -> Array:
     what = next((name for name in ("keypoint_id", "point_id") if name in names), None)
     if who is None or what is None:
         raise InputError(
-            f"{path}: columns cam_id and keypoint_id (or port and point_id) are missing; export it again"
+            f"{path}: columns cam_id and keypoint_id (or port and point_id) are missing; export "
+            "it again"
         )
     columns = [names.index(each) for each in ("sync_index", who, what, "img_loc_x", "img_loc_y")]
     parts = []
     while len(some := list(islice(rows, _LINES))) > 0:
         values = np.array([_numbers(path, line, row, len(names)) for line, row in some])[:, columns]
-        bad = ~np.isfinite(values).all(axis=1) | (values[:, :3] != np.round(values[:, :3])).any(axis=1)
+        bad = ~np.isfinite(values).all(axis=1) | (values[:, :3] != np.round(values[:, :3])).any(
+            axis=1
+        )
         bad |= (values[:, :3] < 0).any(axis=1) | (values[:, 0] >= MOST_FRAME)
         if bad.any():
             line = some[int(np.argmax(bad))][0]
-            raise InputError(f"{path}: line {line} must hold whole numbers and pixels; export it again")
+            raise InputError(
+                f"{path}: line {line} must hold whole numbers and pixels; export it again"
+            )
         parts.append(values)
     table = np.concatenate(parts) if parts else np.zeros((0, 5))
     if table[:, 2].max(initial=0) > BLAZEPOSE and not (table[:, 2] == 0).any():
         table = table[:0]
     if len(table) == 0:
         raise InputError(
-            f"{path}: there are no points of a person's body; track with Caliscope's POSE or HOLISTIC"
+            f"{path}: there are no points of a person's body; track with Caliscope's POSE or "
+            "HOLISTIC"
         )
     return table
 
@@ -171,7 +182,8 @@ def _port(path: Path, camera: int, cameras: Sequence[str], ports: list[int]) -> 
         return int(digits)
     numbers = " ".join(map(str, ports))
     raise InputError(
-        f"{path}: has cameras {numbers}, but not {cameras[camera]}; give the calibration of the same recording"
+        f"{path}: has cameras {numbers}, but not {cameras[camera]}; give the calibration of the "
+        "same recording"
     )
 
 
@@ -196,14 +208,18 @@ def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
             if any(row):
                 yield reader.line_num, row
     except csv.Error as error:
-        raise InputError(f"{path}: line {reader.line_num} cannot be read as CSV ({error}); {_RERUN}") from None
+        raise InputError(
+            f"{path}: line {reader.line_num} cannot be read as CSV ({error}); {_RERUN}"
+        ) from None
 
 
 def _frame(path: Path, line: int, word: str) -> int:
     """The frame number: the first field, or the last number in a picture's name."""
     number = last_number(word.strip().rsplit(".", 1)[0])
     if number is None or number == MOST_FRAME:
-        raise InputError(f"{path}: line {line} must begin with a frame number, got {word[:40]!r}; {_RERUN}")
+        raise InputError(
+            f"{path}: line {line} must begin with a frame number, got {word[:40]!r}; {_RERUN}"
+        )
     return number
 
 

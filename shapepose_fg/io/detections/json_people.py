@@ -18,15 +18,32 @@ from pydantic import AliasChoices, BaseModel, Field, FiniteFloat, TypeAdapter
 
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.storage.files import BIG, LARGE, MIDDLE, open_regular, parse_json, read_json, read_text
+from shapepose_fg.core.storage.files import (
+    BIG,
+    LARGE,
+    MIDDLE,
+    open_regular,
+    parse_json,
+    read_json,
+    read_text,
+)
 from shapepose_fg.io.camera_names import MOST_FRAME, in_order, last_number, numbered
 from shapepose_fg.io.detection_table import BLOCK_FRAMES
-from shapepose_fg.io.detections.people import CameraPeople, PeopleBlock, check_one_model, frame_blocks
+from shapepose_fg.io.detections.people import (
+    CameraPeople,
+    PeopleBlock,
+    check_one_model,
+    frame_blocks,
+)
 from shapepose_fg.io.json_items import JsonItems
 from shapepose_fg.io.validation import describe, validated, validated_list
 
 _OPENPOSE, _POSE2SIM, _PICTURES = "OpenPose's JSON", "Pose2Sim's JSON", "MMPose's JSON of pictures"
-_COCO, _ALPHAPOSE, _VIDEO = "COCO's keypoint results", "AlphaPose's JSON", "MMPose's JSON of a video"
+_COCO, _ALPHAPOSE, _VIDEO = (
+    "COCO's keypoint results",
+    "AlphaPose's JSON",
+    "MMPose's JSON of a video",
+)
 _PIFPAF, _YOLO, _SEPARATE = "OpenPifPaf's JSON", "Ultralytics' JSON", "AlphaPose's JSON of frames"
 _RERUN = {
     _OPENPOSE: "run OpenPose again with --write_json --keypoint_scale 0",
@@ -47,7 +64,8 @@ _LOOKED_AT = 100
 FRAME_FILE = r"(_keypoints|(\.\w{1,5})?\.predictions)?\.json"
 """Pattern of what follows the frame number in file names."""
 _ALL_FRAMES, _SEP_JSON = "alphapose-results.json", "sep-json"
-"""AlphaPose's file with all frames, and its folder with a file per frame (--format open and cmu)."""
+"""AlphaPose's file with all frames, and its folder with a file per frame (--format open and
+cmu)."""
 _LISTS = ("annotations", "instance_info")
 """Keys of the list if the file is an object: COCO's data sets, and MMPose."""
 _AT_ONCE = 1024
@@ -84,7 +102,10 @@ class _Instance(BaseModel, strict=True):
     def flat(self, place: str, program: str) -> list[float]:
         """x, y and score of each keypoint."""
         if len(self.keypoints) != len(self.keypoint_scores):
-            problem = f"there are {len(self.keypoints)} keypoints, but {len(self.keypoint_scores)} keypoint_scores"
+            problem = (
+                f"there are {len(self.keypoints)} keypoints, but {len(self.keypoint_scores)} "
+                "keypoint_scores"
+            )
             raise InputError(f"{place}: {problem}; {_RERUN[program]}")
         pairs = zip(self.keypoints, self.keypoint_scores, strict=True)
         return [number for (x, y), score in pairs for number in (x, y, score)]
@@ -141,7 +162,10 @@ class _Object(BaseModel, strict=True):
             return []
         scores = [1.0] * len(own.x) if own.visible is None else own.visible
         if not len(own.x) == len(own.y) == len(scores):
-            raise InputError(f"{place}.keypoints must have the same number of x, y and visible; {_RERUN[program]}")
+            raise InputError(
+                f"{place}.keypoints must have the same number of x, y and visible; "
+                f"{_RERUN[program]}"
+            )
         rows = zip(own.x, own.y, scores, strict=True)
         return [number for x, y, score in rows for number in (x, y, score if x or y else 0.0)]
 
@@ -190,14 +214,20 @@ def read_json_people(place: Path) -> CameraPeople:
     if len(lists) == 1:
         items = JsonItems(lists[0], _LISTS)
         first = next(iter(items), None)
-        of_a_picture = isinstance(first, dict) and "keypoints" in first and items.key == "instance_info"
-        if not of_a_picture and (items.key is not None or (items.found and (first is None or _known(first)))):
+        of_a_picture = (
+            isinstance(first, dict) and "keypoints" in first and items.key == "instance_info"
+        )
+        if not of_a_picture and (
+            items.key is not None or (items.found and (first is None or _known(first)))
+        ):
             return read_one_file(lists[0])
     return read_frame_files(place)
 
 
 def _joints_of_meta(meta: Any) -> str | tuple[str, ...] | None:
-    """The joints in MMPose's `meta_info`: names, or the name of a data set; None if it has neither."""
+    """The joints in MMPose's `meta_info`: names, or the name of a data set; None if it has
+    neither.
+    """
     if not isinstance(meta, dict):
         return None
     names, count = meta.get("keypoint_id2name"), meta.get("num_keypoints")
@@ -241,8 +271,8 @@ def read_frame_files(folder: Path) -> CameraPeople:
     if len(found) == 0:
         lists = sorted(each.name for each in _lists(folder))
         what = (
-            "there is no *_keypoints.json (OpenPose) or *_000000.json (Pose2Sim) in this folder; write the"
-            " detections of one of them into it"
+            "there is no *_keypoints.json (OpenPose) or *_000000.json (Pose2Sim) in this folder; "
+            "write the detections of one of them into it"
         )
         if len(lists) > 1:
             names = " ".join(lists[:4])
@@ -255,10 +285,18 @@ def read_frame_files(folder: Path) -> CameraPeople:
     first, last = found[0][0], found[-1][0]
     if last - first + 1 > 2 * len(found) + _LONGEST_GAP:
         problem = f"{len(found)} files are numbered from {first} to {last}"
-        raise InputError(f"{folder}: {problem}; number them by the frames of the recording, or {_RERUN[program]}")
-    gaps = tuple((one + 1, other - 1) for (one, _), (other, _) in pairwise(found) if other > one + 1)
-    blocks = frame_blocks(folder, program, found, partial(_people_of_file, program=program, joints=joints))
-    return CameraPeople(folder, program, blocks, first, last, gaps=gaps, rerun=_RERUN[program], joints=joints)
+        raise InputError(
+            f"{folder}: {problem}; number them by the frames of the recording, or {_RERUN[program]}"
+        )
+    gaps = tuple(
+        (one + 1, other - 1) for (one, _), (other, _) in pairwise(found) if other > one + 1
+    )
+    blocks = frame_blocks(
+        folder, program, found, partial(_people_of_file, program=program, joints=joints)
+    )
+    return CameraPeople(
+        folder, program, blocks, first, last, gaps=gaps, rerun=_RERUN[program], joints=joints
+    )
 
 
 def _program_of_frames(files: list[Path]) -> tuple[str, str | tuple[str, ...] | None]:
@@ -277,7 +315,11 @@ def _program_of_frames(files: list[Path]) -> tuple[str, str | tuple[str, ...] | 
                 return _SEPARATE, "openpose coco"
             return program, joints
         program = _PIFPAF if ".predictions." in file.name else _PICTURES
-        people = [each for each in content if isinstance(each, dict)] if isinstance(content, list) else []
+        people = (
+            [each for each in content if isinstance(each, dict)]
+            if isinstance(content, list)
+            else []
+        )
         if len(people) == 0:
             continue
         keypoints = next((each["keypoints"] for each in people if "keypoints" in each), None)
@@ -288,13 +330,16 @@ def _program_of_frames(files: list[Path]) -> tuple[str, str | tuple[str, ...] | 
     return program, joints
 
 
-def _people_of_file(file: Path, program: str, joints: str | tuple[str, ...] | None) -> list[list[float]]:
+def _people_of_file(
+    file: Path, program: str, joints: str | tuple[str, ...] | None
+) -> list[list[float]]:
     """Flat keypoints of the people of a frame."""
     content = read_json(file, most=MIDDLE)
     if program == _PICTURES and isinstance(content, dict):
         if _joints_of_meta(content.get("meta_info")) != joints:
             raise InputError(
-                f"{file}: its meta_info names other joints than the first file; give the files of one model"
+                f"{file}: its meta_info names other joints than the first file; give the files "
+                "of one model"
             )
         content = content.get("instance_info")
     return _people(content, file, program)
@@ -321,19 +366,23 @@ def read_one_file(path: Path) -> CameraPeople:
     if is_object and (named := _by_picture(path)) is not None:
         return named
     if items.key is not None and not items.found:
-        raise InputError(f"{path}: the file must be a list, got {describe(items.value)}; {_RERUN[_COCO]}")
+        raise InputError(
+            f"{path}: the file must be a list, got {describe(items.value)}; {_RERUN[_COCO]}"
+        )
     every = iter(items)
     first = next(every, None)
     if not items.found or (items.key is None and first is not None and not _known(first)):
         found = "a list" if items.found else describe(items.value)
         raise InputError(
-            f"{path}: recognised as JSON ({found}), but a list of people with image_id (COCO, AlphaPose) or of"
-            " frames with instances (MMPose) is expected; give one of these"
+            f"{path}: recognised as JSON ({found}), but a list of people with image_id (COCO, "
+            "AlphaPose) or of frames with instances (MMPose) is expected; give one of these"
         )
     again = every if first is None else chain([first], every)
     if items.key == "instance_info" or (isinstance(first, dict) and "instances" in first):
         return _video(_Collected(path, _VIDEO), again, items.others)
-    program = _ALPHAPOSE if isinstance(first, dict) and isinstance(first.get("image_id"), str) else _COCO
+    program = (
+        _ALPHAPOSE if isinstance(first, dict) and isinstance(first.get("image_id"), str) else _COCO
+    )
     return _results(_Collected(path, program), again, items.others)
 
 
@@ -344,7 +393,9 @@ class _Collected:
         self.path, self.program = path, program
         self._keypoints, self._counts = list[Array](), set[int]()
 
-    def valid(self, kind: TypeAdapter[list[Any]], items: Iterable[Any]) -> Iterator[tuple[int, list[Any]]]:
+    def valid(
+        self, kind: TypeAdapter[list[Any]], items: Iterable[Any]
+    ) -> Iterator[tuple[int, list[Any]]]:
         """The validated items in batches, with the index of each batch's first item."""
         items, start = iter(items), 0
         while len(some := list(islice(items, _AT_ONCE))) > 0:
@@ -355,7 +406,9 @@ class _Collected:
         """Add people with flat keypoints."""
         check_one_model(self._counts, rows, self.path, self.program)
         if len(rows) > 0:
-            self._keypoints.append(np.array(rows, dtype=np.float64).reshape(len(rows), len(rows[0]) // 3, 3))
+            self._keypoints.append(
+                np.array(rows, dtype=np.float64).reshape(len(rows), len(rows[0]) // 3, 3)
+            )
 
     def camera(
         self, frames: list[int], listed: tuple[int, int], joints: str | tuple[str, ...] | None
@@ -364,7 +417,12 @@ class _Collected:
         file.
         """
         blocks, rerun = self._in_order(np.array(frames, dtype=np.intp)), _RERUN[self.program]
-        how = {"every_frame": False, "lists_people": self.program != _VIDEO, "rerun": rerun, "joints": joints}
+        how = {
+            "every_frame": False,
+            "lists_people": self.program != _VIDEO,
+            "rerun": rerun,
+            "joints": joints,
+        }
         return CameraPeople(self.path, self.program, blocks, *listed, **how)
 
     def _in_order(self, frames: Index) -> Iterator[PeopleBlock]:
@@ -395,7 +453,9 @@ def _pifpaf_video(path: Path) -> CameraPeople | None:
             continue
         one = validated(_PifPafFrame, parse_json(line, path), path, _RERUN[_PIFPAF])
         if one.frame <= last:
-            raise InputError(f"{path}: line {number}: frame numbers must increase; {_RERUN[_PIFPAF]}")
+            raise InputError(
+                f"{path}: line {number}: frame numbers must increase; {_RERUN[_PIFPAF]}"
+            )
         last = one.frame
         place = f"{path}: line {number}"
         people.add([each.flat(place, _PIFPAF) for each in one.predictions])
@@ -431,7 +491,12 @@ def _results(people: _Collected, items: Iterable[Any], others: Mapping[str, Any]
     for start, results in people.valid(_RESULTS, items):
         images += [person.image_id for person in results]
         categories |= {person.category_id for person in results}
-        people.add([person.flat(f"{path}: [{index}]", program) for index, person in enumerate(results, start)])
+        people.add(
+            [
+                person.flat(f"{path}: [{index}]", program)
+                for index, person in enumerate(results, start)
+            ]
+        )
     names = _names(others, path, program)
     frames: dict[int | str, int] = {}
     known = [(image, f"[{index}].image_id") for index, image in enumerate(images)]
@@ -443,10 +508,13 @@ def _results(people: _Collected, items: Iterable[Any], others: Mapping[str, Any]
     for image, frame in frames.items():
         if first.setdefault(frame, image) != image:
             problem = (
-                f"the pictures {str(first[frame])[:40]!r} and {str(image)[:40]!r} have the same frame"
-                f" number {frame}"
+                f"the pictures {str(first[frame])[:40]!r} and {str(image)[:40]!r} have the same "
+                f"frame number {frame}"
             )
-            raise InputError(f"{path}: {problem}; {_RERUN[program]}, of one camera with a number for each picture")
+            raise InputError(
+                f"{path}: {problem}; {_RERUN[program]}, of one camera with a number for each "
+                "picture"
+            )
     listed = (min(first), max(first)) if first else (0, -1)
     joints = _joints_of_categories(others.get("categories"), categories)
     return people.camera([frames[image] for image in images], listed, joints)
@@ -458,7 +526,9 @@ def _names(others: Mapping[str, Any], path: Path, program: str) -> dict[int | st
     for index, image in enumerate(images if isinstance(images, list) else []):
         one = image.get("id") if isinstance(image, dict) else None
         if type(one) not in (int, str):
-            raise InputError(f"{path}: images[{index}].id must be a whole number or text; {_RERUN[program]}")
+            raise InputError(
+                f"{path}: images[{index}].id must be a whole number or text; {_RERUN[program]}"
+            )
         names[one] = str(image["file_name"]) if "file_name" in image else None
     return names
 
@@ -470,10 +540,14 @@ def _number(image: int | str, name: str | None, place: str, program: str) -> int
     if name is None and isinstance(image, int):
         if 0 <= image < MOST_FRAME:
             return image
-        raise InputError(f"{place} '{image}' is not a frame number; {_RERUN[program]}, of numbered pictures")
+        raise InputError(
+            f"{place} '{image}' is not a frame number; {_RERUN[program]}, of numbered pictures"
+        )
     name = str(image) if name is None else name
     if (number := last_number(Path(name).stem)) in (None, MOST_FRAME):
-        raise InputError(f"{place} {name[:40]!r} has no frame number; {_RERUN[program]}, of numbered pictures")
+        raise InputError(
+            f"{place} {name[:40]!r} has no frame number; {_RERUN[program]}, of numbered pictures"
+        )
     return number
 
 
@@ -487,7 +561,9 @@ def _video(people: _Collected, items: Iterable[Any], others: Mapping[str, Any]) 
         for index, frame in enumerate(found, start):
             first, last = min(first, frame.frame_id), max(last, frame.frame_id)
             frames += [frame.frame_id] * len(frame.instances)
-            rows += [each.flat(f"{people.path}: [{index}].instances", _VIDEO) for each in frame.instances]
+            rows += [
+                each.flat(f"{people.path}: [{index}].instances", _VIDEO) for each in frame.instances
+            ]
         people.add(rows)
     joints = _joints_of_meta(others.get("meta_info"))
     return people.camera(frames, (first, last) if last >= 0 else (0, -1), joints)

@@ -8,7 +8,12 @@ import numpy as np
 
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.joint_names import body_points, keypoint_names, layouts_called, skeleton_of_names
+from shapepose_fg.core.joint_names import (
+    body_points,
+    keypoint_names,
+    layouts_called,
+    skeleton_of_names,
+)
 from shapepose_fg.core.skeleton import BODY_25, SKELETONS, Skeleton
 from shapepose_fg.io.camera_names import listing
 from shapepose_fg.io.detections.people import CameraPeople, DeclaredJoints, KeptPeople
@@ -24,7 +29,9 @@ joints, by 0.07."""
 
 
 def skeleton_of_people(
-    people: Sequence[KeptPeople], wanted: Skeleton | None = None, declared: DeclaredJoints | None = None
+    people: Sequence[KeptPeople],
+    wanted: Skeleton | None = None,
+    declared: DeclaredJoints | None = None,
 ) -> tuple[Skeleton, list[str]]:
     """The skeleton of the people of all cameras, and notes on how it was found.
 
@@ -39,14 +46,21 @@ def skeleton_of_people(
     named, notes = _named_in_files(people, count)
     if wanted is not None:
         if wanted.keypoint_count != count:
-            raise InputError(f"{place}, but {wanted.name} has {wanted.keypoint_count}; name the right layout")
+            raise InputError(
+                f"{place}, but {wanted.name} has {wanted.keypoint_count}; name the right layout"
+            )
         if named is not None and keypoint_names(named[0]) != keypoint_names(wanted):
             return wanted, [f"{named[1]}, but they are read as {wanted.name}, as requested"]
         return wanted, []
     if named is not None:
         skeleton, who, passed = named
         over = (
-            [f"joints that the body does not have are ignored: {listing([_shown(each) for each in passed])}"]
+            [
+                (
+                    "joints that the body does not have are ignored: "
+                    f"{listing([_shown(each) for each in passed])}"
+                )
+            ]
             if passed
             else []
         )
@@ -61,7 +75,8 @@ def skeleton_of_people(
         known = ", ".join(f"{each.keypoint_count} ({each.name})" for each in SKELETONS.values())
         problem = "which is not a known layout"
         raise InputError(
-            f"{place}, {problem}; describe the layout in a --skeleton file; known layouts are {known}"
+            f"{place}, {problem}; describe the layout in a --skeleton file; known layouts are "
+            f"{known}"
         )
     found, why = (alike[0], "") if len(alike) == 1 else _best_fit(people, alike)
     said = f"{count} keypoints per person without joint names: read as {found.name}{why}"
@@ -86,8 +101,8 @@ def _best_fit(people: Sequence[KeptPeople], layouts: Sequence[Skeleton]) -> tupl
     if len(chosen) > 1:
         (one, first), (other, second) = list(chosen.items())[:2]
         raise InputError(
-            f"{first.source}: people look like {one}, those of {second.source} like {other}; give the detections"
-            f" of one model for all cameras, or {_CURE}"
+            f"{first.source}: people look like {one}, those of {second.source} like {other}; "
+            f"give the detections of one model for all cameras, or {_CURE}"
         )
     fits_of_all = np.concatenate(fits, axis=1)
     best = _sure(fits_of_all)
@@ -95,10 +110,17 @@ def _best_fit(people: Sequence[KeptPeople], layouts: Sequence[Skeleton]) -> tupl
         if fits_of_all.shape[1] > 0 and fits_of_all.mean(axis=1).max() < LIKE_A_BODY:
             return usual, ", the most common layout, although people look like none of them"
         rivals = [
-            each.name for each, fit in zip(layouts, fits_of_all, strict=True) if not _surely(fits_of_all[0] - fit)
+            each.name
+            for each, fit in zip(layouts, fits_of_all, strict=True)
+            if not _surely(fits_of_all[0] - fit)
         ]
-        return usual, f", the most common layout; people do not distinguish it from {', '.join(rivals[1:])}"
-    return layouts[best], ", because people look like it" + (f", not as {usual.name}" if best > 0 else "")
+        return (
+            usual,
+            f", the most common layout; people do not distinguish it from {', '.join(rivals[1:])}",
+        )
+    return layouts[best], ", because people look like it" + (
+        f", not as {usual.name}" if best > 0 else ""
+    )
 
 
 def _fits(people: Array, layouts: Sequence[Skeleton]) -> Array:
@@ -127,7 +149,9 @@ def _surely(more: Array) -> bool:
     """Whether people fit one layout significantly better than another; `more` (N,) are the
     differences of their fits.
     """
-    return len(more) > 0 and bool(more.mean() > _SIGMAS * np.sqrt((more.var() + _SPREAD**2) / len(more)))
+    return len(more) > 0 and bool(
+        more.mean() > _SIGMAS * np.sqrt((more.var() + _SPREAD**2) / len(more))
+    )
 
 
 def _one_count(people: Sequence[KeptPeople]) -> tuple[int, CameraPeople] | None:
@@ -139,8 +163,8 @@ def _one_count(people: Sequence[KeptPeople]) -> tuple[int, CameraPeople] | None:
     if len(counts) > 1:
         (one, first), (other, second) = list(counts.items())[:2]
         raise InputError(
-            f"{first.source} has people of {one} keypoints, {second.source} of {other}; give the detections of one"
-            " model for all cameras"
+            f"{first.source} has people of {one} keypoints, {second.source} of {other}; give the "
+            "detections of one model for all cameras"
         )
     return next(iter(counts.items()), None)
 
@@ -165,21 +189,29 @@ def _named_in_files(
             continue
         if found is not None and keypoint_names(found[0]) != keypoint_names(named[0]):
             raise InputError(
-                f"{camera.source} names other joints than {found[3].source} ({named[0].name}, {found[0].name});"
-                " give the detections of one model for all cameras"
+                f"{camera.source} names other joints than {found[3].source} ({named[0].name}, "
+                f"{found[0].name}); give the detections of one model for all cameras"
             )
         found = found or (named[0], what, named[1], camera)
     return (None if found is None else found[:3]), [f"the file{each}" for each in notes]
 
 
-def _declared(declared: DeclaredJoints, count: int) -> tuple[tuple[Skeleton, list[str]] | None, str]:
+def _declared(
+    declared: DeclaredJoints, count: int
+) -> tuple[tuple[Skeleton, list[str]] | None, str]:
     """`_called` for a project's settings, which may name only some of the keypoints, or belong to
     other detections.
     """
     joints = declared.joints
     if not isinstance(joints, str):
         if len(joints) > count:
-            return None, f"{declared.source} names keypoint {len(joints) - 1}, but people have {count} keypoints"
+            return (
+                None,
+                (
+                    f"{declared.source} names keypoint {len(joints) - 1}, but people have {count} "
+                    "keypoints"
+                ),
+            )
         joints += ("",) * (count - len(joints))
     return _called(joints, count, declared.source)
 
@@ -207,13 +239,15 @@ def _called(
         return None, f"{source} names unknown joints, such as {_shown(joints[0])}"
     if len(joints) != count:
         raise InputError(
-            f"{source} names {len(joints)} joints, but its people have {count} keypoints; correct the names, or"
-            f" {_CURE}"
+            f"{source} names {len(joints)} joints, but its people have {count} keypoints; "
+            f"correct the names, or {_CURE}"
         )
     try:
         return skeleton_of_names(joints), f"{source} names its joints"
     except ValueError as error:
-        raise InputError(f"{source} names joints, but {str(error).partition(': ')[2]}; {_CURE}") from None
+        raise InputError(
+            f"{source} names joints, but {str(error).partition(': ')[2]}; {_CURE}"
+        ) from None
 
 
 def _shown(name: str) -> str:

@@ -1,4 +1,6 @@
-"""Reads the detections of one picture from a line of JSON: OpenPose's format, with camera and time."""
+"""Reads the detections of one picture from a line of JSON: OpenPose's format, with camera and
+time.
+"""
 
 from typing import Annotated, Any
 
@@ -17,8 +19,8 @@ from shapepose_fg.io.detections.view_streams import undistorted
 from shapepose_fg.io.validation import validated
 
 _CURE = (
-    'give {"camera": NAME, "time_s": SECONDS, "people": [{"pose_keypoints_2d": [x, y, score, ...]}]}, and for a'
-    ' moving camera "pose": 4 x 4 numbers, "pose_covariance": 6 x 6'
+    'give {"camera": NAME, "time_s": SECONDS, "people": [{"pose_keypoints_2d": [x, y, score, '
+    '...]}]}, and for a moving camera "pose": 4 x 4 numbers, "pose_covariance": 6 x 6'
 )
 _Row4 = Annotated[list[FiniteFloat], Len(4, 4)]
 _Row6 = Annotated[list[FiniteFloat], Len(6, 6)]
@@ -47,7 +49,9 @@ def read_view_line(text: str, place: str, rig: Rig, skeleton: Skeleton) -> tuple
     if line.camera in rig.unwanted:
         return None
     people = [one.pose_keypoints_2d for one in line.people]
-    pose, surely = (None if each is None else np.array(each) for each in (line.pose, line.pose_covariance))
+    pose, surely = (
+        None if each is None else np.array(each) for each in (line.pose, line.pose_covariance)
+    )
     if pose is not None:
         with naming(place, _CURE):
             both = None if surely is None else np.stack([surely, surely])
@@ -62,16 +66,21 @@ def view_of(
     picture), one list per person.
     """
     if camera not in rig.names:
-        raise InputError(f"{place}: there is no camera {camera[:40]}; there are {', '.join(rig.names)}")
+        raise InputError(
+            f"{place}: there is no camera {camera[:40]}; there are {', '.join(rig.names)}"
+        )
     K = skeleton.keypoint_count
     if any(len(each) != 3 * K for each in flat):
         wrong = next(len(each) for each in flat if len(each) != 3 * K)
         raise InputError(
-            f"{place}: {3 * K} numbers per person are expected for {skeleton.name}, got {wrong}; {_CURE}"
+            f"{place}: {3 * K} numbers per person are expected for {skeleton.name}, got {wrong}; "
+            f"{_CURE}"
         )
     keypoints = np.array(flat, dtype=np.float64).reshape(len(flat), K, 3)
     if np.nanmax(keypoints[..., 2], initial=0.0) > OVERSHOOT:
-        raise InputError(f"{place}: scores must be 0 to 1, got {np.nanmax(keypoints[..., 2]):.3g}; rescale them")
+        raise InputError(
+            f"{place}: scores must be 0 to 1, got {np.nanmax(keypoints[..., 2]):.3g}; rescale them"
+        )
     frame = np.zeros(len(flat), dtype=np.intp)
     view = joints_of_people(frame, keypoints, lambda score: np.minimum(score, 1.0), skeleton)
     seen = undistorted(view, place, rig.cameras[rig.names.index(camera)]).seen

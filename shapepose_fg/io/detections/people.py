@@ -61,7 +61,9 @@ class PeopleBlock:
         return every[np.isfinite(every) & (every > 0)]
 
 
-def check_one_model(known: set[int], people: Sequence[list[float]], source: Path, program: str) -> None:
+def check_one_model(
+    known: set[int], people: Sequence[list[float]], source: Path, program: str
+) -> None:
     """Add the numbers of keypoints per person to `known`; InputError if there are several."""
     known |= {len(person) // 3 for person in people}
     if len(known) > 1:
@@ -71,7 +73,10 @@ def check_one_model(known: set[int], people: Sequence[list[float]], source: Path
 
 
 def frame_blocks(
-    folder: Path, program: str, files: Sequence[tuple[int, Path]], read: Callable[[Path], list[list[float]]]
+    folder: Path,
+    program: str,
+    files: Sequence[tuple[int, Path]],
+    read: Callable[[Path], list[list[float]]],
 ) -> Iterator[PeopleBlock]:
     """The people of numbered files of frames, block by block; `read` returns flat keypoints of the
     people in a file.
@@ -102,8 +107,8 @@ class CameraPeople:
     last: int
     """Number of the last frame."""
     every_frame: bool = True
-    """Whether the files list every frame, also those without people. If not, frames may be missing at both
-    ends, and the other cameras define the length of the recording."""
+    """Whether the files list every frame, also those without people. If not, frames may be missing
+    at both ends, and the other cameras define the length of the recording."""
     lists_people: bool = False
     """Whether only frames with people are listed; the recording may then begin before the first of
     them."""
@@ -160,7 +165,9 @@ class KeptPeople:
         count = self.keypoint_count or 0
         names = self._names[:: -(-len(self._names) // _BLOCKS_LOOKED_AT) if self._names else 1]
         parts = [np.asarray(self._kept.array(name, "keypoints")) for name in names]
-        every = np.concatenate([np.zeros((0, count, 3)), *(part[:: -(-len(part) // most)] for part in parts)])
+        every = np.concatenate(
+            [np.zeros((0, count, 3)), *(part[:: -(-len(part) // most)] for part in parts)]
+        )
         every = every[:: -(-len(every) // most) if len(every) > 0 else 1]
         return np.where(every[..., 2:] > 0, every[..., :2], np.nan)
 
@@ -203,7 +210,9 @@ def score_rule(people: Sequence[KeptPeople]) -> tuple[Scores, str | None]:
     return lambda score: np.minimum(score / scale, 1.0), note
 
 
-def candidates_of(people: KeptPeople, rule: Scores, skeleton: Skeleton, first: int, last: int) -> ViewStream:
+def candidates_of(
+    people: KeptPeople, rule: Scores, skeleton: Skeleton, first: int, last: int
+) -> ViewStream:
     """The joints of people as candidates, with affinity 1 along the limbs of each person.
 
     So grouped and ungrouped detections are processed in the same way. Frames are those with numbers
@@ -230,8 +239,12 @@ def candidates_of(people: KeptPeople, rule: Scores, skeleton: Skeleton, first: i
     return ViewStream(people.camera.source, count, blocks(), first)
 
 
-def joints_of_people(frame: Index, keypoints: Array, rule: Scores, skeleton: Skeleton) -> ViewCandidates:
-    """Candidates of one view: the joints of N people with `frame` (N,) and `keypoints` (N, K, 3)."""
+def joints_of_people(
+    frame: Index, keypoints: Array, rule: Scores, skeleton: Skeleton
+) -> ViewCandidates:
+    """Candidates of one view: the joints of N people with `frame` (N,) and `keypoints` (N, K,
+    3).
+    """
     joints = _joints(keypoints, rule, skeleton)
     person, joint = np.nonzero(joints[..., 2] > 0)
     order = np.lexsort((person, joint, frame[person]))
@@ -247,7 +260,9 @@ def joints_of_people(frame: Index, keypoints: Array, rule: Scores, skeleton: Ske
 
 def _joints(keypoints: Array, rule: Scores, skeleton: Skeleton) -> Array:
     """(N, J, 3) x, y and score (0 to 1) of the skeleton's joints; 0 0 0 if not detected."""
-    target = np.arange(len(skeleton)) if skeleton.keypoints is None else np.array(skeleton.keypoints)
+    target = (
+        np.arange(len(skeleton)) if skeleton.keypoints is None else np.array(skeleton.keypoints)
+    )
     joints = np.zeros((len(keypoints), len(skeleton), 3))
     joints[:, target[target >= 0]] = keypoints[:, target >= 0]
     joints[..., 2] = rule(joints[..., 2])

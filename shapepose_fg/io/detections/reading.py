@@ -15,7 +15,12 @@ from shapepose_fg.core.skeleton import BODY_25, Skeleton
 from shapepose_fg.core.storage.kept_arrays import InMemory, KeptArrays
 from shapepose_fg.io.camera_names import listing, told_by_parts
 from shapepose_fg.io.detection_table import DetectionTable
-from shapepose_fg.io.detections.arrays import cameras_of_freemocap, read_freemocap, read_hdf5, what_it_is
+from shapepose_fg.io.detections.arrays import (
+    cameras_of_freemocap,
+    read_freemocap,
+    read_hdf5,
+    what_it_is,
+)
 from shapepose_fg.io.detections.association_text import read_association_text
 from shapepose_fg.io.detections.csv_people import (
     cameras_of_caliscope,
@@ -26,7 +31,13 @@ from shapepose_fg.io.detections.csv_people import (
 )
 from shapepose_fg.io.detections.json_people import read_json_people
 from shapepose_fg.io.detections.keypoint_layout import skeleton_of_people
-from shapepose_fg.io.detections.people import CameraPeople, DeclaredJoints, KeptPeople, candidates_of, score_rule
+from shapepose_fg.io.detections.people import (
+    CameraPeople,
+    DeclaredJoints,
+    KeptPeople,
+    candidates_of,
+    score_rule,
+)
 from shapepose_fg.io.detections.view_streams import ViewStream, assemble
 from shapepose_fg.io.detections.yolo import label_files, read_yolo
 from shapepose_fg.io.footage.placement import FOOTAGE
@@ -59,9 +70,13 @@ JSON = Format(
     ("{}", "{}_json", "{}.json", "results_{}.json", "{}_results.json", "alphapose-results_{}.json"),
     lambda place, camera: _read_folder(place, camera),
 )
-CSV = Format("CSV of DeepLabCut and AniPose", ("{}.csv",), lambda place, camera: read_deeplabcut(place))
+CSV = Format(
+    "CSV of DeepLabCut and AniPose", ("{}.csv",), lambda place, camera: read_deeplabcut(place)
+)
 HDF5 = Format(
-    "HDF5 of SLEAP, DeepLabCut and AniPose", ("{}.h5", "{}.analysis.h5"), lambda place, camera: read_hdf5(place)
+    "HDF5 of SLEAP, DeepLabCut and AniPose",
+    ("{}.h5", "{}.analysis.h5"),
+    lambda place, camera: read_hdf5(place),
 )
 TEXT = Format("4D Association's text", ("{}.txt",), read_association_text)
 FORMATS = [TEXT, JSON, CSV, HDF5]
@@ -72,7 +87,9 @@ _FOLDERS = ("detection", "output_data/raw_data", "raw_data")
 _PROGRAM_S = re.compile(r"^(alphapose-)?results_|_results$|_json$|\.analysis$|DLC[_A-Za-z].*")
 """Pattern of affixes that programs add to the name of a camera or video; the part after DLC
 contains other numbers."""
-_FREEMOCAP_FILES = re.compile(r"2dData_numCams_numFrames_numTrackedPoints_pixelXY\.npy$|^mediaPipeData_2d\.npy$")
+_FREEMOCAP_FILES = re.compile(
+    r"2dData_numCams_numFrames_numTrackedPoints_pixelXY\.npy$|^mediaPipeData_2d\.npy$"
+)
 
 
 def read_detections(
@@ -130,7 +147,9 @@ def find_places(path: Path, rig: Rig) -> tuple[Format, list[Path], list[str]]:
             return form, [path] * len(rig), []
         known = what_it_is(path)
         what = "this is a file" if known is None else f"this is {known}"
-        raise InputError(f"{path}: {what}; give the folder that holds the detections of all cameras")
+        raise InputError(
+            f"{path}: {what}; give the folder that holds the detections of all cameras"
+        )
     if not path.is_dir():
         raise InputError(f"{path}: there is no such folder; check the path")
     folder, entries = _entries(path)
@@ -143,27 +162,34 @@ def find_places(path: Path, rig: Rig) -> tuple[Format, list[Path], list[str]]:
         if len(there) > 0:
             missing = rig.names[found.index(None)]
             raise InputError(
-                f'{folder / form.names[0].format(missing)}: the detections of camera "{missing}" are missing,'
-                f" {folder} contains {holds}; add them, or leave the camera out with --without {missing}"
+                f'{folder / form.names[0].format(missing)}: the detections of camera "{missing}"'
+                " are missing,"
+                f" {folder} contains {holds}; add them, or leave the camera out with --without"
+                f" {missing}"
             )
     # Such as `walk_Miqus_1_23087_json` for camera `23087`, or `cam01_json` for camera `int_cam1`.
     for form, offered, names in _offered(entries):
         if (told := told_by_parts(folder, rig.names, offered, names)) is not None:
             return form, *told
-    whole = [(form, each) for each in entries if (form := _of_all_cameras(each, rig.names)) is not None]
+    whole = [
+        (form, each) for each in entries if (form := _of_all_cameras(each, rig.names)) is not None
+    ]
     if len(whole) == 1:
         form, file = whole[0]
         return form, [file] * len(rig), []
     if len(whole) > 1:
         names = " ".join(file.name for _, file in whole)
-        raise InputError(f"{folder}: there are several files of all cameras ({names[:200]}); give one of them")
+        raise InputError(
+            f"{folder}: there are several files of all cameras ({names[:200]}); give one of them"
+        )
     for each in entries:
         if each.is_file() and (known := what_it_is(each)) is not None:
             raise InputError(f"{each}: this is {known}")
     raise InputError(
-        f"{folder}: there are no detections of the cameras {' '.join(rig.names)}, only {holds}; give the folder"
-        " with <camera>.txt (4D Association), <camera>/ or <camera>_json/ with a JSON file per frame"
-        " (OpenPose, Pose2Sim, MMPose), or <camera>.json (COCO's results, AlphaPose, MMPose)"
+        f"{folder}: there are no detections of the cameras {' '.join(rig.names)}, only {holds}; "
+        "give the folder with <camera>.txt (4D Association), <camera>/ or <camera>_json/ with a "
+        "JSON file per frame (OpenPose, Pose2Sim, MMPose), or <camera>.json (COCO's results, "
+        "AlphaPose, MMPose)"
     )
 
 
@@ -186,7 +212,8 @@ def camera_names(path: Path) -> list[str]:
     for empty in (False, True):
         for _, places, names in _offered(entries):
             holds = [
-                empty or each.is_file() or any(each.glob("*.json")) or bool(label_files(each)) for each in places
+                empty or each.is_file() or any(each.glob("*.json")) or bool(label_files(each))
+                for each in places
             ]
             if any(holds):
                 return [name for name, there in zip(names, holds, strict=True) if there]
@@ -225,9 +252,15 @@ def _offered(entries: list[Path]) -> list[tuple[Format, list[Path], list[str]]]:
 def _of_all_cameras(file: Path, names: Sequence[str]) -> Format | None:
     """The format of a file with all cameras; None for other files."""
     if file.is_file() and _FREEMOCAP_FILES.search(file.name) is not None:
-        return Format("", (), lambda place, camera: read_freemocap(place, names.index(camera.name), len(names)))
+        return Format(
+            "",
+            (),
+            lambda place, camera: read_freemocap(place, names.index(camera.name), len(names)),
+        )
     if file.is_file() and file.suffix == ".csv" and is_caliscope(file):
-        return Format("", (), lambda place, camera: read_caliscope(place, names.index(camera.name), names))
+        return Format(
+            "", (), lambda place, camera: read_caliscope(place, names.index(camera.name), names)
+        )
     return None
 
 
@@ -261,17 +294,21 @@ def _skeleton_of_streams(streams: Sequence[ViewStream], wanted: Skeleton | None)
         other = each.skeleton or skeleton
         if other.name != skeleton.name:
             raise InputError(
-                f"{each.source} has the joints of {other.name}, but {first.source} those of {skeleton.name};"
-                " give the"
-                " detections of one model for all cameras"
+                f"{each.source} has the joints of {other.name}, but {first.source} those of "
+                f"{skeleton.name}; give the detections of one model for all cameras"
             )
     if wanted is not None and wanted.joints != skeleton.joints:
-        raise InputError(f"{first.source}: these are joints of {skeleton.name}, not of {wanted.name}")
+        raise InputError(
+            f"{first.source}: these are joints of {skeleton.name}, not of {wanted.name}"
+        )
     return skeleton
 
 
-def _streams_of(people: Sequence[KeptPeople], skeleton: Skeleton) -> tuple[list[ViewStream], list[str], int]:
-    """The people of every camera as candidates, notes on their scores and frames, and the table's `first`.
+def _streams_of(
+    people: Sequence[KeptPeople], skeleton: Skeleton
+) -> tuple[list[ViewStream], list[str], int]:
+    """The people of every camera as candidates, notes on their scores and frames, and the table's
+    `first`.
 
     If all files list only frames with people, frame numbers are kept, and frames before the first
     listed one are empty.
@@ -284,8 +321,8 @@ def _streams_of(people: Sequence[KeptPeople], skeleton: Skeleton) -> tuple[list[
     for each, camera in zip(people, cameras, strict=True):
         if each.farthest is not None and each.farthest <= 1:
             raise InputError(
-                f"{camera.source}: recognised as {camera.program}, but all keypoints are between -1 and 1, and"
-                f" pixels are expected; {camera.rerun}"
+                f"{camera.source}: recognised as {camera.program}, but all keypoints are between "
+                f"-1 and 1, and pixels are expected; {camera.rerun}"
             )
     notes = [] if note is None else [note]
     if first > 0 and not all(camera.every_frame for camera in cameras):
@@ -300,7 +337,9 @@ def _streams_of(people: Sequence[KeptPeople], skeleton: Skeleton) -> tuple[list[
             (since, until), more = camera.gaps[0], ", and others" if len(camera.gaps) > 1 else ""
             where = f"frame {since}" if since == until else f"frames {since} to {until}"
             have = "frames have" if count > 1 else "frame has"
-            notes.append(f"{camera.source}: {count} {have} no file ({where}{more}); no people are read there")
+            notes.append(
+                f"{camera.source}: {count} {have} no file ({where}{more}); no people are read there"
+            )
     return streams, notes, empty
 
 
@@ -312,6 +351,8 @@ def _span(cameras: Sequence[CameraPeople]) -> tuple[int, int]:
         raise InputError(f"{cameras[0].source}: {problem}; give detections of people")
     first, last = min(each.first for each in listed), max(each.last for each in listed)
     if last - first >= _MOST_FRAMES:
-        problem = f"recognised as {listed[0].program}, but its frames would run from {first} to {last}"
+        problem = (
+            f"recognised as {listed[0].program}, but its frames would run from {first} to {last}"
+        )
         raise InputError(f"{listed[0].source}: {problem}; number the pictures by their frames")
     return first, last

@@ -50,7 +50,9 @@ class ViewCandidates:
 
 
 _NONE = np.zeros(0, dtype=np.intp)
-_NOTHING = ViewCandidates.of(_NONE, _NONE, np.zeros((0, 2)), np.zeros(0), np.zeros((0, 2), np.intp), np.zeros(0))
+_NOTHING = ViewCandidates.of(
+    _NONE, _NONE, np.zeros((0, 2)), np.zeros(0), np.zeros((0, 2), np.intp), np.zeros(0)
+)
 
 
 @dataclass(frozen=True)
@@ -70,22 +72,31 @@ class ViewStream:
 
 
 def assemble(
-    views: Sequence[ViewStream], rig: Rig, skeleton: Skeleton, kept: KeptArrays, own_frames: bool = False
+    views: Sequence[ViewStream],
+    rig: Rig,
+    skeleton: Skeleton,
+    kept: KeptArrays,
+    own_frames: bool = False,
 ) -> DetectionTable:
-    """Combine the views of a recording, one `ViewStream` per camera of `rig`, undistorted; stored in `kept`.
+    """Combine the views of a recording, one `ViewStream` per camera of `rig`, undistorted; stored
+    in `kept`.
 
     If they have different frames, the common ones are used, with a note; with `own_frames` all are
     used, and missing ones are empty. InputError if there are none, or if the detections do not fit
     the size of the pictures.
     """
     views, count, said = _aligned(views, own_frames)
-    ideal = [_Undistorted(view.source, camera) for view, camera in zip(views, rig.cameras, strict=True)]
+    ideal = [
+        _Undistorted(view.source, camera) for view, camera in zip(views, rig.cameras, strict=True)
+    ]
     for n, blocks in enumerate(zip_longest(*(view.blocks for view in views), fillvalue=_NOTHING)):
         seen = [each.undistorted(block) for each, block in zip(ideal, blocks, strict=True)]
         stop = min((n + 1) * BLOCK_FRAMES, count)
         keep_block(kept, n, *_together(seen, range(n * BLOCK_FRAMES, stop)))
     notes = tuple(note for each in ideal for reason in each.reasons for note in reason.note())
-    table = DetectionTable(skeleton, kept, count, tuple(view.source for view in views), (*said, *notes))
+    table = DetectionTable(
+        skeleton, kept, count, tuple(view.source for view in views), (*said, *notes)
+    )
     if all(view.frame_count == count for view in views):
         return table
     frame = np.arange(count)
@@ -93,7 +104,9 @@ def assemble(
     return replace(table, picture=np.column_stack(has))
 
 
-def _aligned(views: Sequence[ViewStream], own_frames: bool) -> tuple[Sequence[ViewStream], int, list[str]]:
+def _aligned(
+    views: Sequence[ViewStream], own_frames: bool
+) -> tuple[Sequence[ViewStream], int, list[str]]:
     """Restrict all views to their common frames, or with `own_frames` extend them to all frames;
     returns the views, the number of frames, and a note if frames differ.
     """
@@ -113,10 +126,15 @@ def _aligned(views: Sequence[ViewStream], own_frames: bool) -> tuple[Sequence[Vi
     note = f"{folder}: frame 0 has number {start} in the files ({spans})"
     if not own_frames:
         note = (
-            f"{folder}: cameras have different frames ({spans}); the {stop - start} common ones, {start} to"
-            f" {stop - 1}, are used; if the cameras are unsynchronised, run `shapepose-fg synchronise`"
+            f"{folder}: cameras have different frames ({spans}); the {stop - start} common ones, "
+            f"{start} to {stop - 1}, are used; if the cameras are unsynchronised, run "
+            "`shapepose-fg synchronise`"
         )
-    return [_part(view, start - view.first_number, stop - start) for view in views], stop - start, [note]
+    return (
+        [_part(view, start - view.first_number, stop - start) for view in views],
+        stop - start,
+        [note],
+    )
 
 
 def _spans(views: Sequence[ViewStream]) -> str:
@@ -129,7 +147,9 @@ def _span_words(view: ViewStream) -> str:
     """The number of a view's frames, and their numbers, in words."""
     if view.frame_count == 0:
         return "has none"
-    return f"has {view.frame_count}, {view.first_number} to {view.first_number + view.frame_count - 1}"
+    return (
+        f"has {view.frame_count}, {view.first_number} to {view.first_number + view.frame_count - 1}"
+    )
 
 
 def _part(view: ViewStream, lead: int, count: int) -> ViewStream:
@@ -141,7 +161,9 @@ def _part(view: ViewStream, lead: int, count: int) -> ViewStream:
         waiting, number = _NOTHING, 0
         for n, block in enumerate(view.blocks, 1):
             shifted = replace(block, frame=block.frame - lead)
-            waiting = _joined([waiting, shifted.only((shifted.frame >= 0) & (shifted.frame < count))])
+            waiting = _joined(
+                [waiting, shifted.only((shifted.frame >= 0) & (shifted.frame < count))]
+            )
             end = (number + 1) * BLOCK_FRAMES
             if end <= min(n * BLOCK_FRAMES - lead, count):
                 yield waiting.only(waiting.frame < end)
@@ -198,7 +220,9 @@ def _frames_of(recording: DetectionTable, view: int, picture: Index, begin: int)
     there = np.flatnonzero(picture >= 0)
     every = [recording[frame] for frame in picture[there].tolist()]
     parts = [each.only(each.view == view) for each in every]
-    frames = [np.full(len(part), begin + frame) for part, frame in zip(parts, there.tolist(), strict=True)]
+    frames = [
+        np.full(len(part), begin + frame) for part, frame in zip(parts, there.tolist(), strict=True)
+    ]
     return _joined([_NOTHING, *map(ViewCandidates, frames, parts)])
 
 
@@ -252,7 +276,9 @@ class _Undistorted:
     def _words(self, view: ViewCandidates, why: str, row: int) -> str:
         """Text that identifies one left-out candidate of a block, with the reason."""
         x, y = view.seen.xy[row]
-        return f"{self.source}: frame {view.frame[row]} has a joint at pixel ({x:.0f}, {y:.0f}), {why}"
+        return (
+            f"{self.source}: frame {view.frame[row]} has a joint at pixel ({x:.0f}, {y:.0f}), {why}"
+        )
 
 
 def undistorted(view: ViewCandidates, source: Path | str, camera: Camera) -> ViewCandidates:

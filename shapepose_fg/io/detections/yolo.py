@@ -34,10 +34,14 @@ def read_yolo(folder: Path, image_size: tuple[int, int]) -> CameraPeople:
 
     def read(file: Path) -> list[list[float]]:
         lines = enumerate(read_text(file, may_be_empty=True, most=MIDDLE).splitlines(), start=1)
-        return [_person(file, line, text.split(), image_size) for line, text in lines if text.strip()]
+        return [
+            _person(file, line, text.split(), image_size) for line, text in lines if text.strip()
+        ]
 
     blocks, ends = frame_blocks(folder, _YOLO, found, read), (found[0][0], found[-1][0])
-    return CameraPeople(folder, _YOLO, blocks, *ends, every_frame=False, lists_people=True, rerun=_RERUN)
+    return CameraPeople(
+        folder, _YOLO, blocks, *ends, every_frame=False, lists_people=True, rerun=_RERUN
+    )
 
 
 def _person(file: Path, line: int, words: list[str], image_size: tuple[int, int]) -> list[float]:
@@ -49,15 +53,17 @@ def _person(file: Path, line: int, words: list[str], image_size: tuple[int, int]
     numbers = np.array(words[_BOX:], dtype=np.float64)
     count = len(numbers) // 3
     if count < 4:
-        raise InputError(f"{file}: line {line} has a box but no keypoints; run a pose model: yolo pose predict")
+        raise InputError(
+            f"{file}: line {line} has a box but no keypoints; run a pose model: yolo pose predict"
+        )
     points = numbers[: 3 * count].reshape(count, 3)
     if (
         not ((points[:, :2] > -1) & (points[:, :2] < 2)).all()
         or not ((points[:, 2] >= 0) & (points[:, 2] <= 2)).all()
     ):
         raise InputError(
-            f"{file}: line {line} must hold x and y of keypoints as fractions of the picture size, and scores;"
-            f" {_RERUN}"
+            f"{file}: line {line} must hold x and y of keypoints as fractions of the picture "
+            f"size, and scores; {_RERUN}"
         )
     points[(points[:, :2] == 0).all(axis=1), 2] = 0  # keypoints with a low score are at 0 0
     points[:, :2] *= image_size

@@ -58,7 +58,11 @@ def glb_bytes(
     for who, motion in motions.items():
         roots.append(_add_person(file, who, motion, shared, triangles))
         _animate(file, roots[-1], motion, times_s - times_s[0])
-    extras = {} if origin_m is None or not origin_m.any() else {"extras": {"origin_m": origin_m.tolist()}}
+    extras = (
+        {}
+        if origin_m is None or not origin_m.any()
+        else {"extras": {"origin_m": origin_m.tolist()}}
+    )
     return file.content(roots, extras)
 
 
@@ -78,16 +82,25 @@ class _File:
         self.lists[kind].append(what)
         return len(self.lists[kind]) - 1
 
-    def array(self, values: NDArray[Any], target: int | None = None, *, bounds: bool = False) -> int:
+    def array(
+        self, values: NDArray[Any], target: int | None = None, *, bounds: bool = False
+    ) -> int:
         """Append an array and return its accessor; positions and times need `bounds`."""
-        flat = np.ascontiguousarray(values.mT if values.ndim == 3 else values)  # matrices are column-major
+        flat = np.ascontiguousarray(
+            values.mT if values.ndim == 3 else values
+        )  # matrices are column-major
         self._binary += bytes(-len(self._binary) % 4)  # arrays are aligned to 4 bytes
         place = {"buffer": 0, "byteOffset": len(self._binary), "byteLength": flat.nbytes}
         self._binary += flat.tobytes()
-        limits = {"min": np.atleast_1d(flat.min(0)).tolist(), "max": np.atleast_1d(flat.max(0)).tolist()}
+        limits = {
+            "min": np.atleast_1d(flat.min(0)).tolist(),
+            "max": np.atleast_1d(flat.max(0)).tolist(),
+        }
         return self.add(
             "accessors",
-            bufferView=self.add("bufferViews", **place, **({} if target is None else {"target": target})),
+            bufferView=self.add(
+                "bufferViews", **place, **({} if target is None else {"target": target})
+            ),
             componentType=_COMPONENTS[flat.dtype.name],
             count=len(flat),
             type=_TYPES[values.shape[1:]],
@@ -95,13 +108,17 @@ class _File:
         )
 
     def content(self, roots: list[int], more: dict[str, Any]) -> bytes:
-        """The whole file; its scene has the root nodes `roots`, and `more` are further properties."""
+        """The whole file; its scene has the root nodes `roots`, and `more` are further
+        properties.
+        """
         binary = bytes(self._binary) + bytes(-len(self._binary) % 4)
         tree = {
             "asset": {"version": "2.0", "generator": "shapepose-fg"},
             "scene": 0,
             "scenes": [{"name": "people", "nodes": roots, **more}],
-            "animations": [{"name": "motion", "samplers": self.samplers, "channels": self.channels}],
+            "animations": [
+                {"name": "motion", "samplers": self.samplers, "channels": self.channels}
+            ],
             "buffers": [{"byteLength": len(binary)}],
             **self.lists,
         }
@@ -132,7 +149,9 @@ def influences(weights: Array) -> list[tuple[NDArray[np.uint8], NDArray[np.float
     return sets
 
 
-def _add_person(file: _File, who: int, motion: Motion, shared: dict[str, int], triangles: int) -> int:
+def _add_person(
+    file: _File, who: int, motion: Motion, shared: dict[str, int], triangles: int
+) -> int:
     """Add the nodes of a person in the pose of the first frame, with mesh, material and skin;
     returns the index of the first node.
 
@@ -164,7 +183,13 @@ def _add_person(file: _File, who: int, motion: Motion, shared: dict[str, int], t
     inverse = np.tile(np.eye(4, dtype=np.float32), (BONES, 1, 1))
     inverse[:, :3, 3] = -rest.joints
     bones = list(range(first + 1, first + 1 + BONES))
-    skin = file.add("skins", name=name, inverseBindMatrices=file.array(inverse), skeleton=first + 1, joints=bones)
+    skin = file.add(
+        "skins",
+        name=name,
+        inverseBindMatrices=file.array(inverse),
+        skeleton=first + 1,
+        joints=bones,
+    )
     file.add("nodes", name=f"{name}_skin", mesh=mesh, skin=skin)
     return first
 
@@ -172,10 +197,14 @@ def _add_person(file: _File, who: int, motion: Motion, shared: dict[str, int], t
 def _animate(file: _File, first: int, motion: Motion, times: Array) -> None:
     """Add the animation channels of the person whose first node is `first`."""
 
-    def channel(node: int, path: str, at: int, values: Array, interpolation: str = "LINEAR") -> None:
+    def channel(
+        node: int, path: str, at: int, values: Array, interpolation: str = "LINEAR"
+    ) -> None:
         output = file.array(values.astype(np.float32))
         file.samplers.append({"input": at, "output": output, "interpolation": interpolation})
-        file.channels.append({"sampler": len(file.samplers) - 1, "target": {"node": node, "path": path}})
+        file.channels.append(
+            {"sampler": len(file.samplers) - 1, "target": {"node": node, "path": path}}
+        )
 
     at = file.array(times[motion.index].astype(np.float32), bounds=True)
     channel(first + 1, "translation", at, motion.pelvis)
@@ -187,7 +216,9 @@ def _animate(file: _File, first: int, motion: Motion, times: Array) -> None:
     if not there.all():
         turns = np.flatnonzero(np.diff(there, prepend=not there[0]))
         scale = np.repeat(there[turns].astype(np.float64)[:, None], 3, axis=1)
-        channel(first, "scale", file.array(times[turns].astype(np.float32), bounds=True), scale, "STEP")
+        channel(
+            first, "scale", file.array(times[turns].astype(np.float32), bounds=True), scale, "STEP"
+        )
 
 
 def _shortest(rotations: Array) -> Array:

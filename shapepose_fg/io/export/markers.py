@@ -25,7 +25,10 @@ from shapepose_fg.io.pose2sim_project import Pose2SimProject
 
 _MOST = 65_535
 """Maximum number of frames in a C3D file, and maximum frame number: both have 16 bits."""
-_TRC_HEAD = "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames"
+_TRC_HEAD = "\t".join(
+    "DataRate CameraRate NumFrames NumMarkers Units OrigDataRate OrigDataStartFrame "
+    "OrigNumFrames".split()
+)
 
 
 @dataclass(frozen=True)
@@ -50,7 +53,9 @@ class Markers:
         return np.flatnonzero(self.there.sum(axis=1))
 
 
-def markers_of(take: Take, person: int, kind: MarkerSet, arrays: SmplArrays | None = None) -> Markers:
+def markers_of(
+    take: Take, person: int, kind: MarkerSet, arrays: SmplArrays | None = None
+) -> Markers:
     """The markers of one person; `arrays` is the body model, required only for `MarkerSet.BODY`."""
     axes = opensim_axes(take.up)
     if kind == MarkerSet.BODY:
@@ -112,11 +117,17 @@ def _c3d_take(written: Written, take: Take) -> tuple[Take, Array]:
 
 
 def _each(
-    job: Job, take: Take, kind: str, written: Written, write: Callable[[int, Markers, Take, Written], None]
+    job: Job,
+    take: Take,
+    kind: str,
+    written: Written,
+    write: Callable[[int, Markers, Take, Written], None],
 ) -> Written:
     """Call `write` for each person with a marker; people without markers are noted."""
     for person, who in enumerate(take.persons.tolist()):
-        markers = markers_of(take, person, job.markers, job.arrays if job.markers == MarkerSet.BODY else None)
+        markers = markers_of(
+            take, person, job.markers, job.arrays if job.markers == MarkerSet.BODY else None
+        )
         if len(markers.frames) > 0:
             write(who, markers, take, written)
         else:
@@ -134,7 +145,10 @@ def trc_text(markers: Markers, frames: Whole, times_s: Array, fps: float, name: 
     rows = markers.frames
     if len(rows) == 0:
         raise ValueError(f"{name}: no frame has a marker")
-    frames, words = frames[rows], np.where(markers.there[..., None], np.char.mod("%.6f", markers.xyz), "NaN")[rows]
+    frames, words = (
+        frames[rows],
+        np.where(markers.there[..., None], np.char.mod("%.6f", markers.xyz), "NaN")[rows],
+    )
     rate, count = f"{fps:.10g}", len(markers.names)
     lines = [
         f"PathFileType\t4\t(X/Y/Z)\t{name}",
@@ -143,7 +157,9 @@ def trc_text(markers: Markers, frames: Whole, times_s: Array, fps: float, name: 
         "Frame#\tTime\t" + "".join(f"{marker}\t\t\t" for marker in markers.names),
         "\t\t" + "".join(f"X{n}\tY{n}\tZ{n}\t" for n in range(1, count + 1)),
     ]
-    every = zip(frames.tolist(), times_s[rows].tolist(), words.reshape(len(rows), -1).tolist(), strict=True)
+    every = zip(
+        frames.tolist(), times_s[rows].tolist(), words.reshape(len(rows), -1).tolist(), strict=True
+    )
     lines += ["\t".join((str(frame), f"{time:.6f}", *row)) for frame, time, row in every]
     return "\n".join(lines) + "\n"
 
@@ -174,10 +190,14 @@ def _write_c3d(
 
 
 def c3d_bytes(
-    markers: Markers, first_frame: int, fps: float, part: slice = slice(None), origin_m: Array | None = None
+    markers: Markers,
+    first_frame: int,
+    fps: float,
+    part: slice = slice(None),
+    origin_m: Array | None = None,
 ) -> bytes:
-    """A C3D file of the frames `part`; `first_frame`, counted from 0, is in its header, where frames count from 1.
-    `part` has at most 65,535 frames, and the last is number 65,535 at most.
+    """A C3D file of the frames `part`; `first_frame`, counted from 0, is in its header, where
+    frames count from 1. `part` has at most 65,535 frames, and the last is number 65,535 at most.
 
     A point's residual is the standard deviation of its position in whole millimetres, clipped to 1
     to 255 because the format has one byte for it. It is 0 if unknown (in C3D: a computed point),
@@ -242,7 +262,9 @@ def write_pose2sim_files(people: Reconstruction, up: Axis, project: Pose2SimProj
             written.notes.append(f"person {take.persons[person]} has no joint in any frame")
             continue
 
-        def name(span: tuple[int, int] | None, number: int = number, markers: Markers = markers) -> str:
+        def name(
+            span: tuple[int, int] | None, number: int = number, markers: Markers = markers
+        ) -> str:
             first, last = take.frames[markers.frames[[0, -1]]].tolist() if span is None else span
             return project.name_of(number if project.multi_person else None, first, last)
 
@@ -250,13 +272,17 @@ def write_pose2sim_files(people: Reconstruction, up: Axis, project: Pose2SimProj
         written.add(path, trc_text(markers, take.frames, take.times_s, take.fps, path.name))
         holes = int(np.ptp(markers.frames)) + 1 - len(markers.frames)
         if holes > 0:
-            written.notes.append(f"{path.name} leaves out {holes} frames without data of the person")
+            written.notes.append(
+                f"{path.name} leaves out {holes} frames without data of the person"
+            )
         if even is not None:
-            _write_c3d(markers_of(even, person, MarkerSet.OPENSIM), even, folder, name, written, origin)
+            _write_c3d(
+                markers_of(even, person, MarkerSet.OPENSIM), even, folder, name, written, origin
+            )
     left = sorted(before - {each.name for each in written.files})
     if len(left) > 0:
         written.notes.append(
-            f"{folder} also has {' '.join(left[:4])}{' ...' if len(left) > 4 else ''} of an earlier run; remove"
-            " the files that other programs should not read"
+            f"{folder} also has {' '.join(left[:4])}{' ...' if len(left) > 4 else ''} of an "
+            "earlier run; remove the files that other programs should not read"
         )
     return written

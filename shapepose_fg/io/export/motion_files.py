@@ -44,7 +44,9 @@ def write_amass(job: Job) -> Written:
         write_atomically(path, lambda stream, columns=columns: write_npz(stream, columns))
         written.files.append(path)
     if job.body is None and len(written.files) > 0:
-        written.notes.append("amass: betas are those of the built-in body model, not of SMPL; poses fit both")
+        written.notes.append(
+            "amass: betas are those of the built-in body model, not of SMPL; poses fit both"
+        )
     return written
 
 
@@ -73,7 +75,9 @@ def amass_columns(segment: Motion, fps: float) -> dict[str, NDArray[Any]]:
 
 
 def _gender(body: str) -> str:
-    """The gender of a body model by its file name, in SMPL's style; neutral if the name has none."""
+    """The gender of a body model by its file name, in SMPL's style; neutral if the name has
+    none.
+    """
     name = body.lower().replace("-", "_")
     words = name.replace(".", "_").split("_")
     if "female" in words or "f" in words:
@@ -96,10 +100,18 @@ def bvh_text(motion: Motion, fps: float) -> str:
     others do not.
     """
     count = len(motion.index)
-    lines = ["HIERARCHY", *_joint(0, motion.rest, ""), "MOTION", f"Frames: {count}", f"Frame Time: {1 / fps:.12g}"]
+    lines = [
+        "HIERARCHY",
+        *_joint(0, motion.rest, ""),
+        "MOTION",
+        f"Frames: {count}",
+        f"Frame Time: {1 / fps:.12g}",
+    ]
     angles = _zxy_degrees(motion.rotations[:, _ORDER]).reshape(count, -1)
     # Rounding errors are a hundredth of a millimetre at the end of the longest chain.
-    rows = np.concatenate([np.char.mod("%.6f", motion.pelvis), np.char.mod("%.5f", angles)], axis=1).tolist()
+    rows = np.concatenate(
+        [np.char.mod("%.6f", motion.pelvis), np.char.mod("%.5f", angles)], axis=1
+    ).tolist()
     return "\n".join([*lines, *(" ".join(row) for row in rows)]) + "\n"
 
 
@@ -117,7 +129,9 @@ def _zxy_degrees(rotations: Array) -> Array:
     return np.unwrap(angles.reshape(*rotations.shape[:2], 3), axis=0, period=360)
 
 
-_CHILDREN = [[child for child in range(BONES) if SMPL_PARENTS[child] == joint] for joint in range(BONES)]
+_CHILDREN = [
+    [child for child in range(BONES) if SMPL_PARENTS[child] == joint] for joint in range(BONES)
+]
 
 
 def _tree(joint: int) -> Iterator[int]:

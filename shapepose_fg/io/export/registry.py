@@ -87,8 +87,8 @@ class Written:
         if origin.any():
             listed = " ".join(f"{each:.0f}" for each in origin)
             self.notes.append(
-                f"{kind}: coordinates are relative to {listed} m of the world, in the axes of the file"
-                f" ({where}), because the format keeps seven digits"
+                f"{kind}: coordinates are relative to {listed} m of the world, in the axes of "
+                f"the file ({where}), because the format keeps seven digits"
             )
         return local, origin
 
@@ -99,7 +99,8 @@ class Written:
         even, lost = take.at_one_rate()
         if lost > 0:
             self.notes.append(
-                f"{lost} frames are left out: at {take.fps:g} Hz, other frames are nearer to their times"
+                f"{lost} frames are left out: at {take.fps:g} Hz, other frames are nearer to "
+                "their times"
             )
         return even
 
@@ -126,7 +127,9 @@ class Format:
 
     @property
     def write(self) -> Any:
-        """The writer function; InputError if a package is missing or the take lacks a requirement."""
+        """The writer function; InputError if a package is missing or the take lacks a
+        requirement.
+        """
         module, function = self.writer.split(":")
         return getattr(import_module(f"shapepose_fg.io.export.{module}"), function)
 
@@ -135,17 +138,19 @@ _ANYBODY = {"identities": False}
 FORMATS = {
     each.name: each
     for each in (
-        Format("amass", "poses and shape of a body, for learning code (npz)", "motion_files:write_amass"),
+        Format("amass", "poses and shape of a body, for learning code (npz)",
+               "motion_files:write_amass"),
         Format("trc", "markers, for OpenSim and Pose2Sim", "markers:write_trc"),
         Format("c3d", "markers, for biomechanics", "markers:write_c3d"),
         Format("bvh", "a moving skeleton, for animation", "motion_files:write_bvh"),
         Format("glb", "moving bodies with their skin, for Blender and the web", "glb:write_glb"),
         Format("csv", "joints as a table", "tables:write_csv", **_ANYBODY),
-        Format("parquet", "all columns, for archives", "tables:write_parquet", **_ANYBODY, rows=True),
+        Format("parquet", "all columns, for archives", "tables:write_parquet", **_ANYBODY,
+               rows=True),
         Format("mcap", "ROS 2 messages, for rosbag2, RViz and Foxglove", "mcap:write_mcap"),
         Format(
-            "rrd", "everything on a timeline, for the rerun viewer", "rerun_app:write_rrd", **_ANYBODY,
-            observations=True,
+            "rrd", "everything on a timeline, for the rerun viewer", "rerun_app:write_rrd",
+            **_ANYBODY, observations=True,
         ),
     )
 }  # fmt: skip
@@ -192,7 +197,9 @@ def export_result(
         else:
             done[each.name] = each.write(job)
         if len(done[each.name].files) == 0:
-            raise InputError(f"{results}: {'; '.join(done[each.name].notes)}; leave out {each.name}")
+            raise InputError(
+                f"{results}: {'; '.join(done[each.name].notes)}; leave out {each.name}"
+            )
     return done
 
 
@@ -219,8 +226,8 @@ def read_take(
         axis: Any = up or (None if rig is None else rig.up)
         if axis is None:
             raise InputError(
-                f"{cameras}: this file is missing, and it contains the up axis; give --up, such as --up z, or"
-                " write it with `people.save(folder, rig)`"
+                f"{cameras}: this file is missing, and it contains the up axis; give --up, such "
+                "as --up z, or write it with `people.save(folder, rig)`"
             )
         people = opened.rows(chosen_rows(opened, path, frames, persons), observations=observations)
     if frames is not None:  # the requested frames among the reconstructed ones
@@ -246,8 +253,13 @@ def chosen_rows(
         mine = np.isin(opened.person, persons)
     if frames is None:
         return np.flatnonzero(mine)
-    found, there = mine & (opened.frame >= frames.start) & (opened.frame < frames.stop), opened.frame[mine]
+    found, there = (
+        mine & (opened.frame >= frames.start) & (opened.frame < frames.stop),
+        opened.frame[mine],
+    )
     if len(there) > 0 and not found.any():
         problem = f"{path} has no people in these frames"
-        raise InputError(f"--frames: {problem}; people are in frames {there.min()} to {there.max()}")
+        raise InputError(
+            f"--frames: {problem}; people are in frames {there.min()} to {there.max()}"
+        )
     return np.flatnonzero(found)

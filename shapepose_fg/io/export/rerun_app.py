@@ -58,7 +58,9 @@ def shown(first: Any, url: str | None) -> Iterator[Any]:
             )
     except (RuntimeError, ValueError, OSError) as error:
         place = "started" if url is None else f"reached at {url}"
-        raise InputError(f"the rerun viewer cannot be {place}: {' '.join(str(error).split())}") from None
+        raise InputError(
+            f"the rerun viewer cannot be {place}: {' '.join(str(error).split())}"
+        ) from None
     yield stream
     stream.flush()
 
@@ -76,7 +78,10 @@ def quiet_viewer() -> list[str]:
     if viewer is None or not switch_off(viewer):
         return []
     return [
-        "rerun's usage statistics were on and have been switched off; `rerun analytics enable` switches them on"
+        (
+            "rerun's usage statistics were on and have been switched off; `rerun analytics enable` "
+            "switches them on"
+        )
     ]
 
 
@@ -105,7 +110,9 @@ def written(path: Path, first: Any) -> Iterator[Any]:
 def write_rrd(job: Job) -> Written:
     """Write `people.rrd`; without bodies if the body model is missing."""
     found, path = Written(), job.folder / "people.rrd"
-    take, origin = found.near_origin(job.take, np.eye(3), "rrd", "origin_m of the entity world/origin")
+    take, origin = found.near_origin(
+        job.take, np.eye(3), "rrd", "origin_m of the entity world/origin"
+    )
     arrays, notes = body_if_there(job)
     notes += ["cameras are not drawn, because cameras.json is missing"] if take.rig is None else []
     with written(path, layout_of(take)) as stream:
@@ -148,13 +155,17 @@ def layout(up: Axis, rig: Rig | None, around: Array, drawn: Sequence[str]) -> An
             origin=camera_path(camera.name),
             name=camera.name,
             contents=["$origin/**", *drawn],
-            visual_bounds=rrb.VisualBounds2D(x_range=[0, camera.image_size[0]], y_range=[0, camera.image_size[1]]),
+            visual_bounds=rrb.VisualBounds2D(
+                x_range=[0, camera.image_size[0]], y_range=[0, camera.image_size[1]]
+            ),
         )
         for camera in cameras
     ]
     rows = [rrb.Grid(*views), rrb.Horizontal(*plots)] if views else plots
     return rrb.Blueprint(
-        rrb.Horizontal(world, rrb.Vertical(*rows, row_shares=[3, 1] if views else None), column_shares=[1, 1]),
+        rrb.Horizontal(
+            world, rrb.Vertical(*rows, row_shares=[3, 1] if views else None), column_shares=[1, 1]
+        ),
         rrb.TimePanel(timeline="time", state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         rrb.BlueprintPanel(state="collapsed"),
@@ -164,7 +175,9 @@ def layout(up: Axis, rig: Rig | None, around: Array, drawn: Sequence[str]) -> An
 def _eye(rrb: Any, axis: Axis, around: Array) -> Any:
     """A viewpoint above and beside the points (N, 3), far enough to see all of them."""
     around = around[np.isfinite(around).all(axis=1)]
-    low, high = np.quantile(around, [0.02, 0.98], axis=0) if len(around) > 0 else (np.zeros(3), np.ones(3))
+    low, high = (
+        np.quantile(around, [0.02, 0.98], axis=0) if len(around) > 0 else (np.zeros(3), np.ones(3))
+    )
     middle, reach = (low + high) / 2, max(float(np.linalg.norm(high - low)), 2.0)
     up = y_up(axis)[1]
     side = np.roll(up, 1) + 0.6 * np.roll(up, 2)
@@ -182,7 +195,9 @@ def switch_off(viewer: str) -> bool:
 
     def says(command: str) -> str:
         words = [viewer, "analytics", command]
-        done = subprocess.run(words, capture_output=True, text=True, timeout=_PATIENCE_S, check=True)
+        done = subprocess.run(
+            words, capture_output=True, text=True, timeout=_PATIENCE_S, check=True
+        )
         return done.stdout
 
     def on() -> bool:
@@ -202,6 +217,6 @@ def switch_off(viewer: str) -> bool:
     except (OSError, ValueError, AttributeError, subprocess.SubprocessError) as error:
         problem = " ".join(str(error).split())
     raise InputError(
-        f"rerun's usage statistics cannot be switched off ({problem}); run `rerun analytics disable`, or give"
-        " --statistics to allow them"
+        f"rerun's usage statistics cannot be switched off ({problem}); run `rerun analytics "
+        "disable`, or give --statistics to allow them"
     )

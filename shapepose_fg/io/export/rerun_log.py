@@ -1,4 +1,6 @@
-"""Content of a rerun recording: people and cameras in the world, detections, their gates and residuals."""
+"""Content of a rerun recording: people and cameras in the world, detections, their gates and
+residuals.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -102,7 +104,16 @@ class LiveLog:
         if len(rows) == 0:
             return
         places = np.arange(len(rows), dtype=np.intp)[:, None]
-        take = Take(rows, persons, places, rows.frame[:1].astype(np.int64), time_s, 1.0, self._rig.up, self._rig)
+        take = Take(
+            rows,
+            persons,
+            places,
+            rows.frame[:1].astype(np.int64),
+            time_s,
+            1.0,
+            self._rig.up,
+            self._rig,
+        )
         for person, who in enumerate(persons.tolist()):
             if who not in self._met:
                 self._met.add(who)
@@ -143,7 +154,9 @@ def _sigma_path(who: int) -> str:
 def _log_looks(rr: ModuleType, stream: Any, who: int, skin_of: Skin | None) -> None:
     """Log static content of a person: line colour, and triangles of the surface."""
     colour = _rgb8(np.array(colour_of(who)))
-    stream.log(_sigma_path(who), rr.SeriesLines(colors=colour[None], names=f"person {who}"), static=True)
+    stream.log(
+        _sigma_path(who), rr.SeriesLines(colors=colour[None], names=f"person {who}"), static=True
+    )
     if skin_of is not None:
         shade = [*colour.tolist(), round(255 * 0.55)]
         surface = rr.Mesh3D.from_fields(triangle_indices=skin_of.faces, albedo_factor=shade)
@@ -180,8 +193,13 @@ def _log_person(rr: ModuleType, stream: Any, take: Take, person: int) -> None:
         stream.log(f"{path}/joints", points)
         lines = joints[bones]
         lines = lines[np.isfinite(lines).all(axis=(1, 2))]
-        stream.log(f"{path}/bones", rr.LineStrips3D(lines, colors=_rgb8(colour[None]), radii=_BONE_M))
-        stream.log(f"{path}/uncertainty", _ellipsoids(rr, joints[placed], people.covariance[row][placed], colour))
+        stream.log(
+            f"{path}/bones", rr.LineStrips3D(lines, colors=_rgb8(colour[None]), radii=_BONE_M)
+        )
+        stream.log(
+            f"{path}/uncertainty",
+            _ellipsoids(rr, joints[placed], people.covariance[row][placed], colour),
+        )
         if len(known) > 0:
             stream.log(plot, rr.Scalars(float(np.median(known))))
 
@@ -201,7 +219,11 @@ def _ellipsoids(rr: ModuleType, centres: Array, covariance: Array, colour: Array
 
 def _log_bodies(rr: ModuleType, stream: Any, take: Take, person: int, skin_of: Skin) -> None:
     """Log the body of one person, in the frames that have one."""
-    path, arrays, faces = f"{person_path(int(take.persons[person]))}/body", skin_of.arrays, skin_of.faces
+    path, arrays, faces = (
+        f"{person_path(int(take.persons[person]))}/body",
+        skin_of.arrays,
+        skin_of.faces,
+    )
     motion = motion_of(take, person, arrays, np.eye(3))
     index = np.zeros(0, dtype=np.intp) if motion is None else motion.index
     for at in np.setdiff1d(np.flatnonzero(take.rows[person] >= 0), index).tolist():
@@ -217,14 +239,19 @@ def _log_bodies(rr: ModuleType, stream: Any, take: Take, person: int, skin_of: S
         for place, at in enumerate(index[part].tolist()):
             _set_time(stream, take, at)
             normals = vertex_normals(vertices[place], faces).astype(np.float32)
-            stream.log(path, rr.Mesh3D.from_fields(vertex_positions=vertices[place], vertex_normals=normals))
+            stream.log(
+                path,
+                rr.Mesh3D.from_fields(vertex_positions=vertices[place], vertex_normals=normals),
+            )
 
 
 def _log_moving(rr: ModuleType, stream: Any, take: Take, rig: Rig) -> None:
     """Log moving cameras, frame by frame."""
     for index, time_s in enumerate(take.times_s if rig.moves else ()):
         _set_time(stream, take, index)
-        for camera, moves in zip(rig.at(np.full(len(rig), time_s)).cameras, rig.carrier >= 0, strict=True):
+        for camera, moves in zip(
+            rig.at(np.full(len(rig), time_s)).cameras, rig.carrier >= 0, strict=True
+        ):
             if moves:
                 pose = rr.Transform3D(translation=camera.centre, mat3x3=camera.wTc[:3, :3])
                 stream.log(camera_path(camera.name), pose)
@@ -242,7 +269,9 @@ def _log_cameras(rr: ModuleType, stream: Any, rig: Rig) -> None:
         )
         stream.log(camera_path(camera.name), *([] if camera.carrier else [pose]), lens, static=True)
     words = {gate: gate.name.lower().replace("_", " ") for gate in _GATES}
-    reasons = [rr.AnnotationInfo(id=int(gate), label=words[gate], color=_GATES[gate]) for gate in _GATES]
+    reasons = [
+        rr.AnnotationInfo(id=int(gate), label=words[gate], color=_GATES[gate]) for gate in _GATES
+    ]
     stream.log(_CAMERAS, rr.AnnotationContext(reasons), static=True)
 
 
@@ -311,14 +340,20 @@ def log_pictures(
                 progress(done, total)
 
 
-def undistorting(camera: Camera, placement: Placement) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def undistorting(
+    camera: Camera, placement: Placement
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Maps for undistortion (columns and rows, (H, W)): position in the original picture of each
     pixel of the undistorted, calibrated picture.
     """
     width, height = camera.image_size
-    column, row = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
+    column, row = np.meshgrid(
+        np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64)
+    )
     pixels = np.stack([column.ravel(), row.ravel()], axis=1)
-    there = placement.to_picture(camera.distort(pixels)).reshape(height, width, 2).astype(np.float32)
+    there = (
+        placement.to_picture(camera.distort(pixels)).reshape(height, width, 2).astype(np.float32)
+    )
     return np.ascontiguousarray(there[..., 0]), np.ascontiguousarray(there[..., 1])
 
 

@@ -99,14 +99,18 @@ class Motion:
             if len(index) > len(given):
                 from scipy.spatial.transform import Rotation, Slerp  # slow to import; only for gaps
 
-                turns = [Slerp(given, Rotation.from_quat(bone)) for bone in rotations.swapaxes(0, 1)]
+                turns = [
+                    Slerp(given, Rotation.from_quat(bone)) for bone in rotations.swapaxes(0, 1)
+                ]
                 rotations = np.stack([turn(index).as_quat() for turn in turns], axis=1)
                 pelvis = np.stack([np.interp(index, given, axis) for axis in pelvis.T], axis=1)
             yield Motion(self.rest, index, rotations, pelvis, filled=~np.isin(index, given))
 
 
 def motion_of(take: Take, person: int, arrays: SmplArrays, axes: Array) -> Motion | None:
-    """The body of one person in the world rotated by `axes` (3, 3); None for a person without a body."""
+    """The body of one person in the world rotated by `axes` (3, 3); None for a person without a
+    body.
+    """
     parts = [take.column(name, person) for name in BODY]
     index = np.flatnonzero(with_body(*parts))
     if len(index) == 0:
@@ -120,11 +124,15 @@ def motion_of(take: Take, person: int, arrays: SmplArrays, axes: Array) -> Motio
     motion = Motion(RestBody(arrays, betas.mean(axis=0)), index, quaternions, pelvis)
     if (betas == betas[0]).all():
         return motion
-    apart = np.linalg.norm(pose_joints(_offsets(own), quaternions, pelvis) - motion.joints(), axis=-1)
+    apart = np.linalg.norm(
+        pose_joints(_offsets(own), quaternions, pelvis) - motion.joints(), axis=-1
+    )
     return replace(motion, spread_m=float(apart.max()))
 
 
-def everybody(job: Job, take: Take, kind: str, axes: Array, written: Written) -> Iterator[tuple[int, Motion]]:
+def everybody(
+    job: Job, take: Take, kind: str, axes: Array, written: Written
+) -> Iterator[tuple[int, Motion]]:
     """All people with a body, with their motions in the world rotated by `axes` (3, 3).
 
     People without a body, or with several shapes, are noted in `written`.
@@ -136,13 +144,15 @@ def everybody(job: Job, take: Take, kind: str, axes: Array, written: Written) ->
             continue
         if motion.spread_m > _VISIBLE_M:
             written.notes.append(
-                f"{kind}: person {who} has several body shapes; the file has their mean, which moves joints by"
-                f" up to {1e3 * motion.spread_m:.0f} mm"
+                f"{kind}: person {who} has several body shapes; the file has their mean, which "
+                f"moves joints by up to {1e3 * motion.spread_m:.0f} mm"
             )
         yield who, motion
 
 
-def all_segments(job: Job, kind: str, axes: Array, written: Written) -> Iterator[tuple[Path, Motion, Take]]:
+def all_segments(
+    job: Job, kind: str, axes: Array, written: Written
+) -> Iterator[tuple[Path, Motion, Take]]:
     """All motions at a constant rate, split at long gaps: path without suffix, motion, and take of
     its frames.
     """
@@ -195,6 +205,8 @@ def _offsets(rest: Array) -> Array:
 
 
 def _accumulated(rotations: Array) -> Array:
-    """(F, 24, 3, 3) rotations world from bone, from quaternions (F, 24, 4) relative to the parent."""
+    """(F, 24, 3, 3) rotations world from bone, from quaternions (F, 24, 4) relative to the
+    parent.
+    """
     cross = hat(rotations[..., :3])
     return accumulate(np.eye(3) + 2 * (rotations[..., 3:, None] * cross + cross @ cross))

@@ -22,8 +22,8 @@ from shapepose_fg.io.export.registry import Job, Written
 from shapepose_fg.io.export.take import Take
 
 COLUMNS = (
-    "frame time_s person joint x_m y_m z_m sigma_m sigma_x_m sigma_y_m sigma_z_m vx_m_s vy_m_s vz_m_s"
-    " known confidence"
+    "frame time_s person joint x_m y_m z_m sigma_m sigma_x_m sigma_y_m sigma_z_m vx_m_s vy_m_s "
+    "vz_m_s known confidence"
 ).split()
 """Header of the CSV file."""
 _GROUP_ROWS = 4096
@@ -94,7 +94,9 @@ def write_parquet(opened: OpenedReconstruction, rows: Index | None, folder: Path
         arrow.field(name, kind(values), metadata={"shape": json.dumps(values.shape[1:])})
         for name, values in first.items()
     ]
-    schema = arrow.schema(fields, metadata={name: json.dumps(value) for name, value in about.items()})
+    schema = arrow.schema(
+        fields, metadata={name: json.dumps(value) for name, value in about.items()}
+    )
 
     def array(values: NDArray[Any], kind: Any) -> Any:
         if values.ndim == 1:
@@ -113,7 +115,9 @@ def write_parquet(opened: OpenedReconstruction, rows: Index | None, folder: Path
     return Written([folder / "people.parquet"])
 
 
-def _columns(opened: OpenedReconstruction, rows: Index) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+def _columns(
+    opened: OpenedReconstruction, rows: Index
+) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """All columns of some rows, by name, and the metadata of the whole file."""
     people = opened.rows(rows)
     table = people.observations

@@ -1,4 +1,6 @@
-"""The input of exports: the people of a result on one timeline, each with an entry for every frame."""
+"""The input of exports: the people of a result on one timeline, each with an entry for every
+frame.
+"""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -82,8 +84,8 @@ class Take:
             raise ValueError("the result has no people, so there is nothing to export")
         if identities and not people.run.get("configuration", {}).get("temporal", True):
             raise ValueError(
-                "this result is frame by frame and has no identities; reconstruct with --temporal, or export"
-                " csv or rrd"
+                "this result is frame by frame and has no identities; reconstruct with "
+                "--temporal, or export csv or rrd"
             )
         people = _seen(people) if seen_only else people
         # All reconstructed frames, including those without people.
@@ -97,8 +99,8 @@ class Take:
         lost = np.flatnonzero(rows[person, place] != np.arange(len(people)))
         if len(lost) > 0:
             raise ValueError(
-                f"person {people.person[lost[0]]} has two rows of frame {people.frame[lost[0]]}; correct them"
-                " with `shapepose-fg tracks`"
+                f"person {people.person[lost[0]]} has two rows of frame {people.frame[lost[0]]}; "
+                "correct them with `shapepose-fg tracks`"
             )
         times = _times(people, frames, fps)
         steps = np.diff(times) / np.diff(frames)
@@ -112,7 +114,9 @@ class Take:
         row.
         """
         values, rows = getattr(self.people, name), self.rows[person]
-        column = np.full((len(rows), *values.shape[1:]), np.nan if values.dtype.kind == "f" else 0, values.dtype)
+        column = np.full(
+            (len(rows), *values.shape[1:]), np.nan if values.dtype.kind == "f" else 0, values.dtype
+        )
         column[rows >= 0] = values[rows[rows >= 0]]
         return column
 
@@ -129,8 +133,12 @@ class Take:
         if len(every) == 0 or np.abs(every).max() <= _FAR_M:
             return self, np.zeros(3)
         origin = np.rint(np.median(every, axis=0))
-        people = replace(self.people, joints=self.people.joints - origin, transl=self.people.transl - origin)
-        return replace(self, people=people, rig=None if self.rig is None else _moved(self.rig, origin)), origin
+        people = replace(
+            self.people, joints=self.people.joints - origin, transl=self.people.transl - origin
+        )
+        return replace(
+            self, people=people, rig=None if self.rig is None else _moved(self.rig, origin)
+        ), origin
 
     def at_one_rate(self) -> tuple["Take", int]:
         """The take at exactly `fps` frames a second, for formats with a constant rate, and the
@@ -154,7 +162,9 @@ class Take:
         rows = np.full((len(self.persons), count), -1, dtype=np.intp)
         rows[:, place[kept]] = self.rows[:, kept]
         numbers, start = np.arange(count), self.times_s[0]
-        even = replace(self, rows=rows, frames=self.frames[0] + numbers, times_s=start + numbers / self.fps)
+        even = replace(
+            self, rows=rows, frames=self.frames[0] + numbers, times_s=start + numbers / self.fps
+        )
         return even, len(place) - len(kept)
 
 
@@ -183,11 +193,15 @@ def _seen(people: Reconstruction) -> Reconstruction:
     if not (people.known != Known.UNKNOWN).any():
         raise ValueError("people.npz does not contain how joints are known; leave out --seen-only")
     seen = Known.observed(people.known)
-    columns: dict[str, Any] = {"known": np.where(seen, people.known, Known.UNKNOWN).astype(np.uint8)}
+    columns: dict[str, Any] = {
+        "known": np.where(seen, people.known, Known.UNKNOWN).astype(np.uint8)
+    }
     for names, kept in ((_OF_JOINTS, seen), (BODY, seen.any(axis=1))):
         for name in names:
             value = getattr(people, name)
-            columns[name] = np.where(kept.reshape(*kept.shape, *[1] * (value.ndim - kept.ndim)), value, np.nan)
+            columns[name] = np.where(
+                kept.reshape(*kept.shape, *[1] * (value.ndim - kept.ndim)), value, np.nan
+            )
     return replace(people, **columns)
 
 

@@ -22,7 +22,10 @@ def clocks_of(
     """
     rates = [typed_rate(text) for text in per_camera("--fps", fps, cameras, one_for_all=True)]
     starts = per_camera("--start", start, cameras)
-    timed = [rate is not None or each.time_s is not None for rate, each in zip(rates, footage, strict=True)]
+    timed = [
+        rate is not None or each.time_s is not None
+        for rate, each in zip(rates, footage, strict=True)
+    ]
     has_clock = any(timed)
     if has_clock and not all(timed):
         name = cameras[timed.index(False)]
@@ -59,7 +62,11 @@ def typed_start(text: str | None, period: float, has_clock: bool) -> float:
         return 0.0
     match = re.fullmatch(r"([-+]?(?:\d+\.?\d*|\.\d+))\s*([sf])", text.strip())
     if match is None:
-        raise InputError(f"--start {text}: must be seconds, such as 0.2s, or frames of the camera, such as 12f")
+        raise InputError(
+            f"--start {text}: must be seconds, such as 0.2s, or frames of the camera, such as 12f"
+        )
     if match[2] == "s" and not has_clock:
-        raise InputError(f"--start {text}: the frame rate is unknown; give --fps, or frames such as 12f")
+        raise InputError(
+            f"--start {text}: the frame rate is unknown; give --fps, or frames such as 12f"
+        )
     return float(match[1]) * (1.0 if match[2] == "s" else period)

@@ -1,4 +1,6 @@
-"""The pictures of one camera, frame by frame: from a video, a folder of pictures, or a single picture."""
+"""The pictures of one camera, frame by frame: from a video, a folder of pictures, or a single
+picture.
+"""
 
 import os
 from collections.abc import Callable
@@ -85,7 +87,8 @@ class Video:
         size, fps = glance(path, capture)
         if not (min(size) > 0 and max(size) <= _LARGEST):
             raise InputError(
-                f"{path}: its pictures would have {size[0]} x {size[1]} pixels; give an undamaged video"
+                f"{path}: its pictures would have {size[0]} x {size[1]} pixels; give an "
+                "undamaged video"
             )
         announced = max(int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 0)
         stamps = []
@@ -101,8 +104,8 @@ class Video:
         # damaged file.
         if announced - len(stamps) > 2:
             notes.append(
-                f"{path}: only {len(stamps)} of the {announced} frames in its header can be read; the file is"
-                " truncated or damaged"
+                f"{path}: only {len(stamps)} of the {announced} frames in its header can be "
+                "read; the file is truncated or damaged"
             )
         return cls(path, size, time_s, tuple(notes))
 
@@ -143,10 +146,15 @@ class PictureFiles:
         """Open the pictures at `path`; the last number in a file name is the frame number."""
         files = [path]
         if path.is_dir():
-            files = [each for each in path.iterdir() if each.suffix.lower() in PICTURES and each.name[0] != "."]
+            files = [
+                each
+                for each in path.iterdir()
+                if each.suffix.lower() in PICTURES and each.name[0] != "."
+            ]
         if len(files) == 0:
             raise InputError(
-                f"{path}: there are no pictures in this folder; known formats are {' '.join(sorted(PICTURES))}"
+                f"{path}: there are no pictures in this folder; known formats are "
+                f"{' '.join(sorted(PICTURES))}"
             )
         found = [last_number(each.stem) for each in files]
         if path.is_file() or (len(files) == 1 and found[0] is None):
@@ -159,7 +167,11 @@ class PictureFiles:
             *in_order([(number, file) for number, file in pairs if number is not None]), strict=True
         )
         count = numbers[-1] - numbers[0] + 1
-        notes = (f"{path}: {count - len(files)} of {count} pictures are missing",) if count > len(files) else ()
+        notes = (
+            (f"{path}: {count - len(files)} of {count} pictures are missing",)
+            if count > len(files)
+            else ()
+        )
         return cls(path, _size(paths[0]), paths, np.array(numbers, dtype=np.intp), notes)
 
     def at(self, place: int) -> Picture | None:
@@ -185,7 +197,9 @@ def _capture(path: Path) -> Any:
         raise InputError(f"{path}: there is no such video; check the path")
     before, level = os.environ.get(_READ_OPTIONS), cv2.utils.logging.getLogLevel()
     os.environ[_READ_OPTIONS] = _SAFE_READING
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # silent; this is read when the first video is opened
+    os.environ.setdefault(
+        "OPENCV_FFMPEG_LOGLEVEL", "-8"
+    )  # silent; this is read when the first video is opened
     # Messages of OpenCV about damaged files are replaced by ours.
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
@@ -195,7 +209,9 @@ def _capture(path: Path) -> Any:
         os.environ.pop(_READ_OPTIONS)
         os.environ.update({} if before is None else {_READ_OPTIONS: before})
     if not capture.isOpened():
-        raise InputError(f"{path}: cannot be read as a video; give another copy, or convert it to H.264 in MP4")
+        raise InputError(
+            f"{path}: cannot be read as a video; give another copy, or convert it to H.264 in MP4"
+        )
     return capture
 
 
@@ -206,16 +222,21 @@ def _times(path: Path, stamp_s: Array, fps: float) -> tuple[Array, list[str]]:
     """
     if len(stamp_s) > 1 and not (np.diff(stamp_s) > 0).all():
         if fps < 0.01:
-            raise InputError(f"{path}: the video has neither times nor a frame rate; give --fps CAMERA=RATE")
+            raise InputError(
+                f"{path}: the video has neither times nor a frame rate; give --fps CAMERA=RATE"
+            )
         return np.arange(len(stamp_s)) / fps, [
-            f"{path}: the times of frames do not increase; the frame rate of the file, {fps:g} Hz, is used instead"
+            (
+                f"{path}: the times of frames do not increase; the frame rate of the file, {fps:g} "
+                "Hz, is used instead"
+            )
         ]
     time_s = stamp_s - stamp_s[0]
     steps = np.diff(time_s)
     gaps = np.flatnonzero(steps > 1.5 * np.median(steps)) if len(steps) > 1 else steps
     return time_s, [] if len(gaps) == 0 else [
-        f"{path}: the time between frames varies: {len(gaps)} steps are longer than one and a half frames (the"
-        f" first after frame {gaps[0]}); the times in the file are used"
+        f"{path}: the time between frames varies: {len(gaps)} steps are longer than one and a "
+        f"half frames (the first after frame {gaps[0]}); the times in the file are used"
     ]
 
 

@@ -24,7 +24,8 @@ FOOTAGE = "footage.json"
 """Name of the file beside the detections."""
 
 _BLOCK = 16
-"""Block size of video coders, pixels: coders pad or crop a few columns or rows to a multiple of it."""
+"""Block size of video coders, pixels: coders pad or crop a few columns or rows to a multiple of
+it."""
 
 
 class PlacementKind(StrEnum):
@@ -35,7 +36,8 @@ class PlacementKind(StrEnum):
     CROP = "crop"
     """Columns on the right and rows at the bottom were cropped, or padded."""
     CROP_CENTRE = "crop-centre"
-    """Equal numbers of columns on both sides, and of rows above and below, were cropped, or padded."""
+    """Equal numbers of columns on both sides, and of rows above and below, were cropped, or
+    padded."""
     SCALE = "scale"
     """The pictures were resized, with independent scales of the axes."""
     LETTERBOX = "letterbox"
@@ -69,7 +71,9 @@ class Placement:
         picture's edges, pixels.
         """
         centred = self.kind in (PlacementKind.LETTERBOX, PlacementKind.CROP_CENTRE)
-        return (self.picture_size - self.scale * self.calibrated_size) / 2 if centred else np.zeros(2)
+        return (
+            (self.picture_size - self.scale * self.calibrated_size) / 2 if centred else np.zeros(2)
+        )
 
     @property
     def region(self) -> tuple[float, float, float, float]:
@@ -93,7 +97,8 @@ class Placement:
 def placements_of(
     given: Sequence[str], sizes: Mapping[str, tuple[int, int]], rig: Rig
 ) -> tuple[dict[str, Placement], list[str]]:
-    """The placements of cameras with pictures of `sizes` (width, height), and notes on inferred ones.
+    """The placements of cameras with pictures of `sizes` (width, height), and notes on inferred
+    ones.
 
     `given` are kinds of placement, for all cameras or CAMERA=KIND.
     """
@@ -104,13 +109,18 @@ def placements_of(
             raise InputError(f"--image-placement {word}: must be one of {' '.join(PlacementKind)}")
         if camera.name in sizes:
             wanted = None if word is None else PlacementKind(word)
-            placements[camera.name], concluded = place(camera.name, sizes[camera.name], camera.image_size, wanted)
+            placements[camera.name], concluded = place(
+                camera.name, sizes[camera.name], camera.image_size, wanted
+            )
             notes += [] if concluded is None else [concluded]
     return placements, notes
 
 
 def place(
-    name: str, picture_size: tuple[int, int], calibrated_size: tuple[int, int], wanted: PlacementKind | None
+    name: str,
+    picture_size: tuple[int, int],
+    calibrated_size: tuple[int, int],
+    wanted: PlacementKind | None,
 ) -> tuple[Placement, str | None]:
     """The placement of camera `name`, and a sentence if it was inferred from the sizes.
 
@@ -120,7 +130,10 @@ def place(
     """
     (width, height), (full_width, full_height) = picture_size, calibrated_size
     full = f"{full_width} x {full_height}"
-    sizes = f"camera {name}: the pictures have {width} x {height} pixels, but the calibration is for {full}"
+    sizes = (
+        f"camera {name}: the pictures have {width} x {height} pixels, but the calibration is for "
+        f"{full}"
+    )
     kind, note = wanted, None
     if wanted is PlacementKind.SAME and picture_size != calibrated_size:
         raise InputError(f"{sizes}; give another --image-placement")
@@ -129,17 +142,21 @@ def place(
     elif max(abs(width - full_width), abs(height - full_height)) <= _BLOCK:
         kind = PlacementKind.CROP
         note = (
-            f"{sizes}: they are assumed to be cropped on the right or at the bottom (--image-placement"
-            f" {name}=crop); if they were cropped on both sides, give {name}=crop-centre; if resized,"
-            f" {name}=scale"
+            f"{sizes}: they are assumed to be cropped on the right or at the bottom "
+            f"(--image-placement {name}=crop); if they were cropped on both sides, give "
+            f"{name}=crop-centre; if resized, {name}=scale"
         )
     # The same aspect ratio, up to rounding of both sides to whole pixels.
     elif abs(width / full_width - height / full_height) <= 1 / full_width + 1 / full_height:
         kind = PlacementKind.SCALE
-        note = f"{sizes} of the same aspect ratio: they are assumed to be resized (--image-placement {name}=scale)"
+        note = (
+            f"{sizes} of the same aspect ratio: they are assumed to be resized "
+            f"(--image-placement {name}=scale)"
+        )
     elif (height, width) == calibrated_size:
         raise InputError(
-            f"{sizes}: the pictures are rotated by 90 degrees; rotate the video, or calibrate it as it is"
+            f"{sizes}: the pictures are rotated by 90 degrees; rotate the video, or calibrate it "
+            "as it is"
         )
     else:
         raise InputError(
@@ -198,7 +215,9 @@ def write_used_footage(file: Path, cameras: Sequence[CameraFootage], about: dict
 
 
 def read_used_footage(file: Path) -> list[CameraFootage]:
-    """Read a file written by `write_used_footage`; InputError, one sentence, for any other content."""
+    """Read a file written by `write_used_footage`; InputError, one sentence, for any other
+    content.
+    """
     found = []
     for camera in validated(_File, read_json(file), file, "run shapepose-fg detect again").cameras:
         placement = Placement(camera.placement, camera.picture_size, camera.calibrated_size)

@@ -31,7 +31,9 @@ def per_camera(
             rest = text
             continue
         if cut is None:
-            raise InputError(f"{option} {text}: must be CAMERA=VALUE, such as {option} {cameras[0]}=VALUE")
+            raise InputError(
+                f"{option} {text}: must be CAMERA=VALUE, such as {option} {cameras[0]}=VALUE"
+            )
         name = text[:cut]
         if name not in cameras:
             there = " ".join(cameras)
@@ -45,8 +47,8 @@ def per_camera(
 def find_footage(given: Sequence[str], cameras: Sequence[str]) -> tuple[list[Path], list[str]]:
     """A video, a picture, or a folder of pictures for each camera, and notes on inferred names.
 
-    `given` is one folder with an entry named after each camera, or CAMERA=PATH for each of them. InputError naming
-    the camera that is missing, or what is ambiguous.
+    `given` is one folder with an entry named after each camera, or CAMERA=PATH for each of them.
+    InputError naming the camera that is missing, or what is ambiguous.
     """
     if len(given) == 1 and ("=" not in given[0] or Path(given[0]).exists()):
         return _in_folder(Path(given[0]), cameras)
@@ -54,8 +56,8 @@ def find_footage(given: Sequence[str], cameras: Sequence[str]) -> tuple[list[Pat
     for name, path in named.items():
         if path is None:
             raise InputError(
-                f"--videos: there is no footage for camera {name}; add --videos {name}=PATH, or leave the"
-                " camera out with --without"
+                f"--videos: there is no footage for camera {name}; add --videos {name}=PATH, or "
+                "leave the camera out with --without"
             )
         if not Path(path).exists():
             raise InputError(f"{path}: there is no such file or folder; check the path")
@@ -73,7 +75,9 @@ def names_of_footage(given: Sequence[str]) -> list[str]:
     offered = [each for each in entries if not each.name.startswith(".") and _is_footage(each)]
     videos = [each for each in offered if each.suffix.lower() in VIDEOS] or offered
     if len(videos) == 0:
-        raise InputError(f"{folder}: there are no videos or pictures; give the folder with those of all cameras")
+        raise InputError(
+            f"{folder}: there are no videos or pictures; give the folder with those of all cameras"
+        )
     return [each.name if each.is_dir() else each.stem for each in videos]
 
 
@@ -83,18 +87,24 @@ def _in_folder(folder: Path, cameras: Sequence[str]) -> tuple[list[Path], list[s
     """
     if folder.is_file():
         raise InputError(
-            f"{folder}: this is one file; give the folder with the footage of all cameras, or CAMERA=PATH for each"
+            f"{folder}: this is one file; give the folder with the footage of all cameras, or "
+            "CAMERA=PATH for each"
         )
     if not folder.is_dir():
         raise InputError(f"{folder}: there is no such folder; check the path")
     entries = [each for each in sorted(folder.iterdir()) if not each.name.startswith(".")]
     offered = [each for each in entries if _is_footage(each)]
     names = [each.name if each.is_dir() else each.stem for each in offered]
-    exact = [[path for path, name in zip(offered, names, strict=True) if name == camera] for camera in cameras]
+    exact = [
+        [path for path, name in zip(offered, names, strict=True) if name == camera]
+        for camera in cameras
+    ]
     for camera, found in zip(cameras, exact, strict=True):
         if len(found) > 1:
             what = " and ".join(path.name for path in found)
-            raise InputError(f"{folder}: {what} all match camera {camera}; give --videos {camera}=PATH for each")
+            raise InputError(
+                f"{folder}: {what} all match camera {camera}; give --videos {camera}=PATH for each"
+            )
     if all(exact):
         return [found[0] for found in exact], []
     if not any(exact):
@@ -106,8 +116,13 @@ def _in_folder(folder: Path, cameras: Sequence[str]) -> tuple[list[Path], list[s
             return _in_folder(inner[0], cameras)
     missing = next(camera for camera, found in zip(cameras, exact, strict=True) if len(found) == 0)
     holds = listing([path.name for path in offered], "no video, picture or folder of pictures")
-    cure = f"name a video or a folder of pictures after each camera, or give --videos {missing}=PATH for each"
-    raise InputError(f"{folder}: nothing in it is named after camera {missing}; it contains {holds}; {cure}")
+    cure = (
+        "name a video or a folder of pictures after each camera, or give --videos "
+        f"{missing}=PATH for each"
+    )
+    raise InputError(
+        f"{folder}: nothing in it is named after camera {missing}; it contains {holds}; {cure}"
+    )
 
 
 def _is_footage(path: Path) -> bool:

@@ -16,31 +16,39 @@ _FIELDS = {
     "geometry_msgs/Point": "float64 x; float64 y; float64 z",
     "geometry_msgs/Quaternion": "float64 x; float64 y; float64 z; float64 w",
     "geometry_msgs/Pose": "geometry_msgs/Point position; geometry_msgs/Quaternion orientation",
-    "geometry_msgs/Transform": "geometry_msgs/Vector3 translation; geometry_msgs/Quaternion rotation",
+    "geometry_msgs/Transform": (
+        "geometry_msgs/Vector3 translation; geometry_msgs/Quaternion rotation"
+    ),
     "geometry_msgs/TransformStamped": (
         "std_msgs/Header header; string child_frame_id; geometry_msgs/Transform transform"
     ),
     "geometry_msgs/PoseWithCovariance": "geometry_msgs/Pose pose; float64[36] covariance",
     "geometry_msgs/PoseStamped": "std_msgs/Header header; geometry_msgs/Pose pose",
-    "geometry_msgs/PoseWithCovarianceStamped": ("std_msgs/Header header; geometry_msgs/PoseWithCovariance pose"),
-    "nav_msgs/Odometry": ("std_msgs/Header header; string child_frame_id; geometry_msgs/PoseWithCovariance pose"),
+    "geometry_msgs/PoseWithCovarianceStamped": (
+        "std_msgs/Header header; geometry_msgs/PoseWithCovariance pose"
+    ),
+    "nav_msgs/Odometry": (
+        "std_msgs/Header header; string child_frame_id; geometry_msgs/PoseWithCovariance pose"
+    ),
     "tf2_msgs/TFMessage": "geometry_msgs/TransformStamped[] transforms",
     "sensor_msgs/RegionOfInterest": (
         "uint32 x_offset; uint32 y_offset; uint32 height; uint32 width; bool do_rectify"
     ),
     "sensor_msgs/CameraInfo": (
-        "std_msgs/Header header; uint32 height; uint32 width; string distortion_model; float64[] d; float64[9] k;"
-        " float64[9] r; float64[12] p; uint32 binning_x; uint32 binning_y; sensor_msgs/RegionOfInterest roi"
+        "std_msgs/Header header; uint32 height; uint32 width; string distortion_model; float64[] "
+        "d; float64[9] k; float64[9] r; float64[12] p; uint32 binning_x; uint32 binning_y; "
+        "sensor_msgs/RegionOfInterest roi"
     ),
     "sensor_msgs/CompressedImage": "std_msgs/Header header; string format; uint8[] data",
     "visualization_msgs/UVCoordinate": "float32 u; float32 v",
     "visualization_msgs/MeshFile": "string filename; uint8[] data",
     "visualization_msgs/Marker": (
-        "std_msgs/Header header; string ns; int32 id; int32 type; int32 action; geometry_msgs/Pose pose;"
-        " geometry_msgs/Vector3 scale; std_msgs/ColorRGBA color; builtin_interfaces/Duration lifetime;"
-        " bool frame_locked; geometry_msgs/Point[] points; std_msgs/ColorRGBA[] colors; string texture_resource;"
-        " sensor_msgs/CompressedImage texture; visualization_msgs/UVCoordinate[] uv_coordinates; string text;"
-        " string mesh_resource; visualization_msgs/MeshFile mesh_file; bool mesh_use_embedded_materials"
+        "std_msgs/Header header; string ns; int32 id; int32 type; int32 action; "
+        "geometry_msgs/Pose pose; geometry_msgs/Vector3 scale; std_msgs/ColorRGBA color; "
+        "builtin_interfaces/Duration lifetime; bool frame_locked; geometry_msgs/Point[] points; "
+        "std_msgs/ColorRGBA[] colors; string texture_resource; sensor_msgs/CompressedImage "
+        "texture; visualization_msgs/UVCoordinate[] uv_coordinates; string text; string "
+        "mesh_resource; visualization_msgs/MeshFile mesh_file; bool mesh_use_embedded_materials"
     ),
     "visualization_msgs/MarkerArray": "visualization_msgs/Marker[] markers",
     "shapepose_msgs/Person": (
@@ -52,7 +60,9 @@ _FIELDS = {
         "std_msgs/Header header; string kind; string[] joint_names; shapepose_msgs/Person[] people"
     ),
     "shapepose_msgs/Keypoints": "float64[] pose_keypoints_2d",
-    "shapepose_msgs/Detections": "std_msgs/Header header; string camera; shapepose_msgs/Keypoints[] people",
+    "shapepose_msgs/Detections": (
+        "std_msgs/Header header; string camera; shapepose_msgs/Keypoints[] people"
+    ),
 }
 
 
@@ -64,7 +74,9 @@ def definition(name: str) -> str:
     for each in order:
         inner = (field.split()[0].partition("[")[0] for field in _FIELDS[each].split(";"))
         order += [other for other in inner if other in _FIELDS and other not in order]
-    texts = ["\n".join(field.strip() for field in _FIELDS[each].split(";")) + "\n" for each in order]
+    texts = [
+        "\n".join(field.strip() for field in _FIELDS[each].split(";")) + "\n" for each in order
+    ]
     apart = "=" * 80 + "\n"
     return texts[0] + "".join(
         f"{apart}MSG: {each}\n{text}" for each, text in zip(order[1:], texts[1:], strict=True)
@@ -87,10 +99,14 @@ def check_definition(name: str, text: str) -> None:
     """
     parts = re.split(r"^=+\s*MSG: *(\S+) *$", "\n".join(text.splitlines()), flags=re.MULTILINE)
     theirs = {
-        _plain(each): _fields(each, part) for each, part in zip([name, *parts[1::2]], parts[::2], strict=True)
+        _plain(each): _fields(each, part)
+        for each, part in zip([name, *parts[1::2]], parts[::2], strict=True)
     }
     for each, fields in theirs.items():
-        size = max((int(n) for kind in fields.values() for n in re.findall(r"\[(?:<=)?(\d+)\]", kind)), default=0)
+        size = max(
+            (int(n) for kind in fields.values() for n in re.findall(r"\[(?:<=)?(\d+)\]", kind)),
+            default=0,
+        )
         if len(fields) == 0 or size > _MOST_ITEMS:
             raise ValueError(f"{each} has {f'an array of {size}' if size else 'no field'}")
     waiting = [(name, name)]
@@ -120,7 +136,9 @@ def _fields(message: str, text: str) -> dict[str, str]:
         inner, bracket, array = kind.partition("[")
         inner = re.sub(r"<=\d+$", "", inner)
         if inner not in _FAMILY and "/" not in inner:
-            inner = f"{'std_msgs' if inner == 'Header' else _plain(message).partition('/')[0]}/{inner}"
+            inner = (
+                f"{'std_msgs' if inner == 'Header' else _plain(message).partition('/')[0]}/{inner}"
+            )
         found[field] = f"{_plain(inner)}{bracket}{array}"
     return found
 
@@ -131,7 +149,13 @@ def _plain(name: str) -> str:
 
 
 _FAMILY = {each: "whole" for n in (8, 16, 32, 64) for each in (f"int{n}", f"uint{n}")}
-_FAMILY |= {"byte": "whole", "char": "whole", "bool": "bool", "string": "string", "wstring": "wstring"}
+_FAMILY |= {
+    "byte": "whole",
+    "char": "whole",
+    "bool": "bool",
+    "string": "string",
+    "wstring": "wstring",
+}
 _FAMILY |= {"float32": "real", "float64": "real"}
 """Kind of value for each primitive ROS type; any other type is a message."""
 _MOST_ITEMS = 2**16

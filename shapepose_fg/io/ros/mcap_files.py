@@ -66,7 +66,10 @@ class McapWriter(AbstractContextManager["McapWriter"]):
         self._rig, self._begun = rig, False
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self._file.finish()
 
@@ -75,7 +78,9 @@ class McapWriter(AbstractContextManager["McapWriter"]):
         cameras and /tf_static.
         """
         if not self._begun and self._rig is not None:
-            self._message("/tf_static", "tf2_msgs/TFMessage", fixed_transforms(self._rig, time_s), time_s)
+            self._message(
+                "/tf_static", "tf2_msgs/TFMessage", fixed_transforms(self._rig, time_s), time_s
+            )
             for camera in self._rig.cameras:
                 topic = f"/{ros_name(camera.name)}/camera_info"
                 self._message(topic, "sensor_msgs/CameraInfo", camera_info(camera, time_s), time_s)
@@ -106,7 +111,9 @@ class McapWriter(AbstractContextManager["McapWriter"]):
         self._file.write_message(topic, self._schemas[kind], message, log_time=nanoseconds(time_s))
 
 
-def read_views(file: Path, rig: Rig, skeleton: Skeleton, note: Callable[[str], None]) -> Iterator[View]:
+def read_views(
+    file: Path, rig: Rig, skeleton: Skeleton, note: Callable[[str], None]
+) -> Iterator[View]:
     """Yield the arguments of `OnlineReconstructor.push_view` in the order of the log: camera,
     detections, time stamp in seconds, and for a moving camera its interpolated pose with
     covariance.
@@ -114,7 +121,13 @@ def read_views(file: Path, rig: Rig, skeleton: Skeleton, note: Callable[[str], N
     A picture is yielded only after the next pose has been read. `note` receives messages about
     cameras without poses. InputError, one sentence, for an invalid file or one without detections.
     """
-    number, frames, unplaced, begun_s, tidied_s = 0, Frames(), Counter[tuple[str, str]](), math.inf, -math.inf
+    number, frames, unplaced, begun_s, tidied_s = (
+        0,
+        Frames(),
+        Counter[tuple[str, str]](),
+        math.inf,
+        -math.inf,
+    )
     looked_s, left = -math.inf, 0
     waiting = deque[tuple[tuple[str, Detections, float], str]]()
     carrier = {each.name: each.carrier for each in rig.cameras}
@@ -134,7 +147,9 @@ def read_views(file: Path, rig: Rig, skeleton: Skeleton, note: Callable[[str], N
                 unplaced[camera, frame] += 1
 
     with open_regular(file, _CURE) as stream:
-        for topic, kind, logged_s, message in _decoded(stream, file, {type_name(_DETECTIONS), *KINDS}, _CURE):
+        for topic, kind, logged_s, message in _decoded(
+            stream, file, {type_name(_DETECTIONS), *KINDS}, _CURE
+        ):
             begun_s = min(begun_s, logged_s)
             if kind != type_name(_DETECTIONS):
                 with _whole(file, _CURE):
@@ -146,9 +161,13 @@ def read_views(file: Path, rig: Rig, skeleton: Skeleton, note: Callable[[str], N
                         continue
                     people = [list(map(float, each.pose_keypoints_2d)) for each in message.people]
                     time_s = stamp_ns(message.header) / NS
-                    view = view_of(message.camera, time_s, people, f"{file}, message {number}", rig, skeleton)
+                    view = view_of(
+                        message.camera, time_s, people, f"{file}, message {number}", rig, skeleton
+                    )
                     goes = carrier[message.camera]
-                    waiting.append((view, frame_of(goes) if goes else message.header.frame_id.lstrip("/")))
+                    waiting.append(
+                        (view, frame_of(goes) if goes else message.header.frame_id.lstrip("/"))
+                    )
             if abs(logged_s - looked_s) >= _LOOK_S or len(waiting) > 2 * left + 64:
                 yield from placed(logged_s)
                 looked_s, left = logged_s, len(waiting)
@@ -175,7 +194,9 @@ def read_frame(file: Path, frame: str, name: str) -> Trajectory:
     known, wanted = frames.moving, frame.lstrip("/")
     if (not wanted and len(known) != 1) or (wanted and not frames.moves(wanted)):
         which = listing(known) if known else "none"
-        raise InputError(f"{file}: the moving frames in it are {which}; choose one with {file.name}#FRAME")
+        raise InputError(
+            f"{file}: the moving frames in it are {which}; choose one with {file.name}#FRAME"
+        )
     with naming(f"{file}: frame {wanted or known[0]}", "record more"):
         return frames.trajectory(wanted or known[0], name)
 
@@ -188,10 +209,14 @@ def _whole(file: Path, cure: str) -> Iterator[None]:
     try:
         yield
     except (AttributeError, TypeError) as error:
-        raise InputError(f"{file}: cannot be read (field {error} of a message is missing); {cure}") from None
+        raise InputError(
+            f"{file}: cannot be read (field {error} of a message is missing); {cure}"
+        ) from None
 
 
-def _decoded(stream: IO[bytes], file: Path, wanted: set[str], cure: str) -> Iterator[tuple[str, str, float, Any]]:
+def _decoded(
+    stream: IO[bytes], file: Path, wanted: set[str], cure: str
+) -> Iterator[tuple[str, str, float, Any]]:
     """Topic, type, log time and content of the messages; InputError for damaged files."""
     factory, decoders = optional("mcap_ros2.decoder", "ros").DecoderFactory(), dict[int, Any]()
     try:
@@ -202,12 +227,19 @@ def _decoded(stream: IO[bytes], file: Path, wanted: set[str], cure: str) -> Iter
                     # A schema is kept together with its decoder, so that another schema with the
                     # same number replaces neither.
                     own = replace(schema, id=len(decoders) + 1)
-                    decoders[id(schema)] = schema, factory.decoder_for(channel.message_encoding, own)
+                    decoders[id(schema)] = (
+                        schema,
+                        factory.decoder_for(channel.message_encoding, own),
+                    )
                 decode = decoders[id(schema)][1]
                 if decode is None:
-                    raise ValueError(f"its encoding is {channel.message_encoding}, {schema.encoding}")
+                    raise ValueError(
+                        f"its encoding is {channel.message_encoding}, {schema.encoding}"
+                    )
                 yield channel.topic, schema.name, message.log_time / NS, decode(message.data)
-    except Exception as error:  # of damaged files the library raises anything: struct.error, KeyError, zstd's own
+    except (
+        Exception
+    ) as error:  # of damaged files the library raises anything: struct.error, KeyError, zstd's own
         said = f"{type(error).__name__}: {str(error).strip()[:80]}"
         raise InputError(f"{file}: cannot be read ({said}); {cure}") from None
 
@@ -225,7 +257,9 @@ def _messages(stream: IO[bytes]) -> Iterator[tuple[Any, Any, Any]]:
         inside = [record]
         if isinstance(record, reading.Chunk):
             plain = replace(record, compression="", data=_unpacked(record))
-            inside = sorted(reading.breakup_chunk(plain), key=lambda each: getattr(each, "log_time", -1))
+            inside = sorted(
+                reading.breakup_chunk(plain), key=lambda each: getattr(each, "log_time", -1)
+            )
         for each in inside:
             if isinstance(each, reading.Schema):
                 schemas[each.id] = each
@@ -241,7 +275,10 @@ def _unpacked(chunk: Any) -> bytes:
     for more than `_MOST_RECORDS` records, and for records that extend beyond the chunk.
     """
     lz4, zstd = optional("lz4.frame", "ros"), optional("zstandard", "ros")
-    claims = {"zstd": zstd.frame_content_size, "lz4": lambda packed: lz4.get_frame_info(packed)["content_size"]}
+    claims = {
+        "zstd": zstd.frame_content_size,
+        "lz4": lambda packed: lz4.get_frame_info(packed)["content_size"],
+    }
     claim = max(claims.get(chunk.compression, len)(chunk.data), chunk.uncompressed_size)
     if claim > _CHUNK:
         raise ValueError(f"a chunk claims {claim} bytes, over {_CHUNK}")
@@ -249,7 +286,11 @@ def _unpacked(chunk: Any) -> bytes:
     if chunk.compression == "lz4":
         data = lz4.LZ4FrameDecompressor().decompress(chunk.data, max_length=_CHUNK + 1)
     elif chunk.compression == "zstd":
-        data = zstd.ZstdDecompressor(max_window_size=_WINDOW).stream_reader(chunk.data).read(_CHUNK + 1)
+        data = (
+            zstd.ZstdDecompressor(max_window_size=_WINDOW)
+            .stream_reader(chunk.data)
+            .read(_CHUNK + 1)
+        )
     else:
         data = chunk.data
     if len(data) > _CHUNK:
@@ -259,6 +300,8 @@ def _unpacked(chunk: Any) -> bytes:
         at, count = at + 9 + int.from_bytes(data[at + 1 : at + 9], "little"), count + 1
         if at > len(data) or count > _MOST_RECORDS:
             raise ValueError(
-                "a record ends beyond its chunk" if at > len(data) else "a chunk has too many records"
+                "a record ends beyond its chunk"
+                if at > len(data)
+                else "a chunk has too many records"
             )
     return data

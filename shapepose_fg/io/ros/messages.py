@@ -52,9 +52,15 @@ def header(frame_id: str, time_s: float) -> Message:
 
 def people_message(rows: Reconstruction, kind: str, time_s: float) -> Message:
     """shapepose_msgs/People: one frame's rows, the arrays of people.npz, flat, NaN if unknown."""
-    names = "joints covariance velocity velocity_covariance betas global_orient body_pose transl".split()
+    names = (
+        "joints covariance velocity velocity_covariance betas global_orient body_pose transl"
+    ).split()
     people = [
-        {"person": int(rows.person[n]), "status": str(rows.status[n]), "known": rows.known[n].tolist()}
+        {
+            "person": int(rows.person[n]),
+            "status": str(rows.status[n]),
+            "known": rows.known[n].tolist(),
+        }
         | {name: getattr(rows, name)[n].ravel().tolist() for name in names}
         for n in range(len(rows))
     ]
@@ -89,7 +95,9 @@ def fixed_transforms(rig: Rig, time_s: float) -> Message:
     R = np.diag([1.0, -1, -1]) if up @ z < 0 else Rotation.align_vectors(z, up)[0].as_matrix()
     made = [_transform(MAP, WORLD, rigid(R, np.zeros(3)), time_s)]
     for camera in rig.cameras:
-        parent, pose = (ros_name(camera.carrier), camera.bTc) if camera.carrier else (WORLD, camera.wTc)
+        parent, pose = (
+            (ros_name(camera.carrier), camera.bTc) if camera.carrier else (WORLD, camera.wTc)
+        )
         made.append(_transform(parent, optical(camera), pose, time_s))
     return {"transforms": made}
 
@@ -98,7 +106,10 @@ def carrier_transforms(rig: Rig, time_s: float) -> Message:
     """tf2_msgs/TFMessage: transforms from the world to each camera carrier (such as a robot)."""
     at = np.full(1, time_s)
     return {
-        "transforms": [_transform(WORLD, ros_name(each.name), each.at(at)[0], time_s) for each in rig.trajectories]
+        "transforms": [
+            _transform(WORLD, ros_name(each.name), each.at(at)[0], time_s)
+            for each in rig.trajectories
+        ]
     }
 
 
@@ -140,13 +151,15 @@ def _markers(rows: Reconstruction, time_s: float, lasts_s: float) -> Iterator[Me
             ("bones", _LINES, joints[ends], (_BONE_M, 0.0, 0.0)),
         ):
             yield {
-                "header": header(WORLD, time_s), "ns": ns, "id": int(rows.person[n]) % _LAST_S, "type": kind,
-                "action": 0, "pose": {"position": _xyz(np.zeros(3)), "orientation": _quaternion(np.eye(3))},
-                "scale": _xyz(np.array(size)), "color": color, "lifetime": {"sec": sec, "nanosec": nanosec},
-                "frame_locked": False, "points": list(map(_xyz, points)), "colors": [], "texture_resource": "",
-                "texture": {"header": header("", 0.0), "format": "", "data": b""}, "uv_coordinates": [],
-                "text": "", "mesh_resource": "", "mesh_file": {"filename": "", "data": b""},
-                "mesh_use_embedded_materials": False,
+                "header": header(WORLD, time_s), "ns": ns, "id": int(rows.person[n]) % _LAST_S,
+                "type": kind, "action": 0,
+                "pose": {"position": _xyz(np.zeros(3)), "orientation": _quaternion(np.eye(3))},
+                "scale": _xyz(np.array(size)), "color": color,
+                "lifetime": {"sec": sec, "nanosec": nanosec}, "frame_locked": False,
+                "points": list(map(_xyz, points)), "colors": [], "texture_resource": "",
+                "texture": {"header": header("", 0.0), "format": "", "data": b""},
+                "uv_coordinates": [], "text": "", "mesh_resource": "",
+                "mesh_file": {"filename": "", "data": b""}, "mesh_use_embedded_materials": False,
             }  # fmt: skip
 
 
@@ -166,7 +179,11 @@ def optical(camera: Camera) -> str:
 def _hips(rows: Reconstruction, n: int) -> Array:
     """(3,) midpoint of the hips, metres; NaN if unknown."""
     names = rows.joint_names.tolist()
-    at = [names.index(each) for each in (["MidHip"] if "MidHip" in names else ["RHip", "LHip"]) if each in names]
+    at = [
+        names.index(each)
+        for each in (["MidHip"] if "MidHip" in names else ["RHip", "LHip"])
+        if each in names
+    ]
     return rows.joints[n, at].mean(axis=0) if at else np.full(3, math.nan)
 
 

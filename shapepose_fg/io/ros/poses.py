@@ -42,7 +42,10 @@ class Frames:
         """
         for parent, child, stamp, pose, covariance in _links(topic, kind, message):
             if topic.endswith(_STATIC):
-                self._fixed[child], self._parent[child] = _matrix(pose, f"{place}, frame {child}"), parent
+                self._fixed[child], self._parent[child] = (
+                    _matrix(pose, f"{place}, frame {child}"),
+                    parent,
+                )
                 continue
             surely = _covariance(covariance, pose, f"{place}, frame {child}")
             if surely is None and child in self._sure:
@@ -102,7 +105,9 @@ class Frames:
         time_s = np.array(sorted(self._told[most])) / NS
         poses, surely, there = self.at(frame, time_s)
         if there.sum() < 2:
-            raise ValueError(f"2 poses are needed, with {' in '.join(self.chain(frame))} known at the same time")
+            raise ValueError(
+                f"2 poses are needed, with {' in '.join(self.chain(frame))} known at the same time"
+            )
         says = surely[there].any()
         return Trajectory(name, time_s[there], poses[there], surely[there] if says else None)
 
@@ -117,7 +122,10 @@ class Frames:
         """One link over time; None if it has only one pose."""
         if child not in self._known and len(self._told[child]) > 1:
             told = sorted(self._told[child].items())
-            time_s, poses = np.array([at for at, _ in told]) / NS, np.stack([pose for _, (pose, _) in told])
+            time_s, poses = (
+                np.array([at for at, _ in told]) / NS,
+                np.stack([pose for _, (pose, _) in told]),
+            )
             says = [surely for _, (_, surely) in told if surely is not None]
             self._known[child] = Trajectory(child, time_s, poses, np.stack(says) if says else None)
         return self._known.get(child)
@@ -131,14 +139,24 @@ def _links(topic: str, kind: str, message: Any) -> Iterator[tuple[str, str, int,
     for each in stamped:
         covariance = None
         if kind == type_name(TREE):
-            child, place, turn = each.child_frame_id, each.transform.translation, each.transform.rotation
+            child, place, turn = (
+                each.child_frame_id,
+                each.transform.translation,
+                each.transform.rotation,
+            )
         else:
             child = each.child_frame_id if kind == type_name(_WITH_CHILD) else topic
             pose, covariance = each.pose, getattr(each.pose, "covariance", None)
             pose = pose.pose if covariance is not None else pose
             place, turn = pose.position, pose.orientation
         numbers = np.array([place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w])
-        yield each.header.frame_id.lstrip("/"), child.lstrip("/"), stamp_ns(each.header), numbers, covariance
+        yield (
+            each.header.frame_id.lstrip("/"),
+            child.lstrip("/"),
+            stamp_ns(each.header),
+            numbers,
+            covariance,
+        )
 
 
 def stamp_ns(header: Any) -> int:
@@ -156,7 +174,9 @@ def _matrix(pose: Array, place: str) -> Array:
     from scipy.spatial.transform import Rotation
 
     if not np.isfinite(pose).all() or abs(np.linalg.norm(pose[3:]) - 1) > UNIT_LENGTH:
-        raise InputError(f"{place}: a pose must be finite, with a quaternion of length 1; leave it out")
+        raise InputError(
+            f"{place}: a pose must be finite, with a quaternion of length 1; leave it out"
+        )
     if np.abs(pose[:3]).max() > MOST_METRES:
         raise InputError(f"{place}: a pose is more than {MOST_METRES:g} m away; write metres")
     return rigid(Rotation.from_quat(pose[3:]).as_matrix(), pose[:3])
@@ -168,11 +188,17 @@ def _covariance(numbers: Any, pose: Array, place: str) -> Array | None:
     """
     if numbers is None:
         return None
-    parents = np.array(list(numbers), dtype=np.float64).reshape(6, 6)[np.ix_(_TURN_THEN_WAY, _TURN_THEN_WAY)]
+    parents = np.array(list(numbers), dtype=np.float64).reshape(6, 6)[
+        np.ix_(_TURN_THEN_WAY, _TURN_THEN_WAY)
+    ]
     if not parents.any() or parents[3, 3] == -1:
         return None
-    if not np.isfinite(parents).all() or np.linalg.eigvalsh(parents)[0] < -1e-9 * max(1.0, parents.max()):
-        raise InputError(f"{place}: a covariance must be finite, without negative eigenvalues; write zeros")
+    if not np.isfinite(parents).all() or np.linalg.eigvalsh(parents)[0] < -1e-9 * max(
+        1.0, parents.max()
+    ):
+        raise InputError(
+            f"{place}: a covariance must be finite, without negative eigenvalues; write zeros"
+        )
     # Some programs write the largest double for an unknown value.
     parents = np.minimum(parents, MOST_VARIANCE / 10)
     turn = np.kron(np.eye(2), _matrix(pose, place)[:3, :3])
@@ -187,5 +213,7 @@ def _of_inverse(poses: Array) -> Array:
     none = np.zeros_like(x)
     found = np.zeros((len(poses), 6, 6))
     found[:, :3, :3] = found[:, 3:, 3:] = R
-    found[:, 3:, :3] = R @ np.stack([none, z, -y, -z, none, x, y, -x, none], axis=-1).reshape(-1, 3, 3)
+    found[:, 3:, :3] = R @ np.stack([none, z, -y, -z, none, x, y, -x, none], axis=-1).reshape(
+        -1, 3, 3
+    )
     return found

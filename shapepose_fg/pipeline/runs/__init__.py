@@ -1,1 +1,3 @@
-"""A reconstruction in progress: its solved windows, from which it can be resumed, and its result."""
+"""A reconstruction in progress: its solved windows, from which it can be resumed, and its
+result.
+"""

@@ -14,7 +14,14 @@ from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.soles import lowest_of_feet
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.observation_table import ObservationTable
-from shapepose_fg.core.reconstruction import BODY, Known, Reconstruction, Status, check_files, count_rows
+from shapepose_fg.core.reconstruction import (
+    BODY,
+    Known,
+    Reconstruction,
+    Status,
+    check_files,
+    count_rows,
+)
 from shapepose_fg.core.result_files import write_result
 from shapepose_fg.core.shapes import SubjectShapes
 from shapepose_fg.core.storage.npz import Pieces
@@ -60,7 +67,10 @@ class Assembly:
     def persons(self) -> list[NDArray[np.int64]]:
         """Identities (R,) of the rows of each part."""
         tracks = (self.parts.column(n, "person").tolist() for n in range(len(self.parts)))
-        return [np.array([self.names.get(each, each) for each in track], dtype=np.int64) for track in tracks]
+        return [
+            np.array([self.names.get(each, each) for each in track], dtype=np.int64)
+            for track in tracks
+        ]
 
     @cached_property
     def rows_of(self) -> dict[int, int]:
@@ -127,9 +137,13 @@ class Assembly:
         empty = Reconstruction.empty(self.joint_names)
         columns = {name: each for name, each in self.columns().items() if name in empty.ROWS}
         seen = self.observation_columns() or {}
-        columns |= {OBSERVED + name: each for name, each in seen.items() if name in ObservationTable.ROWS}
+        columns |= {
+            OBSERVED + name: each for name, each in seen.items() if name in ObservationTable.ROWS
+        }
         count = sum(map(len, chosen))
-        rows = {name: np.empty((count, *each.shape[1:]), each.dtype) for name, each in columns.items()}
+        rows = {
+            name: np.empty((count, *each.shape[1:]), each.dtype) for name, each in columns.items()
+        }
         before: Counter[int] = Counter()
         stop = 0
         for n, (mine, person) in enumerate(zip(chosen, self.persons, strict=True)):
@@ -158,12 +172,18 @@ class Assembly:
         if name.removeprefix(OBSERVED) == "person":
             return self.persons[n]
         values = self.parts.column(n, name)
-        return values if self.bodies is None else self.bodies.filled(name, values, self.persons[n], before)
+        return (
+            values
+            if self.bodies is None
+            else self.bodies.filled(name, values, self.persons[n], before)
+        )
 
     def _columns(self, empty: Table, prefix: str) -> dict[str, Pieces]:
         """The columns of an `empty` table with the rows of all parts."""
         return {
-            name: Pieces(each.dtype, (len(self), *each.shape[1:]), partial(self.pieces, prefix + name))
+            name: Pieces(
+                each.dtype, (len(self), *each.shape[1:]), partial(self.pieces, prefix + name)
+            )
             if name in empty.ROWS
             else each
             for name, each in empty.columns().items()
@@ -192,7 +212,9 @@ class Assembly:
             stands &= (parts.column(n, "status") == Status.OK)[:, None]
             rows, side = np.nonzero(stands)
             betas, orient, pose, transl = (parts.column(n, name)[rows] for name in BODY)
-            points.append(lowest_of_feet(model, (betas, orient, pose, transl), up)[np.arange(len(rows)), side])
+            points.append(
+                lowest_of_feet(model, (betas, orient, pose, transl), up)[np.arange(len(rows)), side]
+            )
             look = (parts.column(n, "time_s")[rows] // LOOK_S).astype(np.int64)
             looks.append(np.stack([parts.column(n, "person")[rows], side, look], axis=1))
         whose = np.unique(np.concatenate(looks), axis=0, return_inverse=True)[1]

@@ -159,7 +159,9 @@ class Identities:
     """Assigns identities to the tracks of consecutive chunks, consistently over chunks."""
 
     def __init__(self, next_id: int, border: Border | None) -> None:
-        """`next_id` is the next free identity, `border` the tracks at the end of the chunk before."""
+        """`next_id` is the next free identity, `border` the tracks at the end of the chunk
+        before.
+        """
         self.next_id = next_id
         self.border = border
 

@@ -36,7 +36,9 @@ _WORDS = {"program": "version of this program", "cameras": "set of cameras", "sk
 """Words for differences, for keys that are not words themselves."""
 
 
-def open_run(output: Path, begun: dict[str, Any], *, resume: bool = False, restart: bool = False) -> InFolder:
+def open_run(
+    output: Path, begun: dict[str, Any], *, resume: bool = False, restart: bool = False
+) -> InFolder:
     """The folder of a run into `output` with inputs `begun`, plain values; or of the resumed one,
     with `resume`.
 
@@ -51,7 +53,9 @@ def open_run(output: Path, begun: dict[str, Any], *, resume: bool = False, resta
     # A run killed at its start leaves only the manifest's temporary file.
     left = [folder] if folder.is_file() else folder.iterdir() if folder.is_dir() else ()
     if not manifest.is_file() and any(not file.name.startswith(f".{_MANIFEST}.") for file in left):
-        raise InputError(f"{folder}: this is not a run of this program; move it, or give another --output")
+        raise InputError(
+            f"{folder}: this is not a run of this program; move it, or give another --output"
+        )
     kept = InFolder(folder, _digest(begun))
     if manifest.is_file() and not restart:
         sweep(folder)
@@ -60,8 +64,8 @@ def open_run(output: Path, begun: dict[str, Any], *, resume: bool = False, resta
             return kept
         if (done := frames_done(output)) > 0:
             raise InputError(
-                f"{folder}: there is an interrupted run after {done} frames; continue with --resume, or start"
-                " again with --restart"
+                f"{folder}: there is an interrupted run after {done} frames; continue with "
+                "--resume, or start again with --restart"
             )
     end_run(output)
     write_content(manifest, json.dumps(begun, indent=1))
@@ -96,8 +100,8 @@ def _refuse_other(folder: Path, before: Any, now: dict[str, Any]) -> None:
     name, was, is_now = found
     how = f" ({was} then, {is_now} now)" if max(len(repr(was)), len(repr(is_now))) <= 40 else ""
     raise InputError(
-        f"{folder}: the interrupted run had another {_WORDS.get(name, name)}{how}; start it with the same"
-        " options to continue, or start again with --restart"
+        f"{folder}: the interrupted run had another {_WORDS.get(name, name)}{how}; start it with "
+        "the same options to continue, or start again with --restart"
     )
 
 
@@ -110,8 +114,12 @@ def expected_bytes(detections: DetectionSequence, rig: Rig, frames: range) -> in
     joints = detections.skeleton.joints
     if len(frames) == 0:
         return 0
-    spread = np.unique(np.linspace(frames.start, frames.stop - 1, min(len(frames), _LOOKED_AT)).astype(int))
-    people = np.mean([len(detections[frame]) for frame in spread.tolist()]) / (len(rig) * len(joints))
+    spread = np.unique(
+        np.linspace(frames.start, frames.stop - 1, min(len(frames), _LOOKED_AT)).astype(int)
+    )
+    people = np.mean([len(detections[frame]) for frame in spread.tolist()]) / (
+        len(rig) * len(joints)
+    )
     tables = (Reconstruction.empty(joints), ObservationTable.empty(joints, rig.names))
     columns = [table.columns()[name] for table in tables for name in table.ROWS]
     row = sum(column.dtype.itemsize * prod(column.shape[1:]) for column in columns)
@@ -123,16 +131,17 @@ def check_room(folder: Path, needed: int) -> None:
     free = shutil.disk_usage(folder).free
     if free < needed:
         raise InputError(
-            f"{folder}: about {decimal(needed)} of disk space are needed, and {decimal(free)} are free; free"
-            " some space, give"
-            " another --output, or take a part with --frames"
+            f"{folder}: about {decimal(needed)} of disk space are needed, and {decimal(free)} "
+            "are free; free some space, give another --output, or take a part with --frames"
         )
 
 
 _KNOWN, _WRITTEN, _ARRAYS = "known-people", "known-people-written", ("betas", "information")
 
 
-def people_at_start(kept: KeptArrays, file: Path, load: Callable[[], SubjectShapes]) -> SubjectShapes:
+def people_at_start(
+    kept: KeptArrays, file: Path, load: Callable[[], SubjectShapes]
+) -> SubjectShapes:
     """People known when the run began; `load` reads them from `file`, a file of shapes, at the
     beginning.
 
@@ -149,11 +158,13 @@ def people_at_start(kept: KeptArrays, file: Path, load: Callable[[], SubjectShap
         if not isinstance(about, dict) or not {"names", "body", "sha256"} <= about.keys():
             raise ValueError("the persons of its shapes are missing")
         names = np.array([*map(str, about["names"])], dtype=str)
-        known = SubjectShapes(names, *(kept.array(_KNOWN, name) for name in _ARRAYS), body=str(about["body"]))
+        known = SubjectShapes(
+            names, *(kept.array(_KNOWN, name) for name in _ARRAYS), body=str(about["body"])
+        )
     if now not in (about["sha256"], *map(kept.about, kept.names(_WRITTEN))):
         raise InputError(
-            f"{file}: this file has changed since the run was interrupted; start again with --restart to use"
-            " its new content"
+            f"{file}: this file has changed since the run was interrupted; start again with "
+            "--restart to use its new content"
         )
     return known
 

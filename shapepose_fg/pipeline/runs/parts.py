@@ -105,7 +105,9 @@ class Parts:
         values = self.kept.array(_name(n), shared if shared in ObservationTable.ROWS[:2] else name)
         return _STATUS[_CODE.checked(name, values, {})] if name == "status" else values
 
-    def check(self, joint_names: Sequence[str], view_names: Sequence[str], frames: range, frame_s: Array) -> None:
+    def check(
+        self, joint_names: Sequence[str], view_names: Sequence[str], frames: range, frame_s: Array
+    ) -> None:
         """Raise InputError if a part is not of a run with these joints, views and frames; `frame_s`
         (T,) are the times of all frames of the recording.
         """
@@ -137,7 +139,9 @@ class Parts:
                 notes.add(Notes.from_dict(self.kept.about(_name(n))))
         return notes
 
-    def checkpoint(self, read: Callable[[int], Input], frames: range, nobody: Tracks) -> Checkpoint | None:
+    def checkpoint(
+        self, read: Callable[[int], Input], frames: range, nobody: Tracks
+    ) -> Checkpoint | None:
         """State for continuing tracking; None at the beginning. `read` returns the input of a
         frame.
 
@@ -148,7 +152,9 @@ class Parts:
         if name is None:
             return None
         there = {"at", *(key.partition(".")[0] for key in self.kept.keys(name))}
-        columns = {key: column for key, column in _FOLLOWED.items() if key.partition(".")[0] in there}
+        columns = {
+            key: column for key, column in _FOLLOWED.items() if key.partition(".")[0] in there
+        }
         joints, size = nobody.joints.mean.shape[1:]
         found = self.kept.columns(name, columns, {"J": joints, "S": size})
         with naming(self.kept.place(name), ANEW):
@@ -201,7 +207,11 @@ _FOLLOWED |= {f"border.{name}": column for name, column in columns_of(Border).it
 
 
 def checkpoint_of(
-    arrays: Mapping[str, NDArray[Any]], read: Callable[[int], Input], solved: int, frames: range, nobody: Tracks
+    arrays: Mapping[str, NDArray[Any]],
+    read: Callable[[int], Input],
+    solved: int,
+    frames: range,
+    nobody: Tracks,
 ) -> Checkpoint:
     """Inverse of `checkpoint_arrays`.
 
@@ -216,7 +226,11 @@ def checkpoint_of(
     if not possible or following - decided.stop > (MOST_FRAMES if "state.numbers" in arrays else 0):
         raise ValueError(f"it continues at frame {following}, but the parts end at {solved}")
     if "state.numbers" not in arrays:
-        border = Border(*(arrays[f"border.{name}"] for name in Border.ROWS)) if "border.frame" in arrays else None
+        border = (
+            Border(*(arrays[f"border.{name}"] for name in Border.ROWS))
+            if "border.frame" in arrays
+            else None
+        )
         return Checkpoint(following, next_id, border=border)
     given = {frame: read(frame) for frame in range(decided.start, following)}
     rows = {name: arrays.get(f"rows.{name}", np.zeros(0)) for name in _ROWS}
@@ -229,14 +243,20 @@ def checkpoint_of(
         _check_candidates(own["candidate"], given[frame])
         seen = observed(given[frame], own["candidate"], own["initial"], own["track"])
         found.append((given[frame], replace(seen, evidence=own["evidence"])))
-    people, ids, joints = nobody, arrays["state.ids"], (arrays["state.mean"], arrays["state.covariance"])
+    people, ids, joints = (
+        nobody,
+        arrays["state.ids"],
+        (arrays["state.mean"], arrays["state.covariance"]),
+    )
     if len(ids) > 0:
         _check_tracks(ids, next_track)
         if not all(np.isfinite(each).all() for each in joints):
             raise ValueError("its tracks must be finite")
         last = given[decided.stop - 1] if len(decided) > 0 else read(decided.stop - 1)
         people = people_at(last, ids, JointStates(*joints))
-    follow = FollowState(people, next_track, tuple(given[frame] for frame in range(decided.stop, following)))
+    follow = FollowState(
+        people, next_track, tuple(given[frame] for frame in range(decided.stop, following))
+    )
     return Checkpoint(following, next_id, StreamState(follow, tuple(found), before))
 
 

@@ -60,7 +60,9 @@ def adapted(
     config = replace(config, network=shipped.network.config, learning_rate=rate)
     torch.manual_seed(config.seed)
     # The network is on a GPU if available, the bodies on the CPU.
-    network = translated(shipped, BodyModel.default(), body).to("cuda" if torch.cuda.is_available() else "cpu")
+    network = translated(shipped, BodyModel.default(), body).to(
+        "cuda" if torch.cuda.is_available() else "cpu"
+    )
     trainer = Trainer(PeopleSource(motions, body, frame, config), frame, network, config)
     for done, _ in enumerate(trainer.run(config.iterations), start=1):
         progress(done, config.iterations)
@@ -70,8 +72,13 @@ def adapted(
     weights = calibrated(weights, source, _CALIBRATION_PEOPLE)
     scores = compared({TRAINED: SmplFitter(body, weights=weights), PLAIN: SmplFitter(body)}, source)
     about = {
-        "training": f"the shipped weights, {config.iterations} batches of {config.batch}, seed {config.seed}",
-        "validation": ", ".join(f"{name} {score.joints_mm:.1f} mm" for name, score in scores.items()),
+        "training": (
+            f"the shipped weights, {config.iterations} batches of {config.batch}, seed "
+            f"{config.seed}"
+        ),
+        "validation": ", ".join(
+            f"{name} {score.joints_mm:.1f} mm" for name, score in scores.items()
+        ),
         "made with": json.dumps(versions()),
     }
     return replace(weights, card={**card, **about}), scores
@@ -105,4 +112,6 @@ def translated(weights: FitterWeights, trained_on: BodyModel, body: BodyModel) -
 
 def _solved(by: Array, wanted: Array) -> Tensor:
     """Least-squares X (10, 10) with `by` X close to `wanted`."""
-    return torch.from_numpy(np.linalg.solve(by.T @ by + _RIDGE_M**2 * np.eye(10), by.T @ wanted)).float()
+    return torch.from_numpy(
+        np.linalg.solve(by.T @ by + _RIDGE_M**2 * np.eye(10), by.T @ wanted)
+    ).float()

@@ -18,14 +18,19 @@ from shapepose_fg.simulation.detector_statistics import JOINT_GROUP, DetectorSta
 from shapepose_fg.simulation.training.differentiable import inverse_3x3
 
 _NEAREST = {
-    "Head": "Nose", "pelvis": "MidHip", "spine1": "MidHip", "spine2": "MidHip", "spine3": "Neck", "neck": "Neck",
-    "head": "Nose", "collar": "Neck", "hip": "LHip", "knee": "LKnee", "ankle": "LAnkle", "foot": "LBigToe",
-    "shoulder": "LShoulder", "elbow": "LElbow", "wrist": "LWrist", "hand": "LWrist",
+    "Head": "Nose", "pelvis": "MidHip", "spine1": "MidHip", "spine2": "MidHip", "spine3": "Neck",
+    "neck": "Neck", "head": "Nose", "collar": "Neck", "hip": "LHip", "knee": "LKnee",
+    "ankle": "LAnkle", "foot": "LBigToe", "shoulder": "LShoulder", "elbow": "LElbow",
+    "wrist": "LWrist", "hand": "LWrist",
 }  # fmt: skip
 """Joint with statistics that is used for points without their own."""
 _GROUP = torch.tensor(
     [
-        int(JOINT_GROUP[BODY_25.index(name if name in BODY_25.joints else _NEAREST[name.split("_")[-1]])])
+        int(
+            JOINT_GROUP[
+                BODY_25.index(name if name in BODY_25.joints else _NEAREST[name.split("_")[-1]])
+            ]
+        )
         for name in BODY_POINTS
     ]
 )
@@ -44,9 +49,13 @@ _SHIN = _FOOT + _named("Ankle", "ankle")
 _LEG = _SHIN + _named("Knee", "knee", "LHip", "RHip", "left_hip", "right_hip")
 _HAND = _named("Wrist", "wrist", "left_hand", "right_hand")
 _ARM = _HAND + _named("Elbow", "elbow", "Shoulder", "shoulder")
-_FACE = _named("Nose", "Eye", "Ear", "Head") + torch.tensor([float(name == "head") for name in BODY_POINTS])
+_FACE = _named("Nose", "Eye", "Ear", "Head") + torch.tensor(
+    [float(name == "head") for name in BODY_POINTS]
+)
 _FOREARM = _ARM - _named("Shoulder", "shoulder")
-_LIMBS = torch.stack([part * side for part in (_ARM, _LEG, _SHIN, _FOREARM) for side in (_LEFT, _RIGHT)])
+_LIMBS = torch.stack(
+    [part * side for part in (_ARM, _LEG, _SHIN, _FOREARM) for side in (_LEFT, _RIGHT)]
+)
 """(8, K) masks of arms and legs, complete and without their first joint."""
 _REGIONS = torch.stack([_LEFT, _RIGHT, _LEG, _ARM, _FACE, 1 - _LEG])
 """(6, K) masks: one side, everything below the hips, both arms, the head, everything
@@ -98,7 +107,9 @@ def corrupt(
     information = torch.where(by_views[..., None, None], seen_information, noisy_information)
     jump = draw.uniform(*xyz.shape[:2], 1) < config.outlier
     target = target + 0.25 * jump * draw.normal(*xyz.shape)
-    swapped = (draw.uniform(len(xyz), 1) < config.swap) * _SWAPPED[draw.integers(len(_SWAPPED), len(xyz))] > 0
+    swapped = (draw.uniform(len(xyz), 1) < config.swap) * _SWAPPED[
+        draw.integers(len(_SWAPPED), len(xyz))
+    ] > 0
     target = torch.where(swapped[..., None], target[:, _MIRROR], target)
     information = torch.where(swapped[..., None, None], information[:, _MIRROR], information)
     return target, information * (_kept(xyz, draw, config) * offered)[..., None, None]
@@ -127,7 +138,9 @@ def _kept(xyz: Tensor, draw: _Draw, config: CorruptionConfig) -> Tensor:
     for _ in range(2):
         limb = _LIMBS[draw.integers(len(_LIMBS), B)]
         gone = torch.maximum(gone, (draw.uniform(B, 1) < config.limb) * limb)
-    gone = torch.maximum(gone, (draw.uniform(B, 1) < config.region) * _REGIONS[draw.integers(len(_REGIONS), B)])
+    gone = torch.maximum(
+        gone, (draw.uniform(B, 1) < config.region) * _REGIONS[draw.integers(len(_REGIONS), B)]
+    )
     return 1 - gone * (draw.uniform(B, 1) >= config.complete)
 
 
@@ -136,10 +149,14 @@ def _isotropic(xyz: Tensor, draw: _Draw, clean: float) -> tuple[Tensor, Tensor]:
     information.
     """
     B, K = xyz.shape[:2]
-    base = torch.exp(torch.log(torch.tensor(0.002)) + draw.uniform(B, 1) * torch.log(torch.tensor(20.0)))
+    base = torch.exp(
+        torch.log(torch.tensor(0.002)) + draw.uniform(B, 1) * torch.log(torch.tensor(20.0))
+    )
     base = base * (draw.uniform(B, 1) >= clean)
     sigma = base * torch.exp(0.4 * draw.normal(B, K) * (draw.uniform(B, 1) < 0.5))
-    claimed = sigma.clamp_min(0.005) * torch.exp(0.3 * draw.normal(B, 1) * (draw.uniform(B, 1) < 0.3))
+    claimed = sigma.clamp_min(0.005) * torch.exp(
+        0.3 * draw.normal(B, 1) * (draw.uniform(B, 1) < 0.3)
+    )
     information = torch.eye(3) / claimed.square()[..., None, None]
     return xyz + sigma[..., None] * draw.normal(B, K, 3), information
 
@@ -166,7 +183,9 @@ def triangulated(xyz: Tensor, draw: _Draw, statistics: DetectorStatistics) -> tu
     # A single ray leaves the depth unobserved: triangulation gives an arbitrary position.
     anywhere = xyz + 0.4 * draw.normal(B, K, 3)
     little = 0.5
-    solved = inverse_3x3(information + little * torch.eye(3)) @ (target + little * anywhere)[..., None]
+    solved = (
+        inverse_3x3(information + little * torch.eye(3)) @ (target + little * anywhere)[..., None]
+    )
     return solved.squeeze(-1), information
 
 
@@ -195,7 +214,9 @@ def _hidden(xyz: Tensor, direction: Tensor, across: Tensor, draw: _Draw) -> Tens
     return torch.where(other, 2, own.long())
 
 
-def _reports(state: Tensor, draw: _Draw, statistics: DetectorStatistics) -> tuple[Tensor, Tensor, Tensor]:
+def _reports(
+    state: Tensor, draw: _Draw, statistics: DetectorStatistics
+) -> tuple[Tensor, Tensor, Tensor]:
     """Detections of one view for joints in `state` (B, K): missed or not, true sigma and stated
     sigma, metres.
     """
@@ -215,7 +236,9 @@ def _reports(state: Tensor, draw: _Draw, statistics: DetectorStatistics) -> tupl
     sigmas, tails = _table(statistics.sigma_m), _table(statistics.tail)
     sigma = torch.lerp(sigmas[state, knot], sigmas[state, knot + 1], part)
     tail = torch.lerp(tails[state, knot], tails[state, knot + 1], part)
-    sigma = sigma * _table(statistics.joint_scale).mean(-1)[group] * torch.exp(tail * draw.normal(B, K))
+    sigma = (
+        sigma * _table(statistics.joint_scale).mean(-1)[group] * torch.exp(tail * draw.normal(B, K))
+    )
     return missed, sigma.clamp_max(0.25), _PIPELINE_SIGMA_M / confidence
 
 

@@ -33,7 +33,9 @@ class TrainedNetwork(nn.Module):
         super().__init__()
         self.config = config
         self.enter = nn.Linear(UpdateNetwork.num_inputs + config.steps, config.width)
-        self.blocks = nn.ModuleList(_Block(config.width, config.dropout) for _ in range(config.blocks))
+        self.blocks = nn.ModuleList(
+            _Block(config.width, config.dropout) for _ in range(config.blocks)
+        )
         self.leave = nn.Linear(config.width, NUM_PARAMETERS)
         nn.init.zeros_(self.leave.weight)
         nn.init.zeros_(self.leave.bias)
@@ -44,19 +46,25 @@ class TrainedNetwork(nn.Module):
     def of(cls, network: UpdateNetwork) -> "TrainedNetwork":
         """A trainable network with the weights of one of the fitter's."""
         found = cls(network.config)
-        found.load_state_dict({name: torch.from_numpy(value.copy()) for name, value in network.weights.items()})
+        found.load_state_dict(
+            {name: torch.from_numpy(value.copy()) for name, value in network.weights.items()}
+        )
         return found
 
     def finished(self) -> UpdateNetwork:
         """Return this network in the fitter's form."""
-        return UpdateNetwork(self.config, {name: value.cpu().numpy() for name, value in self.state_dict().items()})
+        return UpdateNetwork(
+            self.config, {name: value.cpu().numpy() for name, value in self.state_dict().items()}
+        )
 
     def forward(self, inputs: Tensor, step: int) -> Tensor:
         """(B, `NUM_PARAMETERS`) change of the parameters in update `step`; inputs (B,
         `num_inputs`).
         """
         place, count = self.leave.weight.device, UpdateNetwork.num_inputs
-        with torch.autocast(place.type, torch.bfloat16, enabled=self.training and self.config.half_precision):
+        with torch.autocast(
+            place.type, torch.bfloat16, enabled=self.training and self.config.half_precision
+        ):
             weight, bias = self.enter.weight, self.enter.bias + self.enter.weight[:, count + step]
             hidden = nn.functional.linear(inputs.to(place), weight[:, :count], bias)
             for block in self.blocks:
@@ -68,7 +76,11 @@ class _Block(nn.Module):
     def __init__(self, width: int, dropout: float):
         super().__init__()
         self.layers = nn.Sequential(
-            nn.LayerNorm(width), nn.Linear(width, width), nn.GELU(), nn.Dropout(dropout), nn.Linear(width, width)
+            nn.LayerNorm(width),
+            nn.Linear(width, width),
+            nn.GELU(),
+            nn.Dropout(dropout),
+            nn.Linear(width, width),
         )
 
     def forward(self, hidden: Tensor) -> Tensor:
@@ -97,7 +109,9 @@ class State:
     """(B, 3) translation, metres."""
 
 
-def unroll(see: Sight, network: TrainedNetwork, state: State, targets: DescentTargets) -> Iterator[State]:
+def unroll(
+    see: Sight, network: TrainedNetwork, state: State, targets: DescentTargets
+) -> Iterator[State]:
     """Yield the state after each update, with network inputs from `see`; each starts from the last
     one detached.
     """
@@ -106,7 +120,9 @@ def unroll(see: Sight, network: TrainedNetwork, state: State, targets: DescentTa
     for step in range(network.config.steps):
         plain = BodyState(*(value.detach().double().numpy() for value in vars(state).values()))
         change = STEP * network(torch.from_numpy(see(plain, xyz, information, scale)), step)
-        turned = _six_d(state.local[:, :NUM_ROTATIONS]) + change[:, 10:-3].unflatten(1, (NUM_ROTATIONS, 6))
+        turned = _six_d(state.local[:, :NUM_ROTATIONS]) + change[:, 10:-3].unflatten(
+            1, (NUM_ROTATIONS, 6)
+        )
         local = torch.cat((_from_six_d(turned), state.local[:, NUM_ROTATIONS:]), 1)
         state = State(state.betas + 10 * change[:, :10], local, state.transl + change[:, -3:])
         yield state
@@ -117,7 +133,13 @@ def positions(points: SkinnedPoints, state: State) -> Tensor:
     """(B, K, 3) points of bodies, metres, in single precision."""
     offsets, by_shape, root, root_by_shape, share = (
         torch.from_numpy(np.ascontiguousarray(part)).float()
-        for part in (points.offsets, points.offsets_shape, points.root, points.root_shape, points.translation)
+        for part in (
+            points.offsets,
+            points.offsets_shape,
+            points.root,
+            points.root_shape,
+            points.translation,
+        )
     )
     world = [state.local[:, 0]]
     for bone in range(1, len(SMPL_PARENTS)):  # parents first
@@ -125,8 +147,14 @@ def positions(points: SkinnedPoints, state: State) -> Tensor:
     terms = offsets + torch.einsum("bn,nkyj->bkyj", state.betas, by_shape)
     if points.offsets_pose is not None:
         bent = (state.local[:, 1:] - torch.eye(3)).flatten(1)
-        terms = terms + torch.einsum("be,ekyj->bkyj", bent, torch.from_numpy(points.offsets_pose).float())
-    still = root + torch.einsum("bn,nkx->bkx", state.betas, root_by_shape) + share[:, None] * state.transl[:, None]
+        terms = terms + torch.einsum(
+            "be,ekyj->bkyj", bent, torch.from_numpy(points.offsets_pose).float()
+        )
+    still = (
+        root
+        + torch.einsum("bn,nkx->bkx", state.betas, root_by_shape)
+        + share[:, None] * state.transl[:, None]
+    )
     return still + torch.einsum("bjxy,bkyj->bkx", torch.stack(world, 1), terms)
 
 
@@ -137,13 +165,17 @@ def inverse_3x3(matrix: Tensor) -> Tensor:
     LAPACK would process a batch one by one.
     """
     a, b, c = matrix.unbind(-2)
-    columns = torch.stack((torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)), -1)
+    columns = torch.stack(
+        (torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)), -1
+    )
     determinant = (a * columns[..., 0]).sum(-1)
     return columns / determinant[..., None, None]
 
 
 def _six_d(R: Tensor) -> Tensor:
-    """The first two columns of rotation matrices (`body/fitting/descent.py`); (..., 3, 3) -> (..., 6)."""
+    """The first two columns of rotation matrices (`body/fitting/descent.py`); (..., 3, 3) -> (...,
+    6).
+    """
     return R[..., :2].transpose(-1, -2).flatten(-2)
 
 

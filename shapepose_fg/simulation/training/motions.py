@@ -30,12 +30,14 @@ TEST_SUBJECTS = ("60", "61", "02", "08", "16", "43", "94", "139")
 """CMU subjects for reported figures only: salsa (both partners), sports and chores, walks, runs and
 jumps, a bar, Indian dance, getting up."""
 VALIDATION_SUBJECTS = ("06", "12", "127", "140")
-"""CMU subjects on which settings are chosen: basketball, walks, runs and ducks, getting up from the floor."""
+"""CMU subjects on which settings are chosen: basketball, walks, runs and ducks, getting up from the
+floor."""
 UNKNOWN_SUBJECT = "?"
 """Subject of a recording without one: used for training only."""
 
 MIRROR_JOINTS = tuple(place - BODY_POINTS.index(SMPL_24[0]) for place in MIRROR[-len(SMPL_24) :])
-"""(24,) index of each SMPL joint's partner on the other side of the body; its own for joints in the middle."""
+"""(24,) index of each SMPL joint's partner on the other side of the body; its own for joints in the
+middle."""
 
 SEGMENT_CAP = 300
 """Maximum weight of one recording, frames (10 s)."""
@@ -53,7 +55,8 @@ _LEANING_RAD = 0.15
 """Standard deviation of the lean of sampled people, rad."""
 _WRISTS, _HANDS, _TOES = (20, 21), (22, 23), (10, 11)
 _BODY_COLUMNS = 66
-"""Number of columns of root and 21 body joints, which SMPL, SMPL+H and SMPL-X files have in common."""
+"""Number of columns of root and 21 body joints, which SMPL, SMPL+H and SMPL-X files have in
+common."""
 _Y_UP = Rotation.from_rotvec([-np.pi / 2, 0.0, 0.0])
 """Rotation from AMASS, z up, to SMPL's own frame, y up."""
 _NOT_MOTIONS = ("shape.npz", "_stagei.npz")
@@ -81,14 +84,16 @@ def split_of(subject: str) -> Split:
 class Motions(Table):
     """Poses of many people in SMPL's structure: N frames of S recordings.
 
-    Collars that were not recorded follow the arms as they do in the simulator; unrecorded wrists, toes and hands
-    are zero. World frame: y up, SMPL's own.
+    Collars that were not recorded follow the arms as they do in the simulator; unrecorded wrists,
+    toes and hands are zero. World frame: y up, SMPL's own.
     """
 
     poses: Annotated[NDArray[np.float32], Column("N 24 3", np.float32)]
-    """(N, 24, 3) axis-angle, rad: the root's in the world, the other joints' relative to their parents."""
+    """(N, 24, 3) axis-angle, rad: the root's in the world, the other joints' relative to their
+    parents."""
     weight: Annotated[Array, Column("N")]
-    """(N,) weight of each frame, at most 1: recordings, subjects and walking are capped within their split."""
+    """(N,) weight of each frame, at most 1: recordings, subjects and walking are capped within
+    their split."""
     subject: Annotated[NDArray[np.str_], Column("N", np.str_)]
     """(N,) recorded subject."""
 
@@ -102,7 +107,9 @@ class Motions(Table):
         if split not in SPLITS:
             raise ValueError(f"split must be one of {' '.join(SPLITS)}, got {split!r}")
         subjects, place = np.unique(self.subject, return_inverse=True)
-        return self.rows(np.array([split_of(str(name)) == split for name in subjects], dtype=bool)[place])
+        return self.rows(
+            np.array([split_of(str(name)) == split for name in subjects], dtype=bool)[place]
+        )
 
 
 def drawn_motions(count: int, seed: int) -> Motions:
@@ -112,7 +119,9 @@ def drawn_motions(count: int, seed: int) -> Motions:
     rng = np.random.default_rng(seed)
     root = rng.normal(0, _LEANING_RAD, (count, 1, 3))
     root[:, 0, 1] = rng.uniform(-np.pi, np.pi, count)
-    poses = np.concatenate((root, PosePrior.default().sample(rng, count)), axis=1).astype(np.float32)
+    poses = np.concatenate((root, PosePrior.default().sample(rng, count)), axis=1).astype(
+        np.float32
+    )
     return Motions(poses, np.ones(count), np.full(count, UNKNOWN_SUBJECT))
 
 
@@ -129,13 +138,19 @@ def load_motions(path: str | Path) -> Motions:
     """
     path = Path(path)
     if path.is_dir():
-        files = [file for file in sorted(files_below(path, (".npz",))) if not file.name.endswith(_NOT_MOTIONS)]
+        files = [
+            file
+            for file in sorted(files_below(path, (".npz",)))
+            if not file.name.endswith(_NOT_MOTIONS)
+        ]
         recordings = [_read_amass(file) for file in files]
     else:
         mocap = Mocap.load(path)
         recordings = [_of_clip(mocap.clip(index)) for index in range(len(mocap))]
     if len(recordings) == 0:
-        raise InputError(f"{path}: holds no recordings, or no .npz; give CMU's file or a folder of AMASS motions")
+        raise InputError(
+            f"{path}: holds no recordings, or no .npz; give CMU's file or a folder of AMASS motions"
+        )
     subject, walking, poses = zip(*recordings, strict=True)
     length = np.array([len(each) for each in poses])
     return Motions(
@@ -189,11 +204,14 @@ def _amass_arrays(path: Path) -> tuple[Array, float]:
         missing = "poses" if rate is not None else rates[0]
         raise InputError(f"{path}: array {missing!r} is missing; give motions in AMASS's format")
     if any(arrays[name].dtype.kind == "U" for name in ("poses", rate)):
-        raise InputError(f"{path}: poses and {rate} must be numbers; give motions in AMASS's format")
+        raise InputError(
+            f"{path}: poses and {rate} must be numbers; give motions in AMASS's format"
+        )
     poses, fps = arrays["poses"].astype(np.float64), arrays[rate].astype(np.float64)
     if poses.ndim != 2 or len(poses) == 0 or poses.shape[1] < _BODY_COLUMNS or poses.shape[1] % 3:
         raise InputError(
-            f"{path}: poses must be (T, 66 or more), got {poses.shape}; give motions in AMASS's format"
+            f"{path}: poses must be (T, 66 or more), got {poses.shape}; give motions in AMASS's "
+            "format"
         )
     if not np.isfinite(poses).all():
         raise InputError(f"{path}: poses holds values that are not finite; leave the file out")

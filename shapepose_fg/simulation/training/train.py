@@ -94,7 +94,9 @@ class People:
 class PeopleSource:
     """Samples bodies: shapes from the model's own distribution, poses from recordings."""
 
-    def __init__(self, motions: Motions, model: BodyModel, frame: PersonFrame, config: TrainingConfig):
+    def __init__(
+        self, motions: Motions, model: BodyModel, frame: PersonFrame, config: TrainingConfig
+    ):
         self.config, self.model, self._frame = config, model, frame
         self._poses = torch.from_numpy(motions.poses)
         self._weight = torch.from_numpy(motions.weight).double().cumsum(0)
@@ -105,7 +107,9 @@ class PeopleSource:
         pose = self._pose(count, generator)
         other = self._pose(count, generator)
         exchanged = torch.rand(count, generator=generator) < self.config.exchange
-        part = _CHAINS[torch.randint(len(_CHAINS), (count,), generator=generator)] & exchanged[:, None]
+        part = (
+            _CHAINS[torch.randint(len(_CHAINS), (count,), generator=generator)] & exchanged[:, None]
+        )
         pose = torch.where(part[..., None], other, pose)
         shake = self.config.shake_rad * torch.randn(count, 24, 3, generator=generator)
         shake[:, 0] = 0
@@ -136,7 +140,13 @@ for _row, _joints in enumerate(((13, 16, 18, 20), (14, 17, 19, 21), (1, 4, 7, 10
 class Trainer:
     """One run of training."""
 
-    def __init__(self, source: PeopleSource, frame: PersonFrame, network: TrainedNetwork, config: TrainingConfig):
+    def __init__(
+        self,
+        source: PeopleSource,
+        frame: PersonFrame,
+        network: TrainedNetwork,
+        config: TrainingConfig,
+    ):
         self.source, self.frame, self.config = source, frame, config
         self.network = network
         self.averaged = TrainedNetwork(config.network).to(network.gradient_scale.device)
@@ -183,7 +193,11 @@ class Trainer:
 
 def _learning_rate(config: TrainingConfig, iteration: int) -> float:
     done = iteration / config.iterations
-    warm = min(1.0, done / 0.05) if done < 0.05 else 0.5 * (1 + float(torch.cos(torch.tensor(torch.pi * done))))
+    warm = (
+        min(1.0, done / 0.05)
+        if done < 0.05
+        else 0.5 * (1 + float(torch.cos(torch.tensor(torch.pi * done))))
+    )
     return config.learning_rate * max(warm, 1e-4)
 
 
@@ -195,13 +209,17 @@ def prepared(
     frame.
     """
     B = len(people.points)
-    offered = _OFFERED[torch.multinomial(torch.tensor(config.skeletons), B, True, generator=generator)]
+    offered = _OFFERED[
+        torch.multinomial(torch.tensor(config.skeletons), B, True, generator=generator)
+    ]
     xyz, information = corrupt(people.points, offered, generator, config.corruption)
     information = information @ inverse_3x3(torch.eye(3) + config.model_sigma_m**2 * information)
     xyz = torch.where((information != 0).any(-1).any(-1)[..., None], xyz, 0.0)
     variance = mean_variance(information)
     enough = torch.isfinite(variance).sum(1) >= 4
-    xyz, information, variance, points = (value[enough] for value in (xyz, information, variance, people.points))
+    xyz, information, variance, points = (
+        value[enough] for value in (xyz, information, variance, people.points)
+    )
     local, betas = people.state.local[enough], people.state.betas[enough]
     placed = frame.place(xyz.double().numpy(), variance.double().numpy(), _ALL)
     rotation, origin = map(_tensor, placed)
@@ -209,14 +227,19 @@ def prepared(
     turned = rotation.mT[:, None] @ information @ rotation[:, None]
     true_local = torch.cat((rotation.mT[:, None] @ local[:, :1], local[:, 1:]), 1)
     truth = State(betas, true_local, torch.zeros(len(xyz), 3))
-    local, transl = _tensor(frame.local).expand(len(xyz), 24, 3, 3), _tensor(frame.transl).expand(len(xyz), 3)
+    local, transl = (
+        _tensor(frame.local).expand(len(xyz), 24, 3, 3),
+        _tensor(frame.transl).expand(len(xyz), 3),
+    )
     start = State(torch.zeros(len(xyz), 10), local, transl)
     return DescentTargets(inside(xyz), turned), start, truth, inside(points)
 
 
 def mean_variance(information: Tensor) -> Tensor:
     """(B, K) mean variance over the axes, m²; infinite above `_SEEN_M` squared, e.g. for a ray."""
-    variance = torch.diagonal(inverse_3x3(information + 0.1 * torch.eye(3)), dim1=-2, dim2=-1).mean(-1)
+    variance = torch.diagonal(inverse_3x3(information + 0.1 * torch.eye(3)), dim1=-2, dim2=-1).mean(
+        -1
+    )
     return torch.where(variance < _SEEN_M**2, variance, torch.inf)
 
 
@@ -253,14 +276,20 @@ def calibrated(weights: FitterWeights, source: PeopleSource, count: int = 4096) 
         places = slots(TARGET_SKELETONS[name])
         squared = left_out_squared(plain, source, places, count, generator)
         for place in places:
-            both = np.concatenate([squared.get(place, np.zeros(0)), squared.get(MIRROR[place], np.zeros(0))])
+            both = np.concatenate(
+                [squared.get(place, np.zeros(0)), squared.get(MIRROR[place], np.zeros(0))]
+            )
             if len(both) >= _ENOUGH:
                 spread[place] = np.quantile(both, INSIDE) / chi2.ppf(INSIDE, 3)
     return replace(weights, spread=spread)
 
 
 def left_out_squared(
-    weights: FitterWeights, source: PeopleSource, places: tuple[int, ...], count: int, generator: torch.Generator
+    weights: FitterWeights,
+    source: PeopleSource,
+    places: tuple[int, ...],
+    count: int,
+    generator: torch.Generator,
 ) -> dict[int, Array]:
     """Squared Mahalanobis distances of true joints from predictions without their
     target, by point.
@@ -295,7 +324,9 @@ class Score:
     """Processor time of a fit, ms, including leave-one-out passes."""
 
 
-def compared(fitters: Mapping[str, BodyFitter], source: PeopleSource, count: int = 512) -> dict[str, Score]:
+def compared(
+    fitters: Mapping[str, BodyFitter], source: PeopleSource, count: int = 512
+) -> dict[str, Score]:
     """Scores of `fitters` for BODY_25's joints on the same people, over the rows that all of them
     fit.
     """
@@ -304,7 +335,9 @@ def compared(fitters: Mapping[str, BodyFitter], source: PeopleSource, count: int
     error, spent = dict[str, Array](), dict[str, float]()
     for name, fitter in fitters.items():
         begin = time.process_time()
-        error[name] = 1000 * np.linalg.norm(fitter.fit(targets).joints - truth, axis=-1).mean(axis=1)
+        error[name] = 1000 * np.linalg.norm(fitter.fit(targets).joints - truth, axis=-1).mean(
+            axis=1
+        )
         spent[name] = 1000 * (time.process_time() - begin) / count
     done = np.isfinite(list(error.values())).all(axis=0)
     return {name: Score(float(each[done].mean()), spent[name]) for name, each in error.items()}

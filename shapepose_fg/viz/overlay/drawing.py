@@ -110,7 +110,9 @@ def draw_bodies(
     light = 0.35 + 0.65 * np.clip(-(normal @ view.camera.wTc[:3, 2]), 0.0, 1.0)
     own = np.array(colours, dtype=np.float64)[met // len(faces)]
     drawn = picture.copy()
-    drawn[row, column] = ((1 - _OPACITY) * picture[row, column] + _OPACITY * light[:, None] * own).astype(np.uint8)
+    drawn[row, column] = (
+        (1 - _OPACITY) * picture[row, column] + _OPACITY * light[:, None] * own
+    ).astype(np.uint8)
     return drawn
 
 
@@ -199,8 +201,24 @@ def draw_detections(picture: Picture, xy: Array, used: Mask, colours: Whole) -> 
         else:
             arm = round(1.5 * arm)
             for width, paint in ((max(3, reach), _DARK), (max(1, reach // 2), GATED)):
-                cv2.line(picture, (x - arm, y - arm), (x + arm, y + arm), paint, width, cv2.LINE_AA, _FINE)
-                cv2.line(picture, (x - arm, y + arm), (x + arm, y - arm), paint, width, cv2.LINE_AA, _FINE)
+                cv2.line(
+                    picture,
+                    (x - arm, y - arm),
+                    (x + arm, y + arm),
+                    paint,
+                    width,
+                    cv2.LINE_AA,
+                    _FINE,
+                )
+                cv2.line(
+                    picture,
+                    (x - arm, y + arm),
+                    (x + arm, y - arm),
+                    paint,
+                    width,
+                    cv2.LINE_AA,
+                    _FINE,
+                )
 
 
 def draw_label(

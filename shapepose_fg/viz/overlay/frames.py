@@ -69,7 +69,9 @@ class Overlay:
                 _draw_detections(picture, view, people)
             if self.skeletons:
                 drawing.draw_skeletons(picture, view, drawing.Skeletons.of(people))
-            drawing.draw_label(picture, f"camera {used.name}, frame {frame}", (0, 0), _INK, centred=False)
+            drawing.draw_label(
+                picture, f"camera {used.name}, frame {frame}", (0, 0), _INK, centred=False
+            )
             drawn.append(picture)
         return drawn
 
@@ -141,7 +143,9 @@ def _draw_detections(picture: Picture, view: drawing.PictureView, people: Recons
     gate = table.gate[..., v]
     row, joint = np.nonzero(gate != Gate.NOT_SEEN)
     xy = view.through_lens(table.xy[row, joint, v])
-    colours = np.array([drawing.blue_green_red(person) for person in table.person[row].tolist()]).reshape(-1, 3)
+    colours = np.array(
+        [drawing.blue_green_red(person) for person in table.person[row].tolist()]
+    ).reshape(-1, 3)
     drawing.draw_detections(picture, xy, gate[row, joint] == Gate.USED, colours)
 
 
@@ -154,7 +158,9 @@ def _picture(used: CameraFootage, footage: Footage, frame: int, size: tuple[int,
     if picture.shape[1::-1] == size:
         return picture.copy()
     smaller = size[0] < picture.shape[1]
-    scaled = cv2.resize(picture, size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR)
+    scaled = cv2.resize(
+        picture, size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR
+    )
     return np.asarray(scaled, dtype=np.uint8)
 
 
@@ -175,8 +181,12 @@ def grid_shape(sizes: Sequence[tuple[int, int]], width: int) -> tuple[int, list[
 
 
 def grid(pictures: Sequence[Picture], columns: int) -> Picture:
-    """Arrange pictures of equal height in rows of `columns`; short rows are padded with dark grey."""
+    """Arrange pictures of equal height in rows of `columns`; short rows are padded with dark
+    grey.
+    """
     rows = [np.hstack(pictures[at : at + columns]) for at in range(0, len(pictures), columns)]
     missing = [max(row.shape[1] for row in rows) - row.shape[1] for row in rows]
     pairs = zip(rows, missing, strict=True)
-    return np.vstack([np.pad(row, ((0, 0), (0, n), (0, 0)), constant_values=30) for row, n in pairs])
+    return np.vstack(
+        [np.pad(row, ((0, 0), (0, n), (0, 0)), constant_values=30) for row, n in pairs]
+    )

@@ -11,7 +11,12 @@ from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.run_summary import MOST_FRAMES
 from shapepose_fg.io.footage.footage import Footage, open_footage
-from shapepose_fg.io.footage.placement import FOOTAGE, CameraFootage, placements_of, read_used_footage
+from shapepose_fg.io.footage.placement import (
+    FOOTAGE,
+    CameraFootage,
+    placements_of,
+    read_used_footage,
+)
 from shapepose_fg.io.footage.places import find_footage
 
 
@@ -44,14 +49,16 @@ def pictures_of(
         paths = dict(zip(drawn, places, strict=True))
     elif len(unknown) > 0:
         raise InputError(
-            f"the pictures of camera {unknown[0]} are unknown; give --videos, or with --detections the folder"
-            " that `shapepose-fg detect` wrote"
+            f"the pictures of camera {unknown[0]} are unknown; give --videos, or with "
+            "--detections the folder that `shapepose-fg detect` wrote"
         )
     else:
         paths = {name: used[name].path for name in drawn}
     for name, path in paths.items():
         if not path.exists():
-            raise InputError(f"{path}: the pictures of camera {name} are not there any more; give --videos")
+            raise InputError(
+                f"{path}: the pictures of camera {name} are not there any more; give --videos"
+            )
     opened = {name: open_one(name, path) for name, path in paths.items()}
     # The placement recorded by `detect` is valid as long as the pictures have the same size.
     alike = {
@@ -62,11 +69,13 @@ def pictures_of(
     for name, placement in alike.items():
         size = rig.cameras[rig.names.index(name)].image_size
         if placement.calibrated_size != size:
-            theirs, ours = (f"{width} x {height}" for width, height in (placement.calibrated_size, size))
+            theirs, ours = (
+                f"{width} x {height}" for width, height in (placement.calibrated_size, size)
+            )
             raise InputError(
-                f"{FOOTAGE}: camera {name} was calibrated for pictures of {theirs}, but cameras.json of the"
-                f" result is for {ours}; give --detections with the folder of this result, or"
-                " --image-placement"
+                f"{FOOTAGE}: camera {name} was calibrated for pictures of {theirs}, but "
+                f"cameras.json of the result is for {ours}; give --detections with the folder of "
+                "this result, or --image-placement"
             )
     sizes = {name: each.size for name, each in opened.items() if name not in alike}
     placements, concluded = placements_of(image_placement, sizes, rig)
@@ -75,7 +84,8 @@ def pictures_of(
         first = run.get("numbered_from")
         picture = "the first picture" if first is None else f"picture {first}"
         notes.append(
-            f"frame {first or 0} of the result is assumed to be {picture} of {' '.join(unknown)}, and so on"
+            f"frame {first or 0} of the result is assumed to be {picture} of "
+            f"{' '.join(unknown)}, and so on"
         )
     for text in notes:
         tell(text)
@@ -85,7 +95,9 @@ def pictures_of(
         if moments and name in moments:
             index = np.append(index, -1)[np.minimum(moments[name], len(index))]
         index = np.where(index < len(footage.number), index, -1)
-        pairs.append((CameraFootage(name, footage.path, (placements | alike)[name], index), footage))
+        pairs.append(
+            (CameraFootage(name, footage.path, (placements | alike)[name], index), footage)
+        )
     return pairs
 
 
@@ -97,8 +109,8 @@ def _counted(footage: Footage, numbered: bool) -> Index:
     count = int(footage.number[-1]) - first + 1
     if count > MOST_FRAMES:
         raise InputError(
-            f"{footage.path}: pictures are numbered from {footage.number[0]} to {footage.number[-1]}; number them"
-            " by the frames of the recording"
+            f"{footage.path}: pictures are numbered from {footage.number[0]} to "
+            f"{footage.number[-1]}; number them by the frames of the recording"
         )
     index = np.full(count, -1, dtype=np.intp)
     index[footage.number - first] = np.arange(len(footage.number))
@@ -110,7 +122,9 @@ def _used_footage(run: Mapping[str, Any], detections: Path | None) -> list[Camer
     if detections is not None:
         file = detections / FOOTAGE if detections.is_dir() else detections
         if not file.is_file():
-            raise InputError(f"{file}: there is no such file; give the folder that `shapepose-fg detect` wrote")
+            raise InputError(
+                f"{file}: there is no such file; give the folder that `shapepose-fg detect` wrote"
+            )
         return read_used_footage(file)
     inputs = run.get("inputs")
     texts = [Path(str(each)) for each in (inputs if isinstance(inputs, dict) else ())]

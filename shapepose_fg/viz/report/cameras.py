@@ -83,7 +83,9 @@ class CameraPage:
             confidence=np.ones((P, J)),
             status=np.full(P, str(Status.OK)),
             time_s=self.time_s[self.frame],
-            known=np.where(np.isfinite(self.points[..., 0]), Known.SEEN, Known.UNKNOWN).astype(np.uint8),
+            known=np.where(np.isfinite(self.points[..., 0]), Known.SEEN, Known.UNKNOWN).astype(
+                np.uint8
+            ),
             betas=np.full((P, 10), np.nan),
             global_orient=np.full((P, 3), np.nan),
             body_pose=np.full((P, 23, 3), np.nan),

@@ -18,7 +18,10 @@ def told_by(run: Run) -> dict[str, Any]:
     return {
         "warnings": [*map(str, lists(objects(run.get("setup")).get("warnings")))],
         "notes": [*map(str, lists(run.get("notes")))],
-        "problems": [", ".join(f"{key} {it}" for key, it in objects(each).items()) for each in lists(problems)],
+        "problems": [
+            ", ".join(f"{key} {it}" for key, it in objects(each).items())
+            for each in lists(problems)
+        ],
         "dropped": _dropped(objects(people.get("dropped")), objects(run.get("dropped_frames"))),
         "probabilities": _probabilities(run.get("probability")),
         "fps": number(time.get("fps")),
@@ -57,7 +60,10 @@ def _changed_settings(run: Run) -> list[tuple[str, str, str]]:
     Tables of older versions, which contain all settings, are left out.
     """
     usual = dict(_flat(asdict(PipelineConfig())))
-    given = {name: (_text(value), _text(usual.get(name, "–"))) for name, value in _flat(run.get("configuration"))}
+    given = {
+        name: (_text(value), _text(usual.get(name, "–")))
+        for name, value in _flat(run.get("configuration"))
+    }
     return [
         (name, value, default)
         for name, (value, default) in given.items()
@@ -75,8 +81,8 @@ def _dropped(reasons: Run, frames: Run) -> list[tuple[str, int, str]]:
 def _noise(told: Run) -> list[tuple[float, float, float, float, int]]:
     """Table of the detector's noise law, with a row for each range of scores that had detections.
 
-    Columns are the middle of the range, the standard deviation, mm, that of the shipped law, mm, the
-    share of gross errors, and the number of detections.
+    Columns are the middle of the range, the standard deviation, mm, that of the shipped law, mm,
+    the share of gross errors, and the number of detections.
     """
     try:
         law, usual = NoiseLaw.from_dict(told).as_dict(), NoiseLaw.shipped().as_dict()
@@ -90,7 +96,9 @@ def _probabilities(listed: object) -> dict[int, float]:
     """Probability of each person by number; empty for frame-by-frame results."""
     entries = [objects(each) for each in lists(listed)]
     found = {number(each.get("person")): number(each.get("probability")) for each in entries}
-    return {int(who): value for who, value in found.items() if who is not None and value is not None}
+    return {
+        int(who): value for who, value in found.items() if who is not None and value is not None
+    }
 
 
 def _time(seconds: Run) -> str:

@@ -52,7 +52,8 @@ class CameraFigures:
     used: Residual
     """Residuals of the detections that were used."""
     trend_px: list[float | None]
-    """Time series: median residual of all assigned detections, in equal segments of the recording."""
+    """Time series: median residual of all assigned detections, in equal segments of the
+    recording."""
     offered: float | None = None
     """Number of all detections, assigned or not; None if run.json does not have it."""
     left_out_px: float | None = None
@@ -83,7 +84,10 @@ def camera_figures(people: Reconstruction) -> list[CameraFigures]:
                 {each: int((gate == each).sum()) for each in Gate if each != Gate.NOT_SEEN},
                 Residual.of(error),
                 Residual.of(error[gate == Gate.USED]),
-                [Residual.of(error[segment == index]).median_px for index in range(segment.max(initial=-1) + 1)],
+                [
+                    Residual.of(error[segment == index]).median_px
+                    for index in range(segment.max(initial=-1) + 1)
+                ],
                 number(more.get("offered")),
                 number(left_out.get("median_px")),
                 number(left_out.get("median_mm")),
@@ -103,11 +107,15 @@ def overall(people: Reconstruction) -> dict[str, Any]:
     gate = np.zeros(0) if table is None else table.gate[table.gate != Gate.NOT_SEEN]
     told = [number(objects(each).get("offered")) for each in lists(people.run.get("cameras"))]
     offered = sum(each or 0.0 for each in told) if len(told) > 0 and None not in told else None
-    count = sum(number(objects(each).get("used")) or 0.0 for each in lists(people.run.get("cameras")))
+    count = sum(
+        number(objects(each).get("used")) or 0.0 for each in lists(people.run.get("cameras"))
+    )
     return {
         "placed": bool(np.isfinite(people.joints).all(axis=-1).any()),
         "seen": _share(known == Known.SEEN),
-        "error": Residual.of(np.zeros(0) if table is None else np.linalg.norm(table.residual_px, axis=-1)),
+        "error": Residual.of(
+            np.zeros(0) if table is None else np.linalg.norm(table.residual_px, axis=-1)
+        ),
         "used": _share(gate == Gate.USED) if offered is None else min(count / max(offered, 1), 1.0),
         "used_of_given": None if offered is None else _share(gate == Gate.USED),
         "sigma_mm": 1e3 * float(np.median(sigma)) if len(sigma) > 0 else None,
@@ -115,7 +123,9 @@ def overall(people: Reconstruction) -> dict[str, Any]:
         "rows": len(people),
         "people": len(np.unique(people.person)),
         "frames": len(np.unique(np.concatenate([people.frame, *spans]))),
-        "status": ", ".join(f"{count} {name}" for name, count in Counter(people.status.tolist()).items()),
+        "status": ", ".join(
+            f"{count} {name}" for name, count in Counter(people.status.tolist()).items()
+        ),
     }
 
 

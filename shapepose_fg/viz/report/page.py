@@ -20,14 +20,20 @@ _SCRIPTS = ("geometry.js", "skin.js", "drawing.js", "page.js")
 
 
 def page_text(
-    title: str, people: Reconstruction, tracks: Sequence[TrackSummary], scene: Scene | None, remarks: Sequence[str]
+    title: str,
+    people: Reconstruction,
+    tracks: Sequence[TrackSummary],
+    scene: Scene | None,
+    remarks: Sequence[str],
 ) -> str:
     """The page of a result as self-contained HTML, without references to other addresses.
 
     `tracks` are the identities, `scene` is drawn if given, and `remarks` state what is missing on
     the page.
     """
-    by_person = known_counts(people, np.searchsorted([each.person for each in tracks], people.person))
+    by_person = known_counts(
+        people, np.searchsorted([each.person for each in tracks], people.person)
+    )
     by_joint, kinds = known_counts(people), [kind.name.lower() for kind in KINDS]
     return filled(
         "page.html",
@@ -66,9 +72,18 @@ def filled(name: str, scene: Scene | None, **values: object) -> str:
         extensions=["jinja2.ext.do"],
     )
     page.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
-    page.filters |= {"dash": _dash, "share": _share, "percent": _percent, "count": _count, "path": _path}
+    page.filters |= {
+        "dash": _dash,
+        "share": _share,
+        "percent": _percent,
+        "count": _count,
+        "path": _path,
+    }
     scripts = [_asset(name) for name in _SCRIPTS] if scene is not None else []
-    digests = (base64.b64encode(hashlib.sha256(text.encode("utf-8")).digest()).decode("ascii") for text in scripts)
+    digests = (
+        base64.b64encode(hashlib.sha256(text.encode("utf-8")).digest()).decode("ascii")
+        for text in scripts
+    )
     hashes = " ".join(f"'sha256-{digest}'" for digest in digests) or "'none'"
     policy = f"default-src 'none'; style-src 'unsafe-inline'; script-src {hashes}; img-src data:"
     return page.get_template(name).render(
@@ -100,7 +115,9 @@ def _count(value: float | None) -> str:
 
 
 def _path(values: list[float | None], most: float) -> str:
-    """SVG path of a time series in a box of 120 x 22, for values from 0 to `most`; None is a gap."""
+    """SVG path of a time series in a box of 120 x 22, for values from 0 to `most`; None is a
+    gap.
+    """
     step, drawn, pen_down = 120 / max(len(values) - 1, 1), list[str](), False
     for index, value in enumerate(values):
         if value is not None:

@@ -68,7 +68,11 @@ def scene_of(take: Take, arrays: SmplArrays | None, most_bytes: int) -> Scene:
     rows = take.rows[person, index[frame]]
     joints = take.people.joints[rows] @ axes.T
     # Moving cameras are drawn at their initial poses.
-    cameras = () if take.rig is None else take.rig.at(np.full(len(take.rig), take.times_s[:1].sum())).cameras
+    cameras = (
+        ()
+        if take.rig is None
+        else take.rig.at(np.full(len(take.rig), take.times_s[:1].sum())).cameras
+    )
     centres = np.array([camera.centre for camera in cameras]).reshape(-1, 3) @ axes.T
     pack = _packing(joints)
     sigma = sigma_m(take.people.covariance[rows])
@@ -109,7 +113,9 @@ class _Packing:
         `_MISSING`.
         """
         steps = np.rint((points - self.origin) / self.unit_m)
-        near = np.isfinite(steps).all(axis=-1, keepdims=True) & (np.abs(steps) < -_MISSING).all(-1, keepdims=True)
+        near = np.isfinite(steps).all(axis=-1, keepdims=True) & (np.abs(steps) < -_MISSING).all(
+            -1, keepdims=True
+        )
         return np.where(near, steps, _MISSING)
 
 
@@ -202,7 +208,10 @@ def _bodies(
         place = np.full(len(take.frames), -1)
         place[motion.index] = np.arange(len(motion.index))
         mine = np.flatnonzero((person == each) & (place[frame] >= 0))
-        turns[mine], pelvis[mine] = motion.rotations[place[frame[mine]]], motion.pelvis[place[frame[mine]]]
+        turns[mine], pelvis[mine] = (
+            motion.rotations[place[frame[mine]]],
+            motion.pelvis[place[frame[mine]]],
+        )
     millimetres = _Packing(np.zeros(3), 1e-3)
     return {
         "mesh": {
@@ -220,4 +229,6 @@ def _bodies(
 
 def _base64(values: NDArray[Any], kind: str) -> str:
     """Base64 text of numbers, which the page's script decodes to a typed array."""
-    return base64.b64encode(np.ascontiguousarray(values, dtype=np.dtype(kind)).tobytes()).decode("ascii")
+    return base64.b64encode(np.ascontiguousarray(values, dtype=np.dtype(kind)).tobytes()).decode(
+        "ascii"
+    )

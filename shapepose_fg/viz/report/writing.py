@@ -58,9 +58,13 @@ def write_report(
     if len(people) > 0:
         if fps is None and not _timed(people):
             fps = ASSUMED_FPS
-            remarks.append(f"the times of the frames are unknown: the scene plays at {fps:g} Hz (--fps)")
+            remarks.append(
+                f"the times of the frames are unknown: the scene plays at {fps:g} Hz (--fps)"
+            )
         try:
-            scene = scene_of(Take.of(people, up, rig=rig, fps=fps, identities=False), arrays, SCENE_BYTES)
+            scene = scene_of(
+                Take.of(people, up, rig=rig, fps=fps, identities=False), arrays, SCENE_BYTES
+            )
         except ValueError as error:
             remarks.append(f"the scene is not drawn: {error}")
     title = str(people.run.get("project") or folder.resolve().name or folder)

@@ -1,4 +1,6 @@
-"""A result with everything that exports must cope with: somebody who is out of sight, a hole, a guessed joint."""
+"""A result with everything that exports must cope with: somebody who is out of sight, a hole, a
+guessed joint.
+"""
 
 import json
 from dataclasses import replace
@@ -45,7 +47,8 @@ def result(scene: Scene) -> Reconstruction:
     joints[lost, ankle], covariance[lost, ankle], known[lost, ankle] = np.nan, np.nan, Known.UNKNOWN
     bare = (frame + FIRST == BARE) & (person == 1)
     orient, pose, transl = (
-        value.reshape(N, -1).copy() for value in (motion.global_orient, motion.body_pose, motion.transl)
+        value.reshape(N, -1).copy()
+        for value in (motion.global_orient, motion.body_pose, motion.transl)
     )
     betas = motion.betas[person]
     for value in (betas, orient, pose, transl):
@@ -65,22 +68,30 @@ def result(scene: Scene) -> Reconstruction:
         time_s=(frame + FIRST) / FPS,
         velocity=rng.normal(0, 1, (N, 25, 3)),
         known=known,
-        run={"frames": [FIRST, FIRST + FRAMES], "configuration": {"temporal": True}, "time": {"fps": FPS}},
+        run={
+            "frames": [FIRST, FIRST + FRAMES],
+            "configuration": {"temporal": True},
+            "time": {"fps": FPS},
+        },
     )
     people = replace(people, observations=observations(people, scene))
     return people.rows(~((people.person == 7) & np.isin(people.frame, AWAY)))
 
 
 def observations(people: Reconstruction, scene: Scene) -> ObservationTable:
-    """Every joint in every view where it is; one detection in 50 is too far off and was not used."""
-    xy, _ = scene.rig.project(np.where(np.isfinite(people.joints), people.joints, scene.rig.centres.mean(axis=0)))
+    """Every joint in every view where it is; one detection in 50 is too far off and was not
+    used.
+    """
+    xy, _ = scene.rig.project(
+        np.where(np.isfinite(people.joints), people.joints, scene.rig.centres.mean(axis=0))
+    )
     xy = np.moveaxis(xy, 0, 2).astype(np.float32)
     N, J, V = xy.shape[:3]
     gate = np.full((N, J, V), Gate.USED)
     gate[np.random.default_rng(1).uniform(size=gate.shape) < 0.02] = Gate.TOO_FAR
     return ObservationTable(
-        people.frame, people.person, people.joint_names, np.array(scene.rig.names), np.zeros((N, J, V), int),
-        xy, np.full((N, J, V), 0.7), np.ones((N, J, V, 2)), gate,
+        people.frame, people.person, people.joint_names, np.array(scene.rig.names),
+        np.zeros((N, J, V), int), xy, np.full((N, J, V), 0.7), np.ones((N, J, V, 2)), gate,
     )  # fmt: skip
 
 

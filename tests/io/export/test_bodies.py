@@ -1,4 +1,6 @@
-"""Bodies in AMASS npz, BVH and GLB: what the files say, put together anew, is the body model's to 1 mm."""
+"""Bodies in AMASS npz, BVH and GLB: what the files say, put together anew, is the body model's to 1
+mm.
+"""
 
 from dataclasses import replace
 
@@ -31,7 +33,11 @@ def test_amass_posed_by_the_body_model_stands_where_it_stood(job, true_bodies):
     written = write_amass(job)
     names = [path.name.removesuffix("_amass.npz") for path in written.files]
     # The hole of one frame without a body is filled, the eight frames out of sight are not.
-    assert names == ["person_3_frames_100-123", "person_7_frames_100-107", "person_7_frames_116-123"]
+    assert names == [
+        "person_3_frames_100-123",
+        "person_7_frames_100-107",
+        "person_7_frames_116-123",
+    ]
     assert any("betas are those of the built-in body" in note for note in written.notes)
     body = BodyModel.default()
     for path in written.files:
@@ -63,7 +69,9 @@ def test_amass_is_z_up_whatever_the_world_is(result, tmp_path, true_bodies):
         parts = (file["betas"][None, :10], pose[:, 0], pose[:, 1:], file["trans"][:1])
     joints = body.joints(BodyParameters(*(part.copy() for part in parts)))[0]
     truly, _ = true_bodies(3, FIRST)
-    np.testing.assert_allclose(joints, np.stack([truly[:, 0], truly[:, 2], -truly[:, 1]], axis=1), atol=1e-6)
+    np.testing.assert_allclose(
+        joints, np.stack([truly[:, 0], truly[:, 2], -truly[:, 1]], axis=1), atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("seconds", [0.0, 1.0])
@@ -105,10 +113,14 @@ def read_bvh(path):
 
 
 def bvh_places(joints, frames) -> dict[str, np.ndarray]:
-    """(F, 3) of each joint: rotations about the channels' axes, one after the other, and offsets."""
+    """(F, 3) of each joint: rotations about the channels' axes, one after the other, and
+    offsets.
+    """
     at, turns, places = 0, [], []
     for joint in joints:
-        values = dict(zip(joint["channels"], frames[:, at : at + len(joint["channels"])].T, strict=True))
+        values = dict(
+            zip(joint["channels"], frames[:, at : at + len(joint["channels"])].T, strict=True)
+        )
         at += len(joint["channels"])
         order = [name for name in joint["channels"] if name.endswith("rotation")]
         angles = np.stack([values[name] for name in order], axis=1)
@@ -156,7 +168,9 @@ def test_angles_do_not_jump_by_full_turns(result, tmp_path):
     """A person who spins: 40 degrees a frame about the vertical axis, through 180 and 360."""
     alone = result.rows(result.person == 3)
     turn = Rotation.from_rotvec(np.arange(FRAMES)[:, None] * np.radians(40) * np.array([0, 0, 1.0]))
-    spinning = replace(alone, global_orient=(turn * Rotation.from_euler("x", 90, degrees=True)).as_rotvec())
+    spinning = replace(
+        alone, global_orient=(turn * Rotation.from_euler("x", 90, degrees=True)).as_rotvec()
+    )
     _, _, frames, _ = read_bvh(write_bvh(Job(Take.of(spinning, "z"), tmp_path)).files[0])
     assert np.abs(np.diff(frames[:, 3:6], axis=0)).max() < 41
 
@@ -175,7 +189,9 @@ class Glb:
     def array(self, number: int) -> np.ndarray:
         accessor = self.file.accessors[number]
         view = self.file.bufferViews[accessor.bufferView]
-        kind = {5121: np.uint8, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}[accessor.componentType]
+        kind = {5121: np.uint8, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}[
+            accessor.componentType
+        ]
         width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}[accessor.type]
         flat = np.frombuffer(self.blob, kind, accessor.count * width, view.byteOffset)
         if accessor.type == "MAT4":
@@ -196,12 +212,16 @@ class Glb:
         for channel in animation.channels:
             sampler = animation.samplers[channel.sampler]
             times, output = self.array(sampler.input), self.array(sampler.output)
-            key = int(np.clip(np.searchsorted(times, time + 1e-4, side="right") - 1, 0, len(times) - 1))
+            key = int(
+                np.clip(np.searchsorted(times, time + 1e-4, side="right") - 1, 0, len(times) - 1)
+            )
             values[channel.target.node][channel.target.path] = output[key]
         local = []
         for value in values.values():
             matrix = np.eye(4)
-            matrix[:3, :3] = Rotation.from_quat(value["rotation"]).as_matrix() * np.array(value["scale"])
+            matrix[:3, :3] = Rotation.from_quat(value["rotation"]).as_matrix() * np.array(
+                value["scale"]
+            )
             matrix[:3, 3] = value["translation"]
             local.append(matrix)
         world = list(local)
@@ -216,13 +236,16 @@ class Glb:
         skin = self.file.skins[node.skin]
         attributes = self.file.meshes[node.mesh].primitives[0].attributes
         world = self.posed(time)
-        bones = np.stack([world[joint] for joint in skin.joints]) @ self.array(skin.inverseBindMatrices)
+        bones = np.stack([world[joint] for joint in skin.joints]) @ self.array(
+            skin.inverseBindMatrices
+        )
         rest = np.c_[self.array(attributes.POSITION), np.ones(len(self.array(attributes.POSITION)))]
         total = np.zeros((len(rest), 4))
         sum_of_weights = np.zeros((len(rest), 1))
         for number in range(sets):
             joints, weights = (
-                self.array(getattr(attributes, f"{name}_{number}")) for name in ("JOINTS", "WEIGHTS")
+                self.array(getattr(attributes, f"{name}_{number}"))
+                for name in ("JOINTS", "WEIGHTS")
             )
             total += np.einsum("vi,vixy,vy->vx", weights, bones[joints], rest)
             sum_of_weights += weights.sum(axis=1, keepdims=True)
@@ -244,7 +267,9 @@ def test_glb_drawn_by_the_specification_is_the_body(glb, true_bodies, person, fr
     names = [f"person_{person}_{name}" for name in SMPL_24]
     places = np.stack([world[glb.node(name)][:3, 3] for name in names])
     np.testing.assert_allclose(places, joints @ y_up("z").T, atol=0.01 * MM)
-    np.testing.assert_allclose(glb.skin(f"person_{person}", time), vertices @ y_up("z").T, atol=0.01 * MM)
+    np.testing.assert_allclose(
+        glb.skin(f"person_{person}", time), vertices @ y_up("z").T, atol=0.01 * MM
+    )
 
 
 def test_glb_keeps_millimetres_far_from_the_origin(job, true_bodies, tmp_path):
@@ -262,7 +287,9 @@ def test_glb_keeps_millimetres_far_from_the_origin(job, true_bodies, tmp_path):
 
 
 def test_programs_that_read_four_bones_a_vertex_draw_nearly_the_same(glb, true_bodies):
-    """What README of the format says: 1 in 100 vertices is off by more than 1 mm, none by more than 2 cm."""
+    """What README of the format says: 1 in 100 vertices is off by more than 1 mm, none by more than
+    2 cm.
+    """
     _, vertices = true_bodies(3, 111)
     apart = np.linalg.norm(glb.skin("person_3", 11 / FPS, sets=1) - vertices @ y_up("z").T, axis=1)
     assert np.mean(apart > MM) < 0.015
@@ -276,7 +303,8 @@ def test_who_is_not_there_has_no_size(glb):
     assert size(107) > 1 and size(116) > 1
     assert max(size(frame) for frame in (*AWAY, BARE)) == 0
     assert not any(
-        c.target.path == "scale" and c.target.node == glb.node("person_3") for c in glb.file.animations[0].channels
+        c.target.path == "scale" and c.target.node == glb.node("person_3")
+        for c in glb.file.animations[0].channels
     )
 
 
@@ -309,7 +337,9 @@ def test_influences_of_a_body_with_four_bones_a_vertex_are_one_set():
 
 
 def test_several_shapes_become_one_and_it_is_said_how_far_that_is_off(result, arrays, tmp_path):
-    """Two halves of a recording, one standard deviation of stature apart, have one body in a file."""
+    """Two halves of a recording, one standard deviation of stature apart, have one body in a
+    file.
+    """
     alone = result.rows(result.person == 3)
     betas = alone.betas + np.where(alone.frame[:, None] > 110, 1.0, 0.0) * np.eye(10)[0]
     take = Take.of(replace(alone, betas=betas), "z")
@@ -319,8 +349,11 @@ def test_several_shapes_become_one_and_it_is_said_how_far_that_is_off(result, ar
     same = motion_of(Take.of(alone, "z"), 0, arrays, np.eye(3))
     assert same is not None and same.spread_m < 1e-9
     said = (
-        f"several body shapes; the file has their mean, which moves joints by up to {1e3 * motion.spread_m:.0f} mm"
+        "several body shapes; the file has their mean, which moves joints by up to "
+        f"{1e3 * motion.spread_m:.0f} mm"
     )
     for write in (write_amass, write_bvh, write_glb):
         assert any(said in note for note in write(Job(take, tmp_path)).notes)
-        assert not any("several shapes" in note for note in write(Job(Take.of(alone, "z"), tmp_path)).notes)
+        assert not any(
+            "several shapes" in note for note in write(Job(Take.of(alone, "z"), tmp_path)).notes
+        )

@@ -44,7 +44,10 @@ def test_several_formats_in_one_call(copied, capsys):
 
 def test_options(copied, tmp_path, capsys):
     options = "--person 3 --frames 104:110 --fps 50 --markers joints --seen-only".split()
-    assert run("export", copied / "people.npz", "trc", "--output", tmp_path / "elsewhere", *options) == 0
+    assert (
+        run("export", copied / "people.npz", "trc", "--output", tmp_path / "elsewhere", *options)
+        == 0
+    )
     (path,) = (tmp_path / "elsewhere").iterdir()
     lines = path.read_text().splitlines()
     assert lines[2].split("\t")[:3] == ["50", "50", "6"]
@@ -57,8 +60,14 @@ def test_options(copied, tmp_path, capsys):
         (["fbx"], "format fbx: must be one of amass trc c3d bvh glb csv parquet mcap rrd"),
         (["trc", "--markers", "skin"], "--markers skin: must be one of opensim joints body"),
         (["trc", "--frames", "9:3"], "--frames 9:3: must be A:B"),
-        (["trc", "--frames", "500:600"], "no people in these frames; people are in frames 100 to 123"),
-        (["parquet", "--frames", "500:600"], "no people in these frames; people are in frames 100 to 123"),
+        (
+            ["trc", "--frames", "500:600"],
+            "no people in these frames; people are in frames 100 to 123",
+        ),
+        (
+            ["parquet", "--frames", "500:600"],
+            "no people in these frames; people are in frames 100 to 123",
+        ),
         (["trc", "--person", "4"], "has no such person; it has 3 7"),
         (["trc", "--fps", "0"], "--fps 0: must be 0.01 to 100000 Hz"),
         (["bvh", "--fill-gaps", "-1"], "--fill-gaps -1: must be 0 to 3600 seconds"),
@@ -82,7 +91,9 @@ def test_results_that_are_missing_or_damaged(tmp_path, capsys):
 
 def test_people_without_a_body_have_no_skeleton_to_export(result, copied, capsys):
     bodies = {name: getattr(result, name) * np.nan for name in BODY}
-    bare = replace(result, **bodies, status=np.full(len(result), Status.BODY_UNDETERMINED, result.status.dtype))
+    bare = replace(
+        result, **bodies, status=np.full(len(result), Status.BODY_UNDETERMINED, result.status.dtype)
+    )
     bare.save(copied)
     assert run("export", copied, "bvh") == 2
     assert "bvh: person 3 has no body in any frame" in capsys.readouterr().err
@@ -93,7 +104,8 @@ def test_frames_that_stand_alone_go_into_tables_only(result, copied, capsys):
     replace(result, run=result.run | {"configuration": {"temporal": False}}).save(copied)
     assert run("export", copied, "csv", "trc") == 2
     assert (
-        "frame and has no identities; reconstruct with --temporal, or export csv or rrd" in capsys.readouterr().err
+        "frame and has no identities; reconstruct with --temporal, or export csv or rrd"
+        in capsys.readouterr().err
     )
     assert run("export", copied, "csv") == 0
 
@@ -113,10 +125,18 @@ def test_a_recording_for_rerun_read_back(copied, result, capfd):
     chunks = [chunk for chunk in rerun.chunk.RrdReader(path).stream()]
     paths = {chunk.entity_path for chunk in chunks}
     assert {
-        f"/world/people/{who}/{part}" for who in (3, 7) for part in ("joints", "bones", "uncertainty", "body")
+        f"/world/people/{who}/{part}"
+        for who in (3, 7)
+        for part in ("joints", "bones", "uncertainty", "body")
     } < paths
-    assert {"/world/cameras/cam0", "/world/cameras/cam0/seen/not_used", "/plots/residual/cam0"} < paths
-    tables = [chunk.to_record_batch() for chunk in chunks if chunk.entity_path == "/world/people/7/joints"]
+    assert {
+        "/world/cameras/cam0",
+        "/world/cameras/cam0/seen/not_used",
+        "/plots/residual/cam0",
+    } < paths
+    tables = [
+        chunk.to_record_batch() for chunk in chunks if chunk.entity_path == "/world/people/7/joints"
+    ]
     rows = [row for table in tables for row in table.to_pylist()]
     frames = sorted(row["frame"] for row in rows)
     assert frames == [frame for frame in range(FIRST, FIRST + FRAMES) if frame not in AWAY]
@@ -142,7 +162,9 @@ def test_a_thinned_skin_is_the_same_body(arrays):
         return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
 
     # Cells of 2 cm flatten fingers and ears, no more.
-    assert area(arrays.template[kept], faces) == pytest.approx(area(arrays.template, arrays.faces), rel=0.08)
+    assert area(arrays.template[kept], faces) == pytest.approx(
+        area(arrays.template, arrays.faces), rel=0.08
+    )
 
 
 @pytest.mark.slow
@@ -159,12 +181,16 @@ def test_what_is_viewed_can_be_saved_instead(copied, tmp_path, capsys):
     assert capsys.readouterr().out == f"written  {path}\n"
     paths = {chunk.entity_path for chunk in rerun.chunk.RrdReader(path).stream()}
     assert {"/world/people/3/joints", "/world/people/7/body", "/world/cameras/cam0"} < paths
-    assert run("view", copied, "--save", path, "--connect", "rerun+http://localhost:9876/proxy") == 2
+    assert (
+        run("view", copied, "--save", path, "--connect", "rerun+http://localhost:9876/proxy") == 2
+    )
     assert "--save and --connect" in capsys.readouterr().err
 
 
 def test_rerun_sends_no_statistics(tmp_path, monkeypatch):
-    """On a machine where rerun was never used they are on; `rerun analytics disable` is what its manual says."""
+    """On a machine where rerun was never used they are on; `rerun analytics disable` is what its
+    manual says.
+    """
     pytest.importorskip("rerun")
     for name in ("HOME", "XDG_CONFIG_HOME", "XDG_DATA_HOME"):
         monkeypatch.setenv(name, str(tmp_path / name))
@@ -174,7 +200,9 @@ def test_rerun_sends_no_statistics(tmp_path, monkeypatch):
     assert not switch_off(viewer), "rerun sends none from there"
     monkeypatch.delenv("CI")
     assert switch_off(viewer)
-    told = subprocess.run([viewer, "analytics", "config"], capture_output=True, text=True, check=True).stdout
+    told = subprocess.run(
+        [viewer, "analytics", "config"], capture_output=True, text=True, check=True
+    ).stdout
     assert json.loads(told)["analytics_enabled"] is False
     assert not switch_off(viewer)
 
@@ -205,7 +233,9 @@ def test_commands_load_no_torch(copied):
 
 def test_mcap_has_a_message_of_each_frame_and_every_person(copied, result):
     reader = pytest.importorskip("mcap.reader")
-    decoder = pytest.importorskip("mcap_ros2.decoder", reason='needs pip install "shapepose-fg[ros]"')
+    decoder = pytest.importorskip(
+        "mcap_ros2.decoder", reason='needs pip install "shapepose-fg[ros]"'
+    )
     assert run("export", copied, "mcap") == 0
     with (copied / "export" / "people.mcap").open("rb") as stream:
         opened = reader.make_reader(stream, decoder_factories=[decoder.DecoderFactory()])
@@ -214,9 +244,13 @@ def test_mcap_has_a_message_of_each_frame_and_every_person(copied, result):
     for place, message in enumerate(found):
         rows = result.rows(result.frame == FIRST + place)
         assert [each.person for each in message.people] == rows.person.tolist()
-        assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == round(rows.time_s[0] * 1e9)
+        assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == round(
+            rows.time_s[0] * 1e9
+        )
         for row, each in enumerate(message.people):
-            assert list(each.joints) == pytest.approx(rows.joints[row].ravel().tolist(), abs=0, nan_ok=True)
+            assert list(each.joints) == pytest.approx(
+                rows.joints[row].ravel().tolist(), abs=0, nan_ok=True
+            )
             assert list(each.covariance) == pytest.approx(
                 rows.covariance[row].ravel().tolist(), abs=0, nan_ok=True
             )

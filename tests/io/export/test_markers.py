@@ -11,7 +11,14 @@ import pytest
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25, COCO_17, HALPE_26, SMPL_24
-from shapepose_fg.io.export.markers import Markers, MarkerSet, c3d_bytes, opensim_names, write_c3d, write_trc
+from shapepose_fg.io.export.markers import (
+    Markers,
+    MarkerSet,
+    c3d_bytes,
+    opensim_names,
+    write_c3d,
+    write_trc,
+)
 from shapepose_fg.io.export.motion_files import write_amass, write_bvh
 from shapepose_fg.io.export.registry import Job, read_take
 from shapepose_fg.io.export.tables import COLUMNS, csv_text
@@ -80,11 +87,15 @@ def test_c3d_read_back_by_ezc3d(job, result):
         rows = result.rows(result.person == who)
         sigma = 1e3 * np.sqrt(np.trace(rows.covariance, axis1=2, axis2=3) / 3)
         given = np.isfinite(sigma)
-        np.testing.assert_array_equal(residual[frames - FIRST][given], np.rint(sigma[given]).clip(1))
+        np.testing.assert_array_equal(
+            residual[frames - FIRST][given], np.rint(sigma[given]).clip(1)
+        )
 
 
 def test_c3d_keeps_sigmas_that_a_byte_cannot_hold(tmp_path):
-    """Whole millimetres: a sigma of nothing is not unknown, one of 30 cm does not wrap around to 44 mm."""
+    """Whole millimetres: a sigma of nothing is not unknown, one of 30 cm does not wrap around to 44
+    mm.
+    """
     ezc3d = pytest.importorskip("ezc3d")
     sigma = np.array([[0.0001, 0.0014, 0.2, 0.3, np.nan, 0.01]])
     xyz = np.ones((1, 6, 3))
@@ -96,10 +107,16 @@ def test_c3d_keeps_sigmas_that_a_byte_cannot_hold(tmp_path):
 
 
 def test_c3d_keeps_millimetres_far_from_the_origin(job, result, tmp_path):
-    """Of 400 km a float of 32 bits keeps centimetres: points are from an origin that the file and a note give."""
+    """Of 400 km a float of 32 bits keeps centimetres: points are from an origin that the file and a
+    note give.
+    """
     ezc3d = pytest.importorskip("ezc3d")
     place = np.array([400_000.0, -150_000.25, 1200.5])
-    away = replace(job.take.people, joints=job.take.people.joints + place, transl=job.take.people.transl + place)
+    away = replace(
+        job.take.people,
+        joints=job.take.people.joints + place,
+        transl=job.take.people.transl + place,
+    )
     written = write_c3d(Job(replace(job.take, people=away), tmp_path))
     file = ezc3d.c3d(str(tmp_path / "person_3.c3d"))
     origin = np.array(file["parameters"]["POINT"]["ORIGIN_M"]["value"])
@@ -111,12 +128,18 @@ def test_c3d_keeps_millimetres_far_from_the_origin(job, result, tmp_path):
     truth = joints + place[[1, 2, 0]]
     np.testing.assert_allclose(np.swapaxes(points, 0, 1) + origin, truth, atol=1e-4)
     listed = " ".join(f"{each:.0f}" for each in origin)
-    assert [note for note in written.notes if f"c3d: coordinates are relative to {listed} m " in note]
-    assert write_c3d(job).notes == [] or not any("coordinates" in note for note in write_c3d(job).notes)
+    assert [
+        note for note in written.notes if f"c3d: coordinates are relative to {listed} m " in note
+    ]
+    assert write_c3d(job).notes == [] or not any(
+        "coordinates" in note for note in write_c3d(job).notes
+    )
 
 
 def moving(count: int, first: int, person: int = 3) -> Take:
-    """A person in `count` frames from `first` on, of whom one joint is known: its x is the frame's place, mm."""
+    """A person in `count` frames from `first` on, of whom one joint is known: its x is the frame's
+    place, mm.
+    """
     joints = np.zeros((count, 1, 3))
     joints[:, 0, 0] = 1e-3 * np.arange(count)
     nothing = {
@@ -151,7 +174,9 @@ def test_c3d_is_cut_where_its_numbers_end(tmp_path):
     x = np.concatenate([file["data"]["points"][2, 0] for file in files])
     np.testing.assert_allclose(x, np.arange(65_536), rtol=1e-6)
     assert len(written.notes) == 1
-    assert "person_3_frames_65535-65535.c3d numbers its frames from 1, not 65536" in written.notes[0]
+    assert (
+        "person_3_frames_65535-65535.c3d numbers its frames from 1, not 65536" in written.notes[0]
+    )
 
 
 @pytest.mark.parametrize(("first", "header"), [(65_533, 65_533), (65_534, 0), (70_000, 0)])
@@ -159,7 +184,9 @@ def test_c3d_s_first_frame_does_not_wrap_around(tmp_path, first, header):
     ezc3d = pytest.importorskip("ezc3d")
     written = write_c3d(Job(moving(2, first), tmp_path))
     file = ezc3d.c3d(str(tmp_path / "person_3.c3d"))
-    assert file["header"]["points"]["first_frame"] == header and file["data"]["points"].shape[2] == 2
+    assert (
+        file["header"]["points"]["first_frame"] == header and file["data"]["points"].shape[2] == 2
+    )
     assert [f"not {first + 1}:" in note for note in written.notes] == ([] if header else [True])
 
 
@@ -200,7 +227,9 @@ def test_csv_read_back(saved, result):
     row, joint = row[order], joint[order]
     frames, persons = result.frame[row], result.person[row]
     names = [(int(line["frame"]), int(line["person"]), line["joint"]) for line in lines]
-    assert names == list(zip(frames.tolist(), persons.tolist(), result.joint_names[joint].tolist(), strict=True))
+    assert names == list(
+        zip(frames.tolist(), persons.tolist(), result.joint_names[joint].tolist(), strict=True)
+    )
     variance = np.diagonal(result.covariance[row, joint], axis1=1, axis2=2)
     expected = {"time_s": frames / FPS, "sigma_m": np.sqrt(variance.mean(axis=1))}
     expected |= {"confidence": result.confidence[row, joint]}
@@ -210,12 +239,16 @@ def test_csv_read_back(saved, result):
         expected[f"v{axis}_m_s"] = result.velocity[row, joint, n]
     for name, column in expected.items():
         half_a_digit = 5.1e-5 if name == "confidence" else 5.1e-7
-        np.testing.assert_allclose([float(line[name]) for line in lines], column, atol=half_a_digit, err_msg=name)
+        np.testing.assert_allclose(
+            [float(line[name]) for line in lines], column, atol=half_a_digit, err_msg=name
+        )
     guessed = (persons == GUESSED[0]) & (result.joint_names[joint] == GUESSED[1])
     assert [line["known"] for line in lines] == np.where(guessed, "body", "seen").tolist()
 
 
 def test_a_missing_package_is_one_sentence_with_the_command(job, monkeypatch):
     monkeypatch.setitem(sys.modules, "ezc3d", None)
-    with pytest.raises(InputError, match=r'ezc3d is not installed; pip install "shapepose-fg\[export\]"'):
+    with pytest.raises(
+        InputError, match=r'ezc3d is not installed; pip install "shapepose-fg\[export\]"'
+    ):
         write_c3d(job)

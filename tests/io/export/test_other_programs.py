@@ -1,7 +1,9 @@
-"""What other programs make of our files: rates, start frames, axes and units, read back by those programs.
+"""What other programs make of our files: rates, start frames, axes and units, read back by those
+programs.
 
-Blender's Python (bpy), OpenSim's, trimesh and Polars need other versions of packages than ours: they run in a
-process of their own, by a Python that has them. SHAPEPOSE_READERS names such Pythons, with colons between.
+Blender's Python (bpy), OpenSim's, trimesh and Polars need other versions of packages than ours:
+they run in a process of their own, by a Python that has them. SHAPEPOSE_READERS names such Pythons,
+with colons between.
 """
 
 import json
@@ -25,21 +27,34 @@ RATE = 60.0
 
 def read_by(module: str, code: str, *files: Path) -> dict:
     """What `code` prints last, as JSON; it has `module`, and its files as `files`."""
-    pythons = [*filter(None, os.environ.get("SHAPEPOSE_READERS", "").split(os.pathsep)), sys.executable]
+    pythons = [
+        *filter(None, os.environ.get("SHAPEPOSE_READERS", "").split(os.pathsep)),
+        sys.executable,
+    ]
     find = f"import importlib.util, sys; sys.exit(importlib.util.find_spec({module!r}) is None)"
     clean = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     for python in pythons:
         if subprocess.run([python, "-c", find], env=clean, check=False).returncode == 0:
-            words = [python, "-c", f"import json, sys, {module}\nfiles = sys.argv[1:]\n{code}", *map(str, files)]
+            words = [
+                python,
+                "-c",
+                f"import json, sys, {module}\nfiles = sys.argv[1:]\n{code}",
+                *map(str, files),
+            ]
             done = subprocess.run(words, env=clean, capture_output=True, text=True, check=False)
             assert done.returncode == 0, done.stderr
             return json.loads(done.stdout.strip().splitlines()[-1])
-    pytest.skip(f"{module} is not installed; pip install it beside, and name that Python in SHAPEPOSE_READERS")
+    pytest.skip(
+        f"{module} is not installed; pip install it beside, and name that Python in "
+        "SHAPEPOSE_READERS"
+    )
 
 
 @pytest.fixture(scope="module")
 def filmed(result):
-    """The result as it was filmed at 60 a second, its times in microseconds, as `detect` writes them."""
+    """The result as it was filmed at 60 a second, its times in microseconds, as `detect` writes
+    them.
+    """
     return replace(result, time_s=(result.frame / RATE).round(6)).with_run(time={"fps": 59.9988})
 
 
@@ -64,7 +79,11 @@ def test_all_rates_are_exact(exported):
     assert 1 / float(step) == pytest.approx(RATE, abs=1e-9)
     ezc3d = pytest.importorskip("ezc3d")
     c3d = ezc3d.c3d(str(exported / "person_3.c3d"))
-    assert c3d["parameters"]["POINT"]["RATE"]["value"][0] == c3d["header"]["points"]["frame_rate"] == RATE
+    assert (
+        c3d["parameters"]["POINT"]["RATE"]["value"][0]
+        == c3d["header"]["points"]["frame_rate"]
+        == RATE
+    )
     # It gives numbers from 0, which stand in the file from 1.
     assert c3d["header"]["points"]["first_frame"] == FIRST
     assert c3d["parameters"]["POINT"]["UNITS"]["value"] == ["mm"]
@@ -72,18 +91,22 @@ def test_all_rates_are_exact(exported):
 
 BVH = """
 bpy.ops.wm.read_factory_settings(use_empty=True)
-bpy.ops.import_anim.bvh(filepath=files[0], global_scale=1, frame_start=int(files[1]), update_scene_fps=True)
+how = dict(global_scale=1, frame_start=int(files[1]), update_scene_fps=True)
+bpy.ops.import_anim.bvh(filepath=files[0], **how)
 scene, figure = bpy.context.scene, bpy.context.object
-keys = [point.co[0] for point in figure.animation_data.action.layers[0].strips[0].channelbags[0].fcurves[0]
-        .keyframe_points]
+strip = figure.animation_data.action.layers[0].strips[0]
+keys = [point.co[0] for point in strip.channelbags[0].fcurves[0].keyframe_points]
 scene.frame_set(int(files[1]))
 hip = figure.matrix_world @ figure.pose.bones["pelvis"].head
-print(json.dumps({"rate": scene.render.fps / scene.render.fps_base, "keys": keys, "pelvis": list(hip)}))
+rate = scene.render.fps / scene.render.fps_base
+print(json.dumps({"rate": rate, "keys": keys, "pelvis": list(hip)}))
 """
 
 
 def test_blender_has_a_bvh_where_the_docs_say(exported, filmed, true_bodies):
-    """The start frame is the number in the name and one; frame n is then at n + 1; z is up, in metres."""
+    """The start frame is the number in the name and one; frame n is then at n + 1; z is up, in
+    metres.
+    """
     file = exported / f"person_3_frames_{FIRST}-{FIRST + FRAMES - 1}.bvh"
     told = read_by("bpy", BVH, file, Path(str(FIRST + 1)))
     assert told["rate"] == pytest.approx(RATE, abs=1e-3)
@@ -96,8 +119,9 @@ bpy.ops.wm.read_factory_settings(use_empty=True)
 bpy.context.scene.render.fps = 60
 bpy.ops.import_scene.gltf(filepath=files[0])
 figure = next(each for each in bpy.data.objects if each.type == "ARMATURE" and "3" in each.name)
-keys = sorted({point.co[0] for action in bpy.data.actions for curve in
-               action.layers[0].strips[0].channelbags[0].fcurves for point in curve.keyframe_points})
+keys = sorted({point.co[0] for action in bpy.data.actions
+               for curve in action.layers[0].strips[0].channelbags[0].fcurves
+               for point in curve.keyframe_points})
 bpy.context.scene.frame_set(int(files[1]))
 places = [list(figure.matrix_world @ bone.head) for bone in figure.pose.bones]
 print(json.dumps({"keys": keys, "places": places}))
@@ -115,7 +139,8 @@ TRC = """
 table = opensim.TimeSeriesTableVec3(files[0])
 name = table.getColumnLabels()[0]
 first = table.getRowAtIndex(0)
-print(json.dumps({"rate": table.getTableMetaDataString("DataRate"), "unit": table.getTableMetaDataString("Units"),
+print(json.dumps({"rate": table.getTableMetaDataString("DataRate"),
+                  "unit": table.getTableMetaDataString("Units"),
                   "times": list(table.getIndependentColumn()), "name": name,
                   "first": [first[0][axis] for axis in range(3)]}))
 """
@@ -157,8 +182,14 @@ def test_rerun_has_the_frames_and_their_times(exported, filmed, tmp_path):
     rerun = pytest.importorskip("rerun")
     export_result(exported, [FORMATS["rrd"]], tmp_path)
     chunks = rerun.chunk.RrdReader(tmp_path / "people.rrd").stream()
-    tables = [chunk.to_record_batch() for chunk in chunks if chunk.entity_path == "/world/people/7/joints"]
-    rows = sorted((row for table in tables for row in table.to_pylist()), key=lambda row: row["frame"])
-    assert [row["frame"] for row in rows] == [n for n in range(FIRST, FIRST + FRAMES) if n not in AWAY]
+    tables = [
+        chunk.to_record_batch() for chunk in chunks if chunk.entity_path == "/world/people/7/joints"
+    ]
+    rows = sorted(
+        (row for table in tables for row in table.to_pylist()), key=lambda row: row["frame"]
+    )
+    assert [row["frame"] for row in rows] == [
+        n for n in range(FIRST, FIRST + FRAMES) if n not in AWAY
+    ]
     seconds = [row["time"].total_seconds() for row in rows]
     np.testing.assert_allclose(seconds, [row["frame"] / RATE for row in rows], atol=2e-6)

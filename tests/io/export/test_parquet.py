@@ -51,16 +51,22 @@ def test_all_columns_come_back_in_groups_of_rows(saved, tmp_path, monkeypatch):
     monkeypatch.setattr(tables, "_GROUP_ROWS", 7)
     table, about = exported(tmp_path)
     same(table, people)
-    assert arrow_parquet.ParquetFile(tmp_path / "export" / "people.parquet").num_row_groups == -(-len(people) // 7)
+    assert arrow_parquet.ParquetFile(tmp_path / "export" / "people.parquet").num_row_groups == -(
+        -len(people) // 7
+    )
     assert about["joint_names"] == people.joint_names.tolist() and about["run"] == people.run
     assert about["known_names"][1] == "seen" and about["gate_names"][1] == "used"
     assert about["view_names"] == people.observations.view_names.tolist()
     # A part of the columns, as other programs take it.
-    some = arrow_parquet.read_table(tmp_path / "export" / "people.parquet", columns=["frame", "person"])
+    some = arrow_parquet.read_table(
+        tmp_path / "export" / "people.parquet", columns=["frame", "person"]
+    )
     assert some.column_names == ["frame", "person"]
 
 
-def test_frames_and_people_are_chosen_and_a_result_without_identities_or_rows_is_written(saved, tmp_path):
+def test_frames_and_people_are_chosen_and_a_result_without_identities_or_rows_is_written(
+    saved, tmp_path
+):
     people = Reconstruction.load(saved)
     alone = replace(people, run=people.run | {"configuration": {"temporal": False}})
     alone.save(tmp_path)

@@ -23,7 +23,9 @@ def test_everybody_has_a_place_in_every_frame(result):
     assert take.frames[take.rows[1] < 0].tolist() == list(AWAY)
     joints = take.column("joints", 1)
     assert np.isnan(joints[AWAY.start - FIRST]).all()
-    np.testing.assert_array_equal(joints[0], result.at(FIRST).rows(result.at(FIRST).person == 7).joints[0])
+    np.testing.assert_array_equal(
+        joints[0], result.at(FIRST).rows(result.at(FIRST).person == 7).joints[0]
+    )
 
 
 def test_frames_without_anybody_have_a_time(result):
@@ -34,7 +36,9 @@ def test_frames_without_anybody_have_a_time(result):
 
 
 def test_dropped_frames_are_holes_at_one_rate(result):
-    """Frames 110 to 114 were taken a step later than they would be: at one rate a frame is missing."""
+    """Frames 110 to 114 were taken a step later than they would be: at one rate a frame is
+    missing.
+    """
     late = replace(result, time_s=result.time_s + np.where(result.frame >= 110, 1 / FPS, 0))
     take, lost = Take.of(late, "z").at_one_rate()
     assert lost == 0
@@ -44,10 +48,15 @@ def test_dropped_frames_are_holes_at_one_rate(result):
 
 
 def test_frames_nearer_than_a_step_are_counted(result):
-    """Person 3 alone; the frames after 120 come twice as fast: of four, two have a step of their own."""
+    """Person 3 alone; the frames after 120 come twice as fast: of four, two have a step of their
+    own.
+    """
     alone = result.rows(result.person == 3)
     fast = replace(
-        alone, time_s=np.where(alone.frame > 119, 119 / FPS + (alone.frame - 119) / (2 * FPS), alone.time_s)
+        alone,
+        time_s=np.where(
+            alone.frame > 119, 119 / FPS + (alone.frame - 119) / (2 * FPS), alone.time_s
+        ),
     )
     take, lost = Take.of(fast, "z").at_one_rate()
     assert lost == 2
@@ -66,7 +75,9 @@ def test_seen_only_leaves_inferred_joints_out(result):
     assert np.isnan(take.column("joints", 0)[:, wrist]).all()
     assert np.isnan(take.column("covariance", 0)[:, wrist]).all()
     assert np.isfinite(take.column("joints", 0)[:, wrist - 1]).all()
-    unseen = replace(result, known=np.where(result.frame[:, None] == 110, Known.MOTION, result.known))
+    unseen = replace(
+        result, known=np.where(result.frame[:, None] == 110, Known.MOTION, result.known)
+    )
     bodies = Take.of(unseen, "z", seen_only=True).column("betas", 0)
     assert np.isnan(bodies[110 - FIRST]).all() and np.isfinite(bodies[111 - FIRST]).all()
 
@@ -81,8 +92,14 @@ def test_seen_only_leaves_inferred_joints_out(result):
     ],
 )
 def test_a_result_without_a_timeline_is_refused(result, change, words):
-    columns = {"same": np.full(len(result), 3), "unknown": np.full(len(result), np.nan), "falling": -result.time_s}
-    change = {name: columns[value] if isinstance(value, str) else value for name, value in change.items()}
+    columns = {
+        "same": np.full(len(result), 3),
+        "unknown": np.full(len(result), np.nan),
+        "falling": -result.time_s,
+    }
+    change = {
+        name: columns[value] if isinstance(value, str) else value for name, value in change.items()
+    }
     with pytest.raises(ValueError, match=words):
         Take.of(replace(result, observations=None, **change), "z")
 
@@ -103,7 +120,8 @@ def test_the_up_axis_comes_from_the_cameras_or_is_asked_for(saved, result, tmp_p
     assert read_take(saved, up="-y").up == "-y"
     result.save(tmp_path)
     with pytest.raises(
-        InputError, match=r"cameras\.json: this file is missing, and it contains the up axis; give --up"
+        InputError,
+        match=r"cameras\.json: this file is missing, and it contains the up axis; give --up",
     ):
         read_take(tmp_path)
     with pytest.raises(InputError, match="--up w: must be one of"):
@@ -118,7 +136,8 @@ def test_people_and_frames_can_be_chosen(saved):
         read_take(saved, persons=(5,))
     for frames, persons in ((range(1000, 1100), None), (range(AWAY.start, AWAY.stop), (7,))):
         with pytest.raises(
-            InputError, match=r"--frames: .* no people in these frames; people are in frames 100 to 123"
+            InputError,
+            match=r"--frames: .* no people in these frames; people are in frames 100 to 123",
         ):
             read_take(saved, frames=frames, persons=persons)
 

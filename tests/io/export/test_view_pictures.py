@@ -1,4 +1,6 @@
-"""Pictures in rerun's camera views: without distortion, so that what is drawn over them lies on them."""
+"""Pictures in rerun's camera views: without distortion, so that what is drawn over them lies on
+them.
+"""
 
 from dataclasses import replace
 
@@ -29,7 +31,9 @@ def dotted(camera: Camera, placement: Placement, points: np.ndarray) -> np.ndarr
     picture = np.zeros((height, width, 3), dtype=np.uint8)
     xy = placement.to_picture(camera.distort(camera.project(points)[0]))
     for x, y in xy:
-        cv2.circle(picture, (round(16 * x), round(16 * y)), 16 * 4, (255, 255, 255), -1, cv2.LINE_AA, 4)
+        cv2.circle(
+            picture, (round(16 * x), round(16 * y)), 16 * 4, (255, 255, 255), -1, cv2.LINE_AA, 4
+        )
     return picture
 
 
@@ -65,15 +69,24 @@ def test_points_lie_where_the_camera_without_its_lens_sees_them(scene, kind):
 
 @pytest.fixture
 def filmed(result, scene, tmp_path):
-    """The result with a lens in camera cam0, and its pictures of frames 0 to 101, of which 100 was lost."""
-    rig = Rig((replace(scene.rig.cameras[0], distortion=BENT), *scene.rig.cameras[1:]), scene.rig.up)
+    """The result with a lens in camera cam0, and its pictures of frames 0 to 101, of which 100 was
+    lost.
+    """
+    rig = Rig(
+        (replace(scene.rig.cameras[0], distortion=BENT), *scene.rig.cameras[1:]), scene.rig.up
+    )
     result.save(tmp_path)
     write_rig(rig, tmp_path / "cameras.json")
     (tmp_path / "cam0").mkdir()
     placement = Placement(PlacementKind.SAME, rig.cameras[0].image_size, rig.cameras[0].image_size)
     for frame in (*range(100), FIRST + 1):
-        picture = dotted(rig.cameras[0], placement, result.joints[result.frame == max(frame, FIRST)][0])
-        cv2.imwrite(str(tmp_path / "cam0" / f"{frame:06d}.png"), picture if frame > FIRST else picture[:, :] // 2)
+        picture = dotted(
+            rig.cameras[0], placement, result.joints[result.frame == max(frame, FIRST)][0]
+        )
+        cv2.imwrite(
+            str(tmp_path / "cam0" / f"{frame:06d}.png"),
+            picture if frame > FIRST else picture[:, :] // 2,
+        )
     return tmp_path
 
 
@@ -82,7 +95,9 @@ def test_pictures_are_logged_in_their_frames(filmed, result, tmp_path, capsys):
     rerun = pytest.importorskip("rerun")
     take = read_take(filmed, frames=range(FIRST, FIRST + 3))
     assert take.rig is not None
-    pictures = pictures_of(take.people.run, take.rig, ["cam0"], [f"cam0={filmed / 'cam0'}"], open_one=opened)
+    pictures = pictures_of(
+        take.people.run, take.rig, ["cam0"], [f"cam0={filmed / 'cam0'}"], open_one=opened
+    )
     stream, told = new_stream(), []
     stream.save(tmp_path / "pictures.rrd")
     log_pictures(stream, take, pictures, lambda done, total: told.append((done, total)))
@@ -90,8 +105,17 @@ def test_pictures_are_logged_in_their_frames(filmed, result, tmp_path, capsys):
     del stream
     assert told == [(1, 3), (2, 3), (3, 3)]
     chunks = [chunk for chunk in rerun.chunk.RrdReader(tmp_path / "pictures.rrd").stream()]
-    tables = [each.to_record_batch() for each in chunks if each.entity_path == "/world/cameras/cam0/picture"]
-    rows = {row["frame"]: row for table in tables for row in table.to_pylist() if row.get("EncodedImage:blob")}
+    tables = [
+        each.to_record_batch()
+        for each in chunks
+        if each.entity_path == "/world/cameras/cam0/picture"
+    ]
+    rows = {
+        row["frame"]: row
+        for table in tables
+        for row in table.to_pylist()
+        if row.get("EncodedImage:blob")
+    }
     # The file of frame 100 is missing: that of frame 101 stays in frame 101, and it is said.
     assert sorted(rows) == [FIRST + 1]
     assert f"{filmed / 'cam0'}: 1 of 102 pictures are missing" in capsys.readouterr().err
@@ -107,12 +131,16 @@ def test_pictures_are_logged_in_their_frames(filmed, result, tmp_path, capsys):
 
 @pytest.mark.slow
 def test_frames_that_are_other_frames_of_the_camera(filmed):
-    """The result's frame 1 is frame 3 of the camera; its frame 2 none, its frame 3 one that was not filmed."""
+    """The result's frame 1 is frame 3 of the camera; its frame 2 none, its frame 3 one that was not
+    filmed.
+    """
     take = read_take(filmed)
     assert take.rig is not None
     moments = {"cam0": np.array([0, 3, -1, 5000, FIRST + 1])}
     videos = [f"cam0={filmed / 'cam0'}"]
-    ((used, footage),) = pictures_of(take.people.run, take.rig, ["cam0"], videos, moments=moments, open_one=opened)
+    ((used, footage),) = pictures_of(
+        take.people.run, take.rig, ["cam0"], videos, moments=moments, open_one=opened
+    )
     assert footage.number[used.places[[0, 1, 4]]].tolist() == [0, 3, FIRST + 1]
     assert used.places[[2, 3]].tolist() == [-1, -1]
 
@@ -121,7 +149,9 @@ def test_pictures_whose_numbers_are_no_frames_are_refused(filmed):
     take = read_take(filmed)
     assert take.rig is not None
     (filmed / "cam0" / f"{FIRST + 1:06d}.png").rename(filmed / "cam0" / "20261122061.png")
-    with pytest.raises(InputError, match="pictures are numbered from 0 to 20261122061; number them by the frames"):
+    with pytest.raises(
+        InputError, match="pictures are numbered from 0 to 20261122061; number them by the frames"
+    ):
         pictures_of({}, take.rig, ["cam0"], [f"cam0={filmed / 'cam0'}"])
 
 

@@ -14,7 +14,14 @@ from shapepose_fg.simulation.training.corruption import CorruptionConfig, corrup
 
 COUNT, K = 400, len(BODY_POINTS)
 NOTHING = CorruptionConfig(
-    triangulated=0.0, clean=0.0, limb=0.0, region=0.0, single=0.0, complete=0.0, outlier=0.0, swap=0.0
+    triangulated=0.0,
+    clean=0.0,
+    limb=0.0,
+    region=0.0,
+    single=0.0,
+    complete=0.0,
+    outlier=0.0,
+    swap=0.0,
 )
 """Isotropic noise and nothing else."""
 
@@ -29,7 +36,12 @@ def people() -> torch.Tensor:
     rng = np.random.default_rng(0)
     orient = np.zeros((COUNT, 3))
     orient[:, 1] = rng.uniform(-np.pi, np.pi, COUNT)
-    parts = (rng.normal(size=(COUNT, 10)), orient, PosePrior.default().sample(rng, COUNT), np.zeros((COUNT, 3)))
+    parts = (
+        rng.normal(size=(COUNT, 10)),
+        orient,
+        PosePrior.default().sample(rng, COUNT),
+        np.zeros((COUNT, 3)),
+    )
     model = BodyModel.default().with_keypoints(BODY_POINTS)
     return torch.from_numpy(model.keypoints(BodyParameters(*parts))).float()
 
@@ -54,7 +66,9 @@ def test_targets_are_finite_and_information_is_symmetric_and_not_negative(people
     assert error.shape == (COUNT, K, 3) and information.shape == (COUNT, K, 3, 3)
     assert np.isfinite(error).all() and np.isfinite(information).all()
     largest = information.max(axis=(-1, -2), initial=1.0)[..., None, None]
-    np.testing.assert_allclose(information / largest, information.swapaxes(-1, -2) / largest, atol=1e-6)
+    np.testing.assert_allclose(
+        information / largest, information.swapaxes(-1, -2) / largest, atol=1e-6
+    )
     assert (np.linalg.eigvalsh(information) >= -1e-5 * largest[..., 0]).all()  # single precision
 
 
@@ -87,8 +101,8 @@ def test_cameras_give_rays_full_joints_and_depth_that_is_worse_than_width(people
 
 def test_isotropic_errors_agree_with_their_claims(people):
     error, information = made(people, NOTHING)
-    # Chi-squared with 3 degrees of freedom has its median at 2.37. A third of the people have less noise than
-    # the 5 mm that nobody claims to be better than, a seventh claim wrongly by a third.
+    # Chi-squared with 3 degrees of freedom has its median at 2.37. A third of the people have less
+    # noise than the 5 mm that nobody claims to be better than, a seventh claim wrongly by a third.
     assert 2.37 / 2 < np.median(squared(error, information)) < 2.37 * 1.3
     sigma = 1 / np.sqrt(information[..., 0, 0])
     noisy = (sigma > 0.008).all(axis=1)
@@ -100,8 +114,9 @@ def test_isotropic_errors_agree_with_their_claims(people):
 def test_triangulated_errors_are_of_the_size_that_is_claimed(people):
     error, information = made(people, change(triangulated=1.0))
     full = np.linalg.eigvalsh(information)[..., 0] > 1 / 0.3**2
-    # Claims are the pipeline's, 13 mm over the confidence, errors the simulator's: they differ by design, with a
-    # heavy tail where somebody stands in front, but not by more than a factor of two in sigma.
+    # Claims are the pipeline's, 13 mm over the confidence, errors the simulator's: they differ by
+    # design, with a heavy tail where somebody stands in front, but not by more than a factor of two
+    # in sigma.
     median = np.median(squared(error, information)[full])
     assert 2.37 / 4 < median < 2.37 * 4
     assert np.median(np.linalg.norm(error[full], axis=-1)) < 0.05
@@ -120,7 +135,9 @@ def test_a_limb_goes_missing_whole(people):
     limbs = []
     for (short, long), start in ((arm, 0), (arm, 1), (leg, 0), (leg, 2)):
         for letter, side in (("L", "left_"), ("R", "right_")):
-            names = [letter + part for part in short[start:]] + [side + part for part in long[start:]]
+            names = [letter + part for part in short[start:]] + [
+                side + part for part in long[start:]
+            ]
             limbs.append(np.isin(BODY_POINTS, names))
     allowed = {tuple(a | b) for a in limbs for b in limbs}  # two draws, perhaps the same twice
     assert {tuple(row) for row in gone} <= allowed
@@ -133,7 +150,9 @@ def test_regions_go_missing_whole_and_single_joints_singly(people):
     kinds = {tuple(row) for row in gone}
     assert len(kinds) == 6
     legs = np.array(["Knee" in name or "knee" in name for name in BODY_POINTS])
-    assert any(np.array(kind)[legs].all() and not np.array(kind)[0] for kind in kinds)  # all below the hips
+    assert any(
+        np.array(kind)[legs].all() and not np.array(kind)[0] for kind in kinds
+    )  # all below the hips
     left = np.array([name.startswith(("L", "left")) for name in BODY_POINTS])
     assert any((np.array(kind) == left).all() for kind in kinds)
     gone = ~there(made(people, change(single=0.5))[1])
@@ -146,7 +165,9 @@ def test_regions_go_missing_whole_and_single_joints_singly(people):
 def test_outliers_are_far_off_and_claim_to_be_good(people):
     error, information = made(people, change(clean=1.0, outlier=0.1))
     off = np.linalg.norm(error, axis=-1) > 0.03
-    assert off.mean() == pytest.approx(0.1, abs=0.01)  # sigma of a share of 20,000: 0.2 %; few land within 3 cm
+    assert off.mean() == pytest.approx(
+        0.1, abs=0.01
+    )  # sigma of a share of 20,000: 0.2 %; few land within 3 cm
     assert np.sqrt((error[off] ** 2).mean()) == pytest.approx(0.25, rel=0.05)
     assert there(information)[off].all()
 

@@ -22,10 +22,17 @@ from shapepose_fg.simulation.training.motions import (
 Z_UP = Rotation.from_rotvec([np.pi / 2, 0.0, 0.0])
 
 
-def write_amass(path: Path, frames: int = 12, columns: int = 156, fps: float = 60.0, **change) -> np.ndarray:
+def write_amass(
+    path: Path, frames: int = 12, columns: int = 156, fps: float = 60.0, **change
+) -> np.ndarray:
     """A motion as AMASS writes it; returns its `poses`."""
     poses = np.random.default_rng(0).normal(0, 0.3, (frames, columns))
-    arrays = {"poses": poses, "betas": np.zeros(16), "trans": np.zeros((frames, 3)), "mocap_framerate": fps}
+    arrays = {
+        "poses": poses,
+        "betas": np.zeros(16),
+        "trans": np.zeros((frames, 3)),
+        "mocap_framerate": fps,
+    }
     arrays = {name: value for name, value in (arrays | change).items() if value is not None}
     path.parent.mkdir(parents=True, exist_ok=True)
     np.savez(path, **arrays)
@@ -47,7 +54,8 @@ def test_the_split_is_the_one_that_is_written_down():
 def test_other_subjects_are_hashed_eight_to_one_to_one_and_stay_where_they_are():
     names = [f"rub{number:03}" for number in range(2000)]
     count = [sum(split_of(name) == split for name in names) / len(names) for split in SPLITS]
-    # 2,000 names: sigma of a share of 0.1 is 0.7 %; 256 values of a byte are 26, 26, ..., 25 in tenths.
+    # 2,000 names: sigma of a share of 0.1 is 0.7 %; 256 values of a byte are 26, 26, ..., 25 in
+    # tenths.
     np.testing.assert_allclose(count, [0.8, 0.1, 0.1], atol=0.03)
     parts = [split_of(name) for name in ("rub001", "s1", "317", "3", "rub002", "s5")]
     assert parts == ["train", "train", "train", "validation", "validation", "test"]
@@ -57,7 +65,9 @@ def test_other_subjects_are_hashed_eight_to_one_to_one_and_stay_where_they_are()
 def test_parts_are_of_different_people_and_leave_nobody_out(cmu):
     parts = [cmu.of(split) for split in SPLITS]
     assert sum(map(len, parts)) == len(cmu) == 90242
-    assert set(parts[1].subject) == set(VALIDATION_SUBJECTS) and set(parts[2].subject) == set(TEST_SUBJECTS)
+    assert set(parts[1].subject) == set(VALIDATION_SUBJECTS) and set(parts[2].subject) == set(
+        TEST_SUBJECTS
+    )
     assert not set(parts[0].subject) & {*VALIDATION_SUBJECTS, *TEST_SUBJECTS}
 
 
@@ -65,7 +75,10 @@ def test_parts_are_of_different_people_and_leave_nobody_out(cmu):
 def test_nobody_weighs_more_than_the_caps_allow(cmu):
     for split in SPLITS:
         part = cmu.of(split)
-        total = {subject: part.weight[part.subject == subject].sum() for subject in np.unique(part.subject)}
+        total = {
+            subject: part.weight[part.subject == subject].sum()
+            for subject in np.unique(part.subject)
+        }
         assert max(total.values()) <= SUBJECT_CAP + 1e-6
     assert cmu.weight.min() > 0 and cmu.weight.max() <= 1
 
@@ -84,10 +97,11 @@ def test_poses_of_cmu_are_the_recorded_ones_with_collars_that_follow_the_arms(cm
         recorded = data["poses"][:500].astype(np.float64)
     ours = cmu.poses[:500].astype(np.float64)
     legs_and_trunk = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 12, 15, 18, 19]
-    turned = Rotation.from_rotvec(ours[:, legs_and_trunk].reshape(-1, 3)).inv() * Rotation.from_rotvec(
-        recorded[:, legs_and_trunk].reshape(-1, 3)
-    )
-    # Exact but for half precision in the file, and for the few frames where a marker jumped and is bridged.
+    turned = Rotation.from_rotvec(
+        ours[:, legs_and_trunk].reshape(-1, 3)
+    ).inv() * Rotation.from_rotvec(recorded[:, legs_and_trunk].reshape(-1, 3))
+    # Exact but for half precision in the file, and for the few frames where a marker jumped and is
+    # bridged.
     assert np.quantile(turned.magnitude(), 0.97) < 1e-6
     for collar, shoulder in ((13, 16), (14, 17)):
         arm = Rotation.from_rotvec(ours[:, collar]) * Rotation.from_rotvec(ours[:, shoulder])
@@ -100,13 +114,20 @@ def test_poses_of_cmu_are_the_recorded_ones_with_collars_that_follow_the_arms(cm
 def test_a_folder_of_amass_is_read_thinned_and_turned_upright(tmp_path):
     poses = write_amass(tmp_path / "KIT" / "s1" / "jump_poses.npz", 120, 156, 120.0)
     write_amass(
-        tmp_path / "KIT" / "s2" / "walk_poses.npz", 10, 165, 0.0, mocap_framerate=None, mocap_frame_rate=30.0
+        tmp_path / "KIT" / "s2" / "walk_poses.npz",
+        10,
+        165,
+        0.0,
+        mocap_framerate=None,
+        mocap_frame_rate=30.0,
     )
     write_amass(tmp_path / "KIT" / "s2" / "shape.npz", poses=None)  # lies beside the motions
     motions = load_motions(tmp_path)
     assert len(motions) == 40
     assert set(motions.subject[:30]) == {"s1"} and set(motions.subject[30:]) == {"s2"}
-    np.testing.assert_allclose(motions.poses[:30, 1:22], poses[::4, 3:66].reshape(-1, 21, 3), atol=1e-6)
+    np.testing.assert_allclose(
+        motions.poses[:30, 1:22], poses[::4, 3:66].reshape(-1, 21, 3), atol=1e-6
+    )
     assert not motions.poses[:, 22:].any()
     upright = Rotation.from_rotvec(motions.poses[:30, 0].astype(float))
     assert ((Z_UP * upright).inv() * Rotation.from_rotvec(poses[::4, :3])).magnitude().max() < 1e-6

@@ -20,7 +20,12 @@ from shapepose_fg.simulation.training.motions import MIRROR_JOINTS, Motions
 pytest.importorskip("torch", reason='needs pip install "shapepose-fg[train]"')
 import torch
 
-from shapepose_fg.simulation.training.differentiable import TrainedNetwork, inverse_3x3, positions, unroll
+from shapepose_fg.simulation.training.differentiable import (
+    TrainedNetwork,
+    inverse_3x3,
+    positions,
+    unroll,
+)
 from shapepose_fg.simulation.training.train import (
     INSIDE,
     PeopleSource,
@@ -43,7 +48,9 @@ SMALL = TrainingConfig(
 
 @pytest.fixture(scope="module", autouse=True)
 def one_thread():
-    """Small matrices in several threads wait for each other where other work runs on the same cores."""
+    """Small matrices in several threads wait for each other where other work runs on the same
+    cores.
+    """
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -55,7 +62,9 @@ def motions(count: int = 200, seed: int = 0) -> Motions:
     rng = np.random.default_rng(seed)
     root = np.zeros((count, 1, 3))
     root[:, 0, 1] = rng.uniform(-np.pi, np.pi, count)
-    poses = np.concatenate((root, PosePrior.default().sample(rng, count)), axis=1).astype(np.float32)
+    poses = np.concatenate((root, PosePrior.default().sample(rng, count)), axis=1).astype(
+        np.float32
+    )
     subject = np.full(count, "01")
     return Motions(poses, np.ones(count), subject)
 
@@ -92,7 +101,9 @@ def error_mm(trainer: Trainer, network: TrainedNetwork) -> float:
 
 def weights_of(trainer: Trainer) -> list[np.ndarray]:
     networks = (trainer.network, trainer.averaged)
-    return [weight.detach().numpy() for network in networks for weight in network.state_dict().values()]
+    return [
+        weight.detach().numpy() for network in networks for weight in network.state_dict().values()
+    ]
 
 
 @pytest.mark.slow
@@ -128,7 +139,9 @@ def test_training_and_fits_take_the_same_steps(frame):
     ours = unroll(Sight(points, ALL, SMALL.kernel_scale), trainer.network.eval(), start, targets)
     for one, other in zip(ours, descent.unroll(plain, *given), strict=True):
         for name, value in vars(other).items():
-            np.testing.assert_allclose(getattr(one, name).detach().numpy(), value, atol=2e-5, err_msg=name)
+            np.testing.assert_allclose(
+                getattr(one, name).detach().numpy(), value, atol=2e-5, err_msg=name
+            )
         placed = points.positions(other.local, other.betas, other.transl)
         np.testing.assert_allclose(positions(points, one).detach().numpy(), placed, atol=2e-5)
     assert np.abs(other.transl - plain.transl).max() > 0.01
@@ -140,8 +153,12 @@ def test_training_and_fits_take_the_same_steps(frame):
 def test_gradients_reach_the_network_from_the_last_step_only_through_itself(frame):
     trainer, generator = make_trainer(frame), torch.Generator().manual_seed(3)
     targets, start, *_ = prepared(trainer.source.draw(20, generator), frame, SMALL, generator)
-    first, second = unroll(Sight(trainer.source.model.points, ALL, 6.0), trainer.network.eval(), start, targets)
-    (slope,) = torch.autograd.grad(second.transl.sum(), trainer.network.leave.bias, retain_graph=True)
+    first, second = unroll(
+        Sight(trainer.source.model.points, ALL, 6.0), trainer.network.eval(), start, targets
+    )
+    (slope,) = torch.autograd.grad(
+        second.transl.sum(), trainer.network.leave.bias, retain_graph=True
+    )
     # transl <- transl + 0.1 * output: each row gives 0.1, of the second step alone.
     np.testing.assert_allclose(slope[-3:].numpy(), 0.1 * len(start.betas), rtol=1e-5)
     assert first.transl.requires_grad
@@ -175,7 +192,9 @@ def test_half_of_the_people_are_mirrored_and_some_have_a_limb_of_another(frame):
     local = source.draw(200, torch.Generator().manual_seed(0)).state.local
     apart = (local[:, None] - torch.from_numpy(exp_so3(poses))).abs().amax(dim=(2, 3, 4)).numpy()
     assert (apart.min(axis=1) < 1e-6).all()
-    assert (apart.argmin(axis=1) == 0).mean() == pytest.approx(0.5, abs=0.11)  # three sigma of 200 coins
+    assert (apart.argmin(axis=1) == 0).mean() == pytest.approx(
+        0.5, abs=0.11
+    )  # three sigma of 200 coins
     assert [MIRROR_JOINTS[joint] for joint in MIRROR_JOINTS] == list(range(24))
     assert SMPL_24[MIRROR_JOINTS[SMPL_24.index("left_elbow")]] == "right_elbow"
     mixed = PeopleSource(recorded, BodyModel.default(), frame, replace(still, exchange=1.0))
@@ -193,7 +212,9 @@ def test_what_is_prepared_is_in_the_frame_in_which_the_fitter_starts(frame):
     seen = targets.information.diagonal(dim1=-2, dim2=-1).amin(-1) > 1 / 0.05**2
     error = torch.linalg.vector_norm(targets.xyz - points, dim=-1)[seen]
     assert float(error.median()) < 0.05
-    assert float(torch.linalg.eigvalsh(targets.information).amax()) <= 1.001 / SMALL.model_sigma_m**2
+    assert (
+        float(torch.linalg.eigvalsh(targets.information).amax()) <= 1.001 / SMALL.model_sigma_m**2
+    )
     # True rotations pose the true points, but for where the person stands.
     posed = positions(BodyModel.default().points, truth)
     shift = points - posed

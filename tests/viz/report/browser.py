@@ -1,4 +1,6 @@
-"""A page in headless Chromium, through chromedriver's own interface (W3C WebDriver, JSON over HTTP)."""
+"""A page in headless Chromium, through chromedriver's own interface (W3C WebDriver, JSON over
+HTTP).
+"""
 
 import json
 import os
@@ -34,12 +36,17 @@ class Browser:
 
     def wait(self) -> None:
         """Until two frames have been drawn."""
-        script = "const done = arguments[0]; requestAnimationFrame(() => requestAnimationFrame(() => done()));"
+        script = (
+            "const done = arguments[0]; requestAnimationFrame(() => requestAnimationFrame(() => "
+            "done()));"
+        )
         self.ask("execute/async", {"script": script, "args": []})
 
     def resize(self, width: int, height: int) -> None:
         metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
-        self.ask("goog/cdp/execute", {"cmd": "Emulation.setDeviceMetricsOverride", "params": metrics})
+        self.ask(
+            "goog/cdp/execute", {"cmd": "Emulation.setDeviceMetricsOverride", "params": metrics}
+        )
 
     def complaints(self) -> list[str]:
         """What the console holds: errors of scripts, and of what was refused or not found."""
@@ -60,10 +67,18 @@ def _ask(url: str, body: dict[str, Any] | None, method: str | None = None) -> An
 def chromium() -> Iterator[Browser]:
     """A window of headless Chromium; skips the test where it is not installed."""
     driver = shutil.which("chromedriver")
-    program = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    program = (
+        shutil.which("chromium")
+        or shutil.which("chromium-browser")
+        or shutil.which("google-chrome")
+    )
     if driver is None or program is None:
-        pytest.skip("chromium and chromedriver are not installed (Debian: chromium, chromium-driver)")
-    process = subprocess.Popen([driver, "--port=0"], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+        pytest.skip(
+            "chromium and chromedriver are not installed (Debian: chromium, chromium-driver)"
+        )
+    process = subprocess.Popen(
+        [driver, "--port=0"], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    )
     try:
         assert process.stdout is not None
         line = next(line for line in process.stdout if "successfully on port" in line)

@@ -1,4 +1,6 @@
-"""The result that exports are tested on, for its report: somebody out of sight, a hole, a guessed joint."""
+"""The result that exports are tested on, for its report: somebody out of sight, a hole, a guessed
+joint.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +15,9 @@ from tests.io.export.conftest import result, saved, scene, true_bodies
 
 __all__ = ["result", "saved", "scene", "true_bodies"]
 
-HOSTILE = "</script><script>document.title='taken'</script><img src=x onerror=\"document.title='taken'\">"
+HOSTILE = (
+    "</script><script>document.title='taken'</script><img src=x onerror=\"document.title='taken'\">"
+)
 """What a calibration file could call a camera."""
 
 
@@ -32,5 +36,9 @@ def hostile_page(result: Reconstruction, scene: Scene, tmp_path_factory) -> Path
     assert table is not None
     named = replace(result, observations=replace(table, view_names=[HOSTILE, *scene.rig.names[1:]]))
     run = {"notes": [HOSTILE], "versions": {HOSTILE: HOSTILE}, "setup": {"warnings": [HOSTILE]}}
-    run |= {"people": {"dropped": {HOSTILE: 3}}, "inputs": {HOSTILE: "0"}, "time": {"fps": 25, "source": HOSTILE}}
+    run |= {
+        "people": {"dropped": {HOSTILE: 3}},
+        "inputs": {HOSTILE: "0"},
+        "time": {"fps": 25, "source": HOSTILE},
+    }
     return write_report(tmp_path_factory.mktemp("hostile"), named.with_run(**run), rig)

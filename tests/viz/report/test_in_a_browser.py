@@ -1,4 +1,6 @@
-"""report.html in headless Chromium: it draws, plays, turns, and runs nothing but its own scripts."""
+"""report.html in headless Chromium: it draws, plays, turns, and runs nothing but its own
+scripts.
+"""
 
 import base64
 
@@ -42,7 +44,8 @@ def picture(browser: Browser) -> np.ndarray:
 def slide(browser: Browser, frame: int) -> None:
     """What a hand on the slider does."""
     script = (
-        "const s = document.getElementById('frame'); s.value = arguments[0]; s.dispatchEvent(new Event('input'));"
+        "const s = document.getElementById('frame'); s.value = arguments[0]; s.dispatchEvent(new "
+        "Event('input'));"
     )
     browser.run(script, frame)
 
@@ -91,7 +94,9 @@ setTimeout(() => done([during, play.textContent, document.getElementById('frame'
 def test_layers_can_be_switched_off(shown):
     slide(shown, FRAMES - 1)
     # Cameras stand around the room, outside of the first view.
-    zoom = "document.getElementById('canvas').dispatchEvent(new KeyboardEvent('keydown', {key: '-'}))"
+    zoom = (
+        "document.getElementById('canvas').dispatchEvent(new KeyboardEvent('keydown', {key: '-'}))"
+    )
     for _ in range(8):
         shown.run(zoom)
     before = picture(shown)
@@ -125,7 +130,8 @@ const eye = new Eye(r.view, r.cameras);
 eye.resize(800, 500);
 eye.through = arguments[0];
 eye.settle();
-return [eye.frameBox, Array.from({{length: 25}}, (_, j) => eye.project(r.joint(r.rowOf(0, 0), j)).slice(0, 2))];"""
+const at = (_, j) => eye.project(r.joint(r.rowOf(0, 0), j)).slice(0, 2);
+return [eye.frameBox, Array.from({{length: 25}}, at)];"""
         (x, y, wide, tall), drawn = shown.run(script, view)
         xy, _ = camera.project(result.joints[row])
         width, height = camera.image_size
@@ -164,7 +170,9 @@ def test_names_run_nothing(browser, hostile_page):
     assert browser.complaints() == []
     assert "taken" not in browser.run("return document.title")[:5]
     assert browser.run("return document.images.length") == 0
-    options = browser.run("return [...document.querySelectorAll('#through option')].map((o) => o.textContent)")
+    options = browser.run(
+        "return [...document.querySelectorAll('#through option')].map((o) => o.textContent)"
+    )
     assert "onerror" in options[1]
 
 
@@ -182,7 +190,8 @@ def test_fits_a_telephone(browser, page):
 
 def test_dark_where_the_reader_s_screen_is(browser, page):
     grey = (
-        "return getComputedStyle(document.body).backgroundColor.match(/\\d+/g).reduce((s, v) => s + Number(v), 0)"
+        "return getComputedStyle(document.body).backgroundColor.match(/\\d+/g).reduce((s, v) => "
+        "s + Number(v), 0)"
     )
     light = {"features": [{"name": "prefers-color-scheme", "value": "light"}]}
     dark = {"features": [{"name": "prefers-color-scheme", "value": "dark"}]}
@@ -193,10 +202,14 @@ def test_dark_where_the_reader_s_screen_is(browser, page):
     browser.ask("goog/cdp/execute", {"cmd": "Emulation.setEmulatedMedia", "params": dark})
     assert browser.run(grey) < 150
     assert (picture(browser) != before).any(axis=1).mean() > 0.2
-    browser.ask("goog/cdp/execute", {"cmd": "Emulation.setEmulatedMedia", "params": {"features": []}})
+    browser.ask(
+        "goog/cdp/execute", {"cmd": "Emulation.setEmulatedMedia", "params": {"features": []}}
+    )
 
 
 def test_opens_at_the_frame_in_the_address(browser, page):
     browser.open(page, f"#frame={FIRST + 5}")
     browser.wait()
-    assert browser.run("return document.getElementById('clock').textContent").startswith(f"frame {FIRST + 5} ")
+    assert browser.run("return document.getElementById('clock').textContent").startswith(
+        f"frame {FIRST + 5} "
+    )

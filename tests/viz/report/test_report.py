@@ -1,4 +1,6 @@
-"""report.html as text: what it says, that nothing can be smuggled into it, and how large it may be."""
+"""report.html as text: what it says, that nothing can be smuggled into it, and how large it may
+be.
+"""
 
 import base64
 import hashlib
@@ -62,7 +64,11 @@ def array(text: str, kind: str) -> np.ndarray:
 def assert_closed(page: Page) -> None:
     """Nothing is fetched, and no script runs but the page's own."""
     attributes = [(tag, name, value) for tag, each in page.tags for name, value in each.items()]
-    assert not [each for each in attributes if each[1] in ("src", "action", "data") or each[1].startswith("on")]
+    assert not [
+        each
+        for each in attributes
+        if each[1] in ("src", "action", "data") or each[1].startswith("on")
+    ]
     assert all((value or "").startswith("#") for _, name, value in attributes if name == "href")
     assert "url(" not in page.source and "@import" not in page.source
     policy = next(each["content"] or "" for tag, each in page.tags if "http-equiv" in each)
@@ -122,7 +128,9 @@ def test_people_stand_upright_whatever_axis_is_up(result, tmp_path, up):
     page = Page(write_report(tmp_path, turned, None))
     scene = page.scene
     packed = array(scene["joints"], "<i2").reshape(-1, 25, 3).astype(float)
-    upright = np.median(packed[:, BODY_25.index("Neck")] - packed[:, BODY_25.index("MidHip")], axis=0)
+    upright = np.median(
+        packed[:, BODY_25.index("Neck")] - packed[:, BODY_25.index("MidHip")], axis=0
+    )
     assert upright[2] > 400
     assert f"{up} is assumed to be up" in page.text
 
@@ -143,7 +151,13 @@ def test_figures_are_those_of_the_observations(result):
     assert counts[BODY_25.index(GUESSED[1])].tolist() == [16, 0, 24, 0, 0]
     # By person: the guessed wrist is person 3's.
     by_person = known_counts(result, (result.person == 7).astype(int))
-    assert by_person[0].tolist() == [24 * 24, 0, 24, 0, 0] and by_person[1].tolist() == [16 * 25 - 1, 0, 0, 0, 1]
+    assert by_person[0].tolist() == [24 * 24, 0, 24, 0, 0] and by_person[1].tolist() == [
+        16 * 25 - 1,
+        0,
+        0,
+        0,
+        1,
+    ]
 
 
 def test_the_page_says_who_was_there_and_what_happened(result, scene, tmp_path):
@@ -152,9 +166,14 @@ def test_the_page_says_who_was_there_and_what_happened(result, scene, tmp_path):
         "time": {"fps": FPS, "source": "assumed"},
         "notes": ["3 joints were left out."],
         "setup": {"warnings": ["cam2 looks turned by 5 degrees."]},
-        "people": {"dropped": {"too few parts in the box": 4}, "problems": [{"person": 3, "frame": 101}]},
+        "people": {
+            "dropped": {"too few parts in the box": 4},
+            "problems": [{"person": 3, "frame": 101}],
+        },
         "dropped_frames": {"too few parts in the box": [[100, 103], [110, 111]]},
-        "cameras": [{"camera": "cam0", "offered": 1234, "left_out": {"median_px": 9.4, "median_mm": 21.0}}],
+        "cameras": [
+            {"camera": "cam0", "offered": 1234, "left_out": {"median_px": 9.4, "median_mm": 21.0}}
+        ],
         "seconds": {"solve": 2.5},
         "probability": [{"person": 7, "evidence": 0.22, "probability": 0.87}],
         "noise_law": {"times": [2.0] * 7, "gross": [0.25] * 7, "count": [0, 0, 0, 5678, 0, 0, 0]},
@@ -181,7 +200,15 @@ def test_the_page_says_who_was_there_and_what_happened(result, scene, tmp_path):
 @pytest.mark.parametrize("value", [None, 7, "text", ["a", 3], {"a": {"b": None}}, [[1, "x"]]])
 def test_entries_of_run_json_that_make_no_sense_say_nothing(result, scene, tmp_path, value):
     """Those that a loaded result may hold: others are refused when it is loaded (check_run)."""
-    names = ("notes", "setup", "cameras", "dropped_frames", "keypoint_offsets", "noise_law", "probability")
+    names = (
+        "notes",
+        "setup",
+        "cameras",
+        "dropped_frames",
+        "keypoint_offsets",
+        "noise_law",
+        "probability",
+    )
     run = {key: value for key in names}
     run["people"] = {"dropped": value, "problems": value}
     assert_closed(Page(write_report(tmp_path, result.with_run(**run), scene.rig)))
@@ -192,7 +219,9 @@ def test_a_long_recording_is_thinned_and_says_so(result, scene, tmp_path, monkey
     monkeypatch.setattr("shapepose_fg.viz.report.writing.SCENE_BYTES", 8000)
     thin = Page(write_report(tmp_path, result, scene.rig))
     assert len(thin.source) < whole - 8000
-    every = int(np.ceil(whole / 8000)) and re.search(r"One frame in (\d+) is drawn \((\d+) of 24\)", thin.text)
+    every = int(np.ceil(whole / 8000)) and re.search(
+        r"One frame in (\d+) is drawn \((\d+) of 24\)", thin.text
+    )
     assert every is not None
     kept = array(thin.scene["frames"], "<i4")
     assert len(kept) == int(every[2]) == len(range(0, 24, int(every[1])))
@@ -210,8 +239,12 @@ def test_nobody_found_is_a_page_too(scene, tmp_path):
 
 
 def test_one_frame_without_a_rate_is_a_page_too(result, scene, tmp_path):
-    alone = result.at(FIRST).with_run(frames=[FIRST, FIRST + 1], time={"fps": None, "source": "assumed"})
-    page = Page(write_report(tmp_path, replace(alone, time_s=np.full(len(alone), np.nan)), scene.rig))
+    alone = result.at(FIRST).with_run(
+        frames=[FIRST, FIRST + 1], time={"fps": None, "source": "assumed"}
+    )
+    page = Page(
+        write_report(tmp_path, replace(alone, time_s=np.full(len(alone), np.nan)), scene.rig)
+    )
     assert array(page.scene["frames"], "<i4").tolist() == [FIRST]
 
 
@@ -226,7 +259,10 @@ def test_people_on_no_timeline_are_a_page_without_a_scene(result, scene, tmp_pat
     twice = replace(result, person=np.full(len(result), 3), observations=None)
     page = Page(write_report(tmp_path, twice, scene.rig))
     assert_closed(page)
-    assert page.scripts == [] and "the scene is not drawn: person 3 has two rows of frame 100" in page.text
+    assert (
+        page.scripts == []
+        and "the scene is not drawn: person 3 has two rows of frame 100" in page.text
+    )
 
 
 def test_every_reason_has_words(result, scene, tmp_path):
