@@ -130,8 +130,8 @@ class TopDownNetwork:
             name for name in listed if name and (name not in names or listed.count(name) > 1)
         ]:
             raise InputError(
-                f"{network.file}: joints has {wrong[0]!r}, which must be a keypoint of {skeleton.name}"
-                f' without repetition ({" ".join(filter(None, names))}), or ""'
+                f"{network.file}: joints has {wrong[0]!r}, which must be a keypoint of"
+                f' {skeleton.name} without repetition ({" ".join(filter(None, names))}), or ""'
             )
         if len(listed) != count:
             raise InputError(
