@@ -83,7 +83,7 @@ def test_provenance_carries_the_acknowledgement(prior):
     ("change", "message"),
     [
         ({"mean": np.zeros(72)}, "mean must be"),
-        ({"mean": np.full(69, np.nan)}, "NaN"),
+        ({"mean": np.full(69, np.nan)}, "not finite"),
         ({"covariance": np.triu(np.ones((69, 69)))}, "symmetric"),
         ({"covariance": np.ones((69, 69))}, "positive definite"),
         ({"lower": np.zeros(69), "upper": np.zeros(69)}, "below"),

@@ -160,7 +160,7 @@ def test_without_footage_json_pictures_are_counted_and_it_is_said(solved, tmp_pa
     video = solved / "videos" / f"{name}.avi"
     assert run(tmp_path / "results", "--videos", f"{name}={video}", "--frames", "0:2") == 0
     told = " ".join(capsys.readouterr().err.split())
-    assert f"frame 0 of the result is taken to be the first picture of {name}" in told
+    assert f"frame 0 of the result is assumed to be the first picture of {name}" in told
     assert "of the same aspect ratio: they are assumed to be resized" in told
     assert len(frames_of(tmp_path / "results" / "overlay" / "grid.mp4")) == 2
 

@@ -416,7 +416,7 @@ def test_a_joint_thrown_away_is_a_status_with_a_name(walk, five_cameras, two_peo
     assert (found.status[observations.track == 0] == Status.OK).all()
     named = {(each.track, each.frame, each.joint) for each in found.problems}
     assert (who, 4, WRIST) in named and {joint for _, _, joint in named} == {WRIST}
-    assert "ran away" in found.problems[0].reason
+    assert "diverged" in found.problems[0].reason
     assert {each.row for each in found.rows(np.array([row])).problems} == {0}
 
 
@@ -448,7 +448,7 @@ def test_a_factor_must_be_on_the_window_s_own_keys(walk, five_cameras, two_peopl
 
 def test_a_person_twice_in_a_frame_is_refused(walk, five_cameras, two_people):
     twice = Observations.concatenate([walk[0], walk[0].rows(np.array([3]))])
-    with pytest.raises(ValueError, match="one row a frame"):
+    with pytest.raises(ValueError, match="only one row per frame"):
         window_rows(twice)
 
 
@@ -535,7 +535,7 @@ def test_another_format_is_refused_whatever_it_holds(tmp_path):
     (tmp_path / "motion.json").write_text(
         json.dumps(data | {"format": "shapepose-fg motion model 2"})
     )
-    with pytest.raises(InputError, match=r"motion\.json: is not a motion model"):
+    with pytest.raises(InputError, match=r"motion\.json: this is not a motion model"):
         MotionModel.load(("RWrist",), MotionConfig(model=str(tmp_path / "motion.json")))
 
 

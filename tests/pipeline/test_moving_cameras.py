@@ -312,7 +312,8 @@ def test_a_trajectory_of_another_clock_is_refused(drifted):
     path = drifted.rig.trajectories[0]
     rig = replace(drifted.rig, trajectories=(replace(path, time_s=path.time_s + 1.7e9),))
     with pytest.raises(
-        ValueError, match="camera cam2 has no pose at any picture: robot runs from 17000000"
+        ValueError,
+        match="camera cam2 has no pose at the time of any picture: robot runs from 17000000",
     ):
         refine_trajectories(drifted.recording, rig, times=TIMES)
 
