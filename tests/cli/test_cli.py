@@ -298,7 +298,10 @@ def test_a_finished_result_stays_until_it_is_to_be_overwritten(
         (tmp_path / "out" / "export").mkdir()
         (tmp_path / "out" / "export" / "joints.csv").write_text(f"of result {again}")
         assert run(*recording, "--fps", "30", "--overwrite") == 0
-        assert "is of the result before; it is called export-older" in capsys.readouterr().err
+        assert (
+            "belongs to the previous result; it was renamed to export-older"
+            in capsys.readouterr().err
+        )
     assert not (tmp_path / "out" / "export").exists()
     assert (tmp_path / "out" / "export-older" / "joints.csv").read_text() == "of result 1"
     assert (tmp_path / "out" / "export-older2" / "joints.csv").read_text() == "of result 2"

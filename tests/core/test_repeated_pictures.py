@@ -138,7 +138,7 @@ def test_every_picture_twice_is_every_second_one_left_out(recording):
 def test_the_check_names_a_camera_that_stops(scene, recording, stopped):
     report = check_setup(stopped, scene.rig)
     assert [(each.kind, each.cameras) for each in report.findings] == [(Kind.STOPPED, (1,))]
-    assert f"{scene.rig.names[1]} shows the picture before once more in 48 %" in report.warnings[0]
+    assert f"{scene.rig.names[1]} repeats the previous picture in 48 %" in report.warnings[0]
     assert check_setup(recording, scene.rig).findings == ()
 
 

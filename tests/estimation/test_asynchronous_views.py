@@ -189,7 +189,8 @@ def out_of_step(scene, sub: int, places: list[int]) -> tuple[Recording, Recordin
     of = {}
     for place in sorted({0, *places}):
         of[place] = simulate(
-            replace(scene, motion=scene.motion[place::sub], fps=scene.fps / sub), seed=4
+            replace(scene, motion=scene.motion.rows(slice(place, None, sub)), fps=scene.fps / sub),
+            seed=4,
         )
     frames = []
     for t in range(len(of[0])):

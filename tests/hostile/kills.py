@@ -25,7 +25,7 @@ overlap_s = 0.1
 [offsets]
 frames = 6
 """
-PROGRAM = "from shapepose_fg.tracking import identities; following.BLOCK_S = 0.3\n"
+PROGRAM = "from shapepose_fg.tracking import identities; identities.BLOCK_S = 0.3\n"
 PROGRAM += "from shapepose_fg.__main__ import main; main()"
 """The command, which decides after blocks so short that a run of a second stops in the middle of
 them, too."""

@@ -94,7 +94,7 @@ def test_cameras_may_have_different_numbers_of_frames(scene, apart, tmp_path):
         (tmp_path / "short" / "detection" / f"{name}.txt").read_bytes()
     )
     common, _ = read_recording(tmp_path, scene.rig, None, tmp_path / "kept", fps=FPS)
-    assert len(common) == shorter and f"the {shorter} that all have" in common.notes[-1]
+    assert len(common) == shorter and f"the {shorter} common ones" in common.notes[-1]
     found, _ = read_recording(tmp_path, scene.rig, None, tmp_path / "again")
     expected, _ = read_recording(apart, scene.rig, None, tmp_path / "whole")
     assert len(found) == len(expected)

@@ -131,7 +131,7 @@ def test_people_who_move_as_nobody_does_are_named_with_the_rate(recording, room)
     (said,) = result_check(
         report, people, crowd, room, range(60)
     ).warnings  # detections beside those of people
-    assert "people explain 8" in said and "surer ones" in said
+    assert "people explain only 8" in said and "higher confidence threshold" in said
 
 
 @pytest.mark.slow
@@ -176,6 +176,6 @@ def test_people_whom_two_cameras_see_and_who_are_not_found_are_counted(recording
     warned = result_check(report, fewer, recording, room, range(20)).warnings
     words = [each for each in warned if "two cameras" in each]
     seen, found = len(np.unique(people.person)), len(np.unique(fewer.person))
-    assert len(words) == 1 and f"and {found:.1f} are found" in words[0] and found == seen - 1
+    assert len(words) == 1 and f"but {found:.1f} are found" in words[0] and found == seen - 1
     everybody = result_check(report, people, recording, room, range(20))
     assert not any("two cameras" in each for each in everybody.warnings)

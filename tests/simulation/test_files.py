@@ -30,7 +30,7 @@ def test_what_is_simulated_can_be_reconstructed_and_compared(tmp_path: Path, cap
         run("simulate", "demo", "--output", str(tmp_path), "--frames", "40:43", "--seed", "5") == 0
     )
     printed = capsys.readouterr()
-    assert "3 frames of 4 people before 6 cameras" in printed.out and printed.err == ""
+    assert "3 frames of 4 people, 6 cameras" in printed.out and printed.err == ""
     truth = Reconstruction.load(tmp_path / "truth")
     scene = built_in_scene(5)
     np.testing.assert_array_equal(truth.joints.reshape(3, 4, 25, 3), scene.keypoints[40:43])

@@ -148,7 +148,9 @@ def test_a_few_batches_on_another_body_are_as_near_as_ours_and_nearer_than_the_o
     assert train("--body", "second.npz", "--iterations", 4) == 0
     printed = capsys.readouterr()
     assert (
-        "trained" in printed.out and "plain optimiser" in printed.out and "ms a fit" in printed.out
+        "trained" in printed.out
+        and "plain optimiser" in printed.out
+        and "ms per fit" in printed.out
     )
     second, ours, shipped = (
         BodyModel.load("second.npz"),
