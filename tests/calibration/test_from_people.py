@@ -305,7 +305,7 @@ def test_the_command_writes_a_rig_or_says_why_not(rig, recording, tmp_path, caps
     turn, _, grown = off_after_growing(read_rig(tmp_path / "new.json"), rig)
     assert turn.max() < 0.5 and grown == pytest.approx(2, rel=0.03) and 3 < told["stature_m"] < 4
     assert "m; if they are adults, measure the distance of the cameras again" in error
-    assert "people are 3." in (tmp_path / "page.html").read_text("utf-8")
+    assert "median stature of people is 3." in (tmp_path / "page.html").read_text("utf-8")
     lenses = ("--calibration", tmp_path / "lenses.json")
     for more, said in (
         (["--distance=cam0=3"], "give two cameras and metres, such as cam0,cam1=3.42"),
