@@ -62,6 +62,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: item.path)
 
 
+def pytest_make_parametrize_id(val: object, argname: str) -> str | None:
+    """Name contents of files by number: archives contain the time at which they were made, and
+    processes with other names cannot share the tests.
+    """
+    return argname if isinstance(val, bytes) else None
+
+
 _seeded = np.random.default_rng
 
 
