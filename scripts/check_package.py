@@ -142,6 +142,7 @@ def tried(python: str, which: str, place: Path, tests: list[str]) -> str:
     wheels = ("--only-binary", ":all:", "--no-binary", "shapepose-fg")
     install = (place / "bin" / "uv", "pip", "install", "--quiet", "--python", own)
     run(place, *install, *resolution, *wheels, f"{ROOT}[dev]")
+    run(place, place / "bin" / "shapepose-fg", "compile")
     run(place, place / "bin" / "shapepose-fg", "demo", "--output", place / "demo")
     summary, versions = "demo only", run(place, own, "-c", VERSIONS)
     if tests:
