@@ -1,8 +1,8 @@
 """Time offsets of any size between cameras with known poses, with subframe accuracy, from people.
 
-First all offsets between two cameras are scanned (`scanning`); then tracks are associated, and
+First all offsets between two cameras are scanned (`offset_scan`); then tracks are associated, and
 offsets between pairs of cameras refined (`pairwise`); then each camera is compared with people
-triangulated by the others (`in_space`).
+triangulated by the others (`offsets_in_space`).
 """
 
 from collections.abc import Callable

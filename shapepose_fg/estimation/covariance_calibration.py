@@ -43,13 +43,14 @@ class CovarianceFeatures:
     disagreement: Array
     """(N, J) squared Mahalanobis distance of the joint from the body's prediction."""
     association: Array
-    """(N, J, 3, 3) spread due to uncertain associations (`doubt.association_spread`), m²."""
+    """(N, J, 3, 3) spread due to uncertain associations
+    (`association_uncertainty.association_spread`), m²."""
     draft: Array
     """(N, J, 3, 3) outer product of the displacement from the initial estimate used for
     reassociation, m²."""
     exchange: Array
     """(N, J, 3, 3) spread due to possible exchanges with other people's joints
-    (`doubt.exchange_spread`), m²."""
+    (`association_uncertainty.exchange_spread`), m²."""
 
     @property
     def carried(self) -> Array:

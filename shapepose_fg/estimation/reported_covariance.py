@@ -196,8 +196,9 @@ def with_lasting(state: State, person: WindowGraph, marginal: Array) -> Array:
 
     Added are the correlated share of the single-frame covariance by views and body; and of the
     white share, the part that smoothing does not really remove, because errors are correlated over
-    a few frames (`Lasting.kept`). For unseen joints this is taken from the nearest frame in which
-    they are seen. For joints solved with offsets, `marginal` already includes the correlated error.
+    a few frames (`CorrelatedError.kept`). For unseen joints this is taken from the nearest frame in
+    which they are seen. For joints solved with offsets, `marginal` already includes the correlated
+    error.
     """
     said = state.of_views.information[person.rows]
     information = said + state.of_body.information[person.rows]

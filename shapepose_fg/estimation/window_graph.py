@@ -109,7 +109,7 @@ class WindowGraph:
 
     - projections and body priors have only the white share of their variance, so that motion
       smooths only that;
-      `state_covariances` exclude the rest (`outcome.with_lasting` adds it);
+      `state_covariances` exclude the rest (`reported_covariance.with_lasting` adds it);
     - where a joint is lost (`lost` of `solve`) the body's prior gets a slowly decaying offset
       (`factors.motion`): the
       difference between joint and body when it was seen; and so do the views' estimates, which,

@@ -29,7 +29,7 @@ _SEARCH_S = 0.1
 """Interval between searches for new people, seconds."""
 _SURE = 0.3
 """Evidence per second above which a new person is reported at once: probability 0.97
-(`presence.probability`)."""
+(`track_selection.probability`)."""
 _WAITS_S = 1.0
 """Longest time for which a new track that may be a re-identification waits for its bone lengths,
 s."""

@@ -240,7 +240,7 @@ class Change:
     freedom: int = 0
     """Number of fitted parameters."""
     fitted: Kind | None = None
-    """Fitted kind of one camera (`small.ONE`), if any."""
+    """Fitted kind of one camera (`small_errors.ONE`), if any."""
 
 
 def mistake_of_cameras(look: Look, rng: np.random.Generator) -> Change | None:
