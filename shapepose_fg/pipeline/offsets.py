@@ -1,5 +1,6 @@
 """Learns a detector's joint offsets and noise law from frames spread over a recording."""
 
+from collections.abc import Iterator
 from dataclasses import fields, replace
 
 import numpy as np
@@ -9,7 +10,7 @@ from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.offsets.estimation import learn_offsets
 from shapepose_fg.core.camera import Rig, Views
-from shapepose_fg.core.detections import DetectionSequence
+from shapepose_fg.core.detections import Detections, DetectionSequence
 from shapepose_fg.core.errors import naming
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.notes import Notebook
@@ -106,18 +107,13 @@ def noise_of(
         return NoiseLaw.shipped()
     chosen, every = list[Observations](), list[Observations]()
     with book.stage("noise"):
-        stage, time_s = (
-            StageOne(setup.skeleton, setup.config.candidates, setup.config.proposals, Notebook()),
-            times.of_views(len(setup.rig)),
+        stage = StageOne(
+            setup.skeleton, setup.config.candidates, setup.config.proposals, Notebook()
         )
         frames, learnt = detections.first + np.array(spread_frames(count, NOISE_FRAMES)), 0
         # In golden-ratio order, frames are spread over the whole recording even if it ends early.
-        for frame in frames[
-            np.argsort(np.arange(len(frames)) * _GOLDEN % 1.0, kind="stable")
-        ].tolist():
-            found = detections[frame]
-            people = stage(found, setup.rig.at(time_s[frame]))
-            people = replace(people, time_s=np.tile(time_s[frame], (len(people), 1)))
+        order = np.argsort(np.arange(len(frames)) * _GOLDEN % 1.0, kind="stable")
+        for found, people in _people(stage, setup.rig, detections, frames[order].tolist(), times):
             whole = Observations.of(whole_people(people.candidate, found), found, people.initial)
             chosen.append(people)
             every.append(whole)
@@ -150,11 +146,20 @@ def offsets_of(
         # Joints that three views see well are wanted: people whose hips they see are enough, and
         # found faster.
         hips = StageOne(setup.skeleton, config.candidates, config.proposals, Notebook()).of_few()
-        people, time_s = list[Observations](), times.of_views(len(rig))
-        for frame in (detections.first + t for t in spread):
-            found = hips(detections[frame], rig.at(time_s[frame]))
-            people.append(replace(found, time_s=np.tile(time_s[frame], (len(found), 1))))
+        frames = [detections.first + t for t in spread]
+        people = [each for _, each in _people(hips, rig, detections, frames, times)]
         if len(people) == 0:
             return KeypointOffsets.identity()
         targets = confident_targets(Observations.concatenate(people), rig, config.observations)
         return learn_offsets(targets, fitter.model, config=config.body)
+
+
+def _people(
+    stage: StageOne, rig: Rig, detections: ThinnedFrames, frames: list[int], times: FrameTimes
+) -> Iterator[tuple[Detections, Observations]]:
+    """The detections of each of the `frames`, and the people that the `stage` finds in them."""
+    time_s = times.of_views(len(rig))
+    for frame in frames:
+        found = detections[frame]
+        people = stage(found, rig.at(time_s[frame]))
+        yield found, replace(people, time_s=np.tile(time_s[frame], (len(people), 1)))
