@@ -69,6 +69,10 @@ class RefineConfig(Settings):
     a joint is from a fit without that joint's own views. In Algorithm 1 it is fitted to X_n, and
     its joints are the prior."""
 
+    with_body: bool = True
+    """Whether joints and bodies of a window of several frames are one problem
+    (`body_window.BodyWindow`)."""
+
     @classmethod
     def paper(cls) -> "RefineConfig":
         """Algorithm 1 as written, with N = 10."""
@@ -78,6 +82,7 @@ class RefineConfig(Settings):
             disagreement=0.0,
             complete_start=False,
             body_from_views=False,
+            with_body=False,
         )
 
     @property

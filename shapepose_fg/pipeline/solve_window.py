@@ -15,6 +15,7 @@ from shapepose_fg.core.detections import Input
 from shapepose_fg.core.observations import Observations, rows_in
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.asynchronous_views import carried_to_frames, velocities_of, widened
+from shapepose_fg.estimation.body_solution import solve_bodies
 from shapepose_fg.estimation.body_step import BodyStep, disagreement
 from shapepose_fg.estimation.draft import Draft, redraft
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
@@ -101,6 +102,14 @@ def solve_window(
         if assigning.over_time and changed(before, observations) < _SETTLED:
             break
     assigned = time.perf_counter()
+
+    over_time = len(np.unique(observations.track)) < len(observations)
+    if config.refine.with_body and over_time and fitter.model is not None and extra_factors is None:
+        solution = solve_bodies(observations, views, fitter, config, motion)
+        solution.seconds.update(
+            {"associate again": assigned - began, "solve": time.perf_counter() - assigned}
+        )
+        return solution
 
     # Initial estimate: X_0, standard deviations of the observations there, and all graphs.
     state = State.start(observations, views, fitter, config, motion, functions_of(extra_factors))
