@@ -2,12 +2,9 @@
 bodies.
 """
 
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 
-import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.evidence import LEAST_JOINTS
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, FitStatus
@@ -16,7 +13,7 @@ from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Known, Status
 from shapepose_fg.estimation.body_step import joint_targets
-from shapepose_fg.estimation.body_window import BodyState, BodyWindow
+from shapepose_fg.estimation.body_window import BodyWindow
 from shapepose_fg.estimation.body_window_graph import BodyGraph
 from shapepose_fg.estimation.draft import first_places
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
@@ -29,7 +26,7 @@ from shapepose_fg.estimation.linearisation import (
 )
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.state import window_rows
-from shapepose_fg.estimation.window_solution import WindowSolution
+from shapepose_fg.estimation.window_solution import PersonGraph, WindowSolution, tied
 
 LASTS = 2.0
 """Covariances over time are this many times those of errors that are new in every frame: detectors'
@@ -42,38 +39,6 @@ GATE_M = 0.1
 every round."""
 _WEAK_SCORE, _WEAK_PROBABILITY = 0.3, 0.5
 _OUTSIDE_M = 0.02
-
-
-@dataclass(frozen=True)
-class BodyPerson:
-    """One person of a solved window; the graph is made when it is asked for."""
-
-    window: BodyWindow
-    state: BodyState
-    person: int
-    frames: NDArray[np.int64]
-    rows: Index
-    widen: float
-
-    @cached_property
-    def built(self) -> BodyGraph:
-        """The graph with its keys and values."""
-        return BodyGraph(self.window, self.state, self.person, self.frames, self.widen).build()
-
-    @property
-    def graph(self) -> gtsam.NonlinearFactorGraph:
-        """All factors; marginals of `keys` are the reported covariances."""
-        return self.built.graph
-
-    @property
-    def values(self) -> gtsam.Values:
-        """The solution."""
-        return self.built.values
-
-    @property
-    def keys(self) -> NDArray[np.int64]:
-        """(T, J) keys of the joints' positions."""
-        return self.built.keys
 
 
 def solve_bodies(
@@ -101,7 +66,7 @@ def solve_bodies(
         evidence.inlier.copy(),
         evidence.residual_px.copy(),
     )
-    fit, people = BodyFit.failed(start.status, J), list[BodyPerson]()
+    fit, people = BodyFit.failed(start.status, J), list[BodyGraph]()
     joints = np.full((N, J, 3), np.nan)
     for rows in window_rows(observations):
         if not start.ok[rows].any():
@@ -130,7 +95,7 @@ def solve_bodies(
         fit.status[rows] = FitStatus.OK
         frames = observations.frame[rows].astype(np.int64)
         people.append(
-            BodyPerson(window, state, int(observations.track[rows[0]]), frames, rows, widen)
+            BodyGraph(window, state, int(observations.track[rows[0]]), frames, widen, rows)
         )
     found = np.isfinite(joints).all(axis=-1)
     strong = (
@@ -147,7 +112,13 @@ def solve_bodies(
     return WindowSolution(
         observations, joints, covariance, velocity, speeds, mean_confidence(observations, inlier), inlier,
         np.zeros((N, J), dtype=bool), residual, np.where(found, known, Known.UNKNOWN).astype(np.uint8), fit, status,
-        people=tuple(people),
+        people=tied([
+            PersonGraph(
+                window=each, joints=joints[each.rows], covariance=covariance[each.rows],
+                bodies=fit.rows(each.rows),
+            )
+            for each in people
+        ]),
     )  # fmt: skip
 
 

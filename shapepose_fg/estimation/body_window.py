@@ -214,14 +214,19 @@ class BodyWindow:
         body = self.energy.complete(state.free)
         return replace(body, transl=body.transl + self.origin)
 
+    def carried(self, X: Array) -> Observations:
+        """The detections as if all cameras exposed at the frames' times, for joints X (T, J, 3)."""
+        observed = self.observations
+        if observed.time_s.shape[1] > 1 and np.ptp(observed.time_s, axis=1).max() > 0:
+            observed = carried_to_frames(observed, X, velocities_of(observed, X), self.views)
+        return observed
+
     def around(self, state: BodyState, bodies: Array) -> _Around:
         """Cost and normal equations, joints eliminated, around a state with these `bodies` (T, J,
         3).
         """
         X = bodies + state.deviation + self.origin
-        observed = self.observations
-        if observed.time_s.shape[1] > 1 and np.ptp(observed.time_s, axis=1).max() > 0:
-            observed = carried_to_frames(observed, X, velocities_of(observed, X), self.views)
+        observed = self.carried(X)
         evidence = linearise(observed, self.sigmas_px, X, self.views, self.config)
         information, target = evidence.information, evidence.target - self.origin
         share = inverses(np.eye(3) + self.variance * information)

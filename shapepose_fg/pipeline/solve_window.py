@@ -25,7 +25,8 @@ from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.reported_covariance import outcome
 from shapepose_fg.estimation.smoothing import smoothed
 from shapepose_fg.estimation.state import State, parts_of
-from shapepose_fg.estimation.window_graph import ExtraFactors, WindowGraph, functions_of
+from shapepose_fg.estimation.user_factors import ExtraFactors, functions_of
+from shapepose_fg.estimation.window_graph import WindowGraph
 from shapepose_fg.estimation.window_solution import WindowSolution
 from shapepose_fg.tracking.reassociation import LEAST_PROBABILITY, changed, reassociate
 

@@ -22,7 +22,7 @@ from shapepose_fg.core.run_summary import covered_frames
 from shapepose_fg.estimation.floor import Floor
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.noise_law import NoiseLaw
-from shapepose_fg.estimation.window_graph import ExtraFactors
+from shapepose_fg.estimation.user_factors import ExtraFactors
 from shapepose_fg.estimation.window_solution import PersonGraph, WindowSolution
 from shapepose_fg.io.config import ANOTHER_VERSION, config_from
 from shapepose_fg.io.solved_setup import CAMERAS, cameras_of
