@@ -18,10 +18,10 @@ def shape_factors(
     joints: ArrayLike,
     by_pose: ArrayLike,
     by_shape: ArrayLike,
-    sigma_m: float,
+    sigma_m: ArrayLike,
 ) -> list[gtsam.NonlinearFactor]:
     """For each of D joints, metres: r = x - joints - by_pose theta - by_shape beta ~ N(0, sigma_m²
-    I).
+    I), with one standard deviation for all, or (D,).
 
     `keys` (D,) of the positions, `body_keys` (D,) of their poses, `joints` (D, 3) of the body where
     it was linearised, `by_pose` (D, 3, N) and `by_shape` (D, 3, 10) its derivatives.
@@ -40,10 +40,11 @@ def shape_factors(
         )
     if not all(np.isfinite(each).all() for each in (points, to_pose, to_shape)):
         raise ValueError("a joint or a derivative holds a value that is not finite")
-    eye, unit = np.eye(3) / sigma_m, noiseModel.Unit.Create(3)
+    sigma = np.broadcast_to(np.asarray(sigma_m, dtype=np.float64), position.shape)[:, None]
+    eye, unit = np.eye(3) / sigma[..., None], noiseModel.Unit.Create(3)
     linear = map(
-        gtsam.JacobianFactor, position.tolist(), repeat(eye), pose.tolist(), -to_pose / sigma_m,
-        repeat(shape_key), -to_shape / sigma_m, points / sigma_m, repeat(unit),
+        gtsam.JacobianFactor, position.tolist(), eye, pose.tolist(), -to_pose / sigma[..., None],
+        repeat(shape_key), -to_shape / sigma[..., None], points / sigma, repeat(unit),
     )  # fmt: skip
     return list(
         map(

@@ -61,7 +61,7 @@ class BodyGraph:
         of_body = (joints - state.deviation).reshape(-1, 3)
         for each in shape_factors(
             self.keys.ravel(), self.body_keys.repeat(J), self.shape_key, of_body, flat[..., 10:], flat[..., :10],
-            scale * np.sqrt(window.variance),
+            scale * np.sqrt(window.variance).ravel(),
         ):  # fmt: skip
             add(each)
         eye = np.eye(10) / scale
