@@ -9,6 +9,7 @@ threshold. Joints X are eliminated from every step in closed form: three unknown
 their body is connected to.
 """
 
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -19,13 +20,14 @@ from factors import DEFAULT_WIDTH_SIGMA, Motion
 from shapepose_fg.body.fitting.chains import Links
 from shapepose_fg.body.fitting.energy import BodyEnergy, EnergyTargets, Held, nothing
 from shapepose_fg.body.fitting.priors import MotionPrior, PosePrior
-from shapepose_fg.body.kernels.solving import eliminated, put_back
+from shapepose_fg.body.kernels.solving import eliminated, known, put_back, solved
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.body.model.keypoint_offsets import RIDES_ON
 from shapepose_fg.body.model.rotation import exp_so3, log_so3
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.asynchronous_views import carried_to_frames, velocities_of
 from shapepose_fg.estimation.in_time import motion_of
@@ -45,6 +47,9 @@ once in it."""
 _LEVER_M = 0.05
 """A rotation that moves a keypoint by less per radian, metres, does not decide how fast that
 keypoint is."""
+_STRAYS_M = 0.07
+"""Standard deviation, m, of an unseen joint of the body at which its own deviation is as large:
+errors of poses that nothing shows are larger than their Gaussian when they are large."""
 _STEPS, _SETTLED_M = 8, 5e-4
 """Most steps of the solver; it ends when joints move by less on average, metres."""
 _HELD = 1e-6
@@ -53,11 +58,11 @@ _DAMPING = 1e-3
 
 
 @dataclass(frozen=True)
-class BodyState:
+class BodyState(Rows):
     """The variables of a window."""
 
     betas: Array
-    """(10,) shape."""
+    """(10,) shape, or (T, 10) one for each row of different people."""
     root: Array
     """(T, 3, 3) rotation of the root."""
     others: Array
@@ -66,9 +71,7 @@ class BodyState:
     """(T, J, 3) X - J(theta, beta), metres."""
 
     def moved(self, shape: Array, pose: Array) -> "BodyState":
-        """After a step of the betas (10,) and of the poses (T, N), the root's in tangents of the
-        world.
-        """
+        """After a step of betas and poses (T, N), the root's in tangents of the world."""
         return replace(
             self,
             betas=self.betas + shape,
@@ -84,11 +87,14 @@ class BodyState:
 
 
 @dataclass(frozen=True)
-class _Around:
+class _Around(Rows):
     """What the model says around a state."""
 
-    cost: float
-    """E, in squared standard deviations."""
+    cost: Array
+    """(T,) E of each row, without the priors on motion and a common shape, in squared standard
+    deviations."""
+    motion: float
+    """E of the motion and the common shape, likewise."""
     system: Array
     """(T, M, P) normal equations of each row, joints eliminated (`body/kernels/solving.py`)."""
     pull: Array
@@ -97,6 +103,8 @@ class _Around:
     """(T, J, 3) joints of the body, metres around the origin."""
     evidence: ViewEvidence
     """What the views say around the joints X."""
+    weighed: Array
+    """(T, J, 3, 3) information of the views about the body's joints, 1/m²."""
     gain: Array
     """(T, J, 3, 3) (1 + s² L)^-1 s² L: what share of the way from the body's joint to the views' X
     goes."""
@@ -107,6 +115,9 @@ class _Around:
 
 class BodyWindow:
     """The model of one person in T frames; T = 1 is a frame by itself, without motion."""
+
+    alone = False
+    """Whether each row has a shape of its own (`BodyFrames`)."""
 
     def __init__(
         self,
@@ -131,16 +142,16 @@ class BodyWindow:
         )
         self.times_s = observations.time_s.mean(axis=1)
         steps = np.diff(self.times_s)
-        self.share = share = (
-            min(1.0, float(np.median(steps)) / POSE_LASTS_S) if len(steps) > 0 else 1.0
-        )
+        over_time = len(steps) > 0 and not self.alone
+        share = min(1.0, float(np.median(steps)) / POSE_LASTS_S) if over_time else 1.0
+        self.share = share
         self.energy = BodyEnergy(model, PosePrior.default().widened(share**-0.5))
-        self.variance = deviation_m**2
+        self.variance = np.full(self.sigmas_px.shape[:2], deviation_m**2)
         self.origin = np.zeros(3)
         self._motion, self._law, self._kernel = motion, law, config.robust_kernel
         self._held = self.energy.held_by_priors(len(self.times_s))
-        # The betas have their prior once, not in every row.
-        self._held = Held(self._held.betas, np.zeros(len(self.times_s)), self._held.angles)
+        if not self.alone:  # The betas have their prior once, not in every row.
+            self._held = Held(self._held.betas, np.zeros(len(self.times_s)), self._held.angles)
         self.links: Links | None = None
 
     def __len__(self) -> int:
@@ -162,6 +173,7 @@ class BodyWindow:
         if self.links is None and len(self) > 1:
             self.links = self._linked(bodies)
         here, damping, done = self.around(state, bodies), _DAMPING, False
+        cost = here.cost.sum() + here.motion
         for _ in range(_STEPS):
             if done:
                 break
@@ -170,7 +182,9 @@ class BodyWindow:
             bodies = self._bodies(there)
             there = replace(there, deviation=self._deviation(here, bodies))
             new = self.around(there, bodies)
-            if new.cost > here.cost + 1e-3 * abs(here.cost) or not np.isfinite(new.cost):
+            least, cost = cost, new.cost.sum() + new.motion
+            if not cost <= least + 1e-3 * abs(least):
+                cost = least
                 damping = max(10 * damping, 1e-2)
                 if damping > 1e3:
                     break
@@ -197,7 +211,7 @@ class BodyWindow:
             [RIDES_ON[BODY_25.joints.index(n)] if n in BODY_25.joints else 0 for n in names]
         )
         turn = self.energy.model.bone_rotations(self.energy.complete(state.free))[:, bones]
-        weighed = here.gain / self.variance * self.share
+        weighed = here.gain / self.variance[..., None, None] * self.share
         inside = turn.mT @ weighed @ turn
         away = np.where(here.gain.any(axis=(-1, -2))[..., None], here.target - here.bodies, 0.0)
         pull = (turn.mT @ (weighed @ away[..., None]))[..., 0]
@@ -212,7 +226,24 @@ class BodyWindow:
     def parameters(self, state: BodyState) -> BodyParameters:
         """The bodies in the world."""
         body = self.energy.complete(state.free)
-        return replace(body, transl=body.transl + self.origin)
+        return replace(body, transl=body.transl + self.origin.reshape(-1, 3))
+
+    def widen_unseen(self, of_bodies: Array) -> None:
+        """Widen the deviation of joints without a used detection, for covariances (T, J, 3, 3) of
+        the bodies' joints. It changes no other joint, and no solution.
+        """
+        variance = np.trace(of_bodies, axis1=-2, axis2=-1) / 3
+        unseen = ~self.last.evidence.inlier.any(axis=-1)
+        wider = variance * np.sqrt(variance) / _STRAYS_M
+        self.variance = np.where(unseen, np.maximum(self.variance, wider), self.variance)
+
+    def of_joints(self, of_body: Array) -> Array:
+        """(T, J, 3, 3) covariances of X for those of the body's joints, m², around the last
+        solution.
+        """
+        kept = np.eye(3) - self.last.gain
+        found = kept @ of_body @ kept.mT + self.variance[..., None, None] * kept
+        return (found + found.mT) / 2
 
     def carried(self, X: Array) -> Observations:
         """The detections as if all cameras exposed at the frames' times, for joints X (T, J, 3)."""
@@ -229,29 +260,36 @@ class BodyWindow:
         observed = self.carried(X)
         evidence = linearise(observed, self.sigmas_px, X, self.views, self.config)
         information, target = evidence.information, evidence.target - self.origin
-        share = inverses(np.eye(3) + self.variance * information)
+        variance = self.variance[..., None, None]
+        share = inverses(np.eye(3) + variance * information)
         weighed = information @ share  # (L^-1 + s²)^-1, of information that may be singular
         weighed = (weighed + weighed.mT) / 2
         targets = EnergyTargets(target, weighed)
         linear = self.energy.linearise(state.free, targets, 1e9, self._held, nothing(len(self)))
-        cost = self._seen_cost(evidence) + float((state.deviation**2).sum()) / self.variance
+        cost = self._seen_cost(evidence)
+        cost += (np.square(state.deviation).sum(axis=-1) / self.variance).sum(axis=-1)
         angles = state.others[:, :-3] - self._held.angles
-        cost += float(
-            np.einsum("ti,ij,tj", angles, self.energy.priors.precision, angles, optimize=True)
+        cost += np.einsum(
+            "ti,ij,tj->t", angles, self.energy.priors.precision, angles, optimize=True
         )
-        cost += float(state.betas @ state.betas)
+        motion = float(np.square(state.betas).sum())
         pull = np.zeros((len(self), self.energy.num_free - 10))
+        if self.alone:
+            cost, motion = cost + np.square(state.betas).sum(axis=-1), 0.0
         if self.links is not None:
             moved, pull = self._moved(state)
-            cost += moved
-        return _Around(cost, linear.system, pull, bodies, evidence, self.variance * weighed, target)
+            motion += moved
+        return _Around(
+            cost, motion, linear.system, pull, bodies, evidence, weighed, variance * weighed, target
+        )
 
-    def _seen_cost(self, evidence: ViewEvidence) -> float:
-        """Cost of the detections: robust; what the gate discards costs as much as at the gate."""
+    def _seen_cost(self, evidence: ViewEvidence) -> Array:
+        """(T,) robust cost of the detections; a rejected one costs as much as at its gate."""
         seen = np.asarray(self.observations.seen & (self.sigmas_px > 0))
         sigma = np.where(seen, self.sigmas_px, 1.0)
         ratio = (np.nan_to_num(evidence.residual_px) ** 2).sum(axis=-1) / sigma**2
-        depth = (evidence.points @ self.views.cTw[..., 2, :3].mT) + self.views.cTw[..., 2, 3]
+        ahead = self.views.cTw[..., 2, :]
+        depth = evidence.points @ ahead[..., :3].mT + ahead[..., None, :, 3]
         gate = (self.config.rho_2d_m * self.views.focal / np.maximum(depth, 0.2) / sigma) ** 2
         squared = np.where(evidence.inlier, np.minimum(ratio, gate), gate)
         if self._kernel == "cauchy":
@@ -260,7 +298,7 @@ class BodyWindow:
         elif self._kernel == "geman_mcclure":
             c2 = DEFAULT_WIDTH_SIGMA["geman_mcclure"] ** 2
             squared = c2 * squared / (c2 + squared)
-        return float(squared[seen].sum())
+        return np.where(seen, squared, 0.0).sum(axis=(1, 2))
 
     def _bodies(self, state: BodyState) -> Array:
         return self.energy.model.keypoints(self.energy.complete(state.free))
@@ -269,9 +307,6 @@ class BodyWindow:
         """X - J that is best for bodies that have moved."""
         away = np.where(here.gain.any(axis=(-1, -2))[..., None], here.target - bodies, 0.0)
         return (here.gain @ away[..., None])[..., 0]
-
-    # Motion
-    # ---------------------------------------------------------------------------------------------------
 
     def _linked(self, bodies: Array) -> Links:
         """The motion prior, where joints are faster than people on average as much wider as they
@@ -310,9 +345,6 @@ class BodyWindow:
         )
         energy, pull = self.links.at(root, others)
         return energy, pull[:T]
-
-    # Linear algebra
-    # -------------------------------------------------------------------------------------------
 
     def _eliminated(self, root: Array, here: _Around, damping: float) -> tuple[Array, Array]:
         """The factor of the poses and what is left of the betas
@@ -373,6 +405,64 @@ class BodyWindow:
         )
 
 
+class BodyFrames(BodyWindow):
+    """The model of people in single frames: T independent rows, solved together for speed."""
+
+    alone = True
+
+    def rows(self, index: Index) -> "BodyFrames":
+        """The model of some rows."""
+        part = copy(self)
+        part.observations, part.views = self.observations.rows(index), self.views.rows(index)
+        for name in ("sigmas_px", "times_s", "variance", "origin"):
+            setattr(part, name, getattr(self, name)[index])
+        part._held = self._held.rows(index)
+        return part
+
+    def solve(self, start: Array) -> BodyState:
+        """The states of least cost, from bodies (T, P) in the world on."""
+        self.origin = start[:, None, -3:]
+        free = start.copy()
+        free[:, -3:] = 0.0
+        zero = np.zeros((*self.sigmas_px.shape[:2], 3))
+        state = BodyState(free[:, :10], exp_so3(free[:, 10:13]), free[:, 13:], zero)
+        damping, left = np.full(len(free), _DAMPING), np.arange(len(free))
+        here = self.around(state, self._bodies(state))
+        for _ in range(_STEPS):
+            if len(left) == 0:
+                break
+            part, at, now = self.rows(left), state.rows(left), here.rows(left)
+            step, promised = np.empty((len(left), self.energy.num_free)), np.empty(len(left))
+            solved(now.system, damping[left], step, promised)
+            step[:, 10:13] = (at.root @ step[:, 10:13, None])[..., 0]
+            there = at.moved(step[:, :10], step[:, 10:])
+            bodies = part._bodies(there)
+            there = replace(there, deviation=part._deviation(now, bodies))
+            new = part.around(there, bodies)
+            better = new.cost <= now.cost + 1e-3 * np.abs(now.cost)
+            moved = bodies + there.deviation - now.bodies - at.deviation
+            small = np.linalg.norm(moved, axis=-1).mean(axis=-1) < _SETTLED_M
+            taken = left[better]
+            state.put(taken, there.rows(better))
+            here.put(taken, new.rows(better))
+            damping[taken] = np.maximum(damping[taken] / 5, 1e-6)
+            worse = left[~better]
+            damping[worse] = np.maximum(10 * damping[worse], 1e-2)
+            left = left[~(better & small) & (damping[left] <= 1e3)]
+        self.last = here
+        return state
+
+    def body_covariances(self, state: BodyState) -> Array:
+        """(T, J, 3, 3) covariances of the bodies' joints, m², around the last solution."""
+        targets = EnergyTargets(self.last.target, self.last.weighed)
+        system = self.energy.linearise(state.free, targets, 1e9, self._held).system
+        count, unused = len(self), np.empty((len(self), system.shape[2]))
+        solved(system, np.zeros(count), unused, np.empty(count))
+        found = np.zeros((*self.last.target.shape, 3))
+        known(system, found, np.zeros((count, 10, 10)))
+        return found
+
+
 @dataclass(frozen=True)
 class Marginals:
     """Marginal covariances of a solved window."""
@@ -402,16 +492,18 @@ class Marginals:
 
     def joints(self) -> Array:
         """(T, J, 3, 3) covariances of X, m²."""
+        return self.window.of_joints(self.of_bodies)
+
+    @cached_property
+    def of_bodies(self) -> Array:
+        """(T, J, 3, 3) covariances of the bodies' joints, m²."""
         slope = self.slopes
         T, J = slope.shape[:2]
         whole = np.empty((T, slope.shape[-1], slope.shape[-1]))
         whole[:, :10, :10], whole[:, 10:, 10:] = self.shape, self.poses
         whole[:, 10:, :10], whole[:, :10, 10:] = self.across, self.across.mT
         flat = slope.reshape(T, 3 * J, -1)
-        of_body = (flat @ whole).reshape(slope.shape) @ slope.mT
-        kept = np.eye(3) - self.window.last.gain
-        found = kept @ of_body @ kept.mT + self.window.variance * kept
-        return (found + found.mT) / 2
+        return (flat @ whole).reshape(slope.shape) @ slope.mT
 
     def velocities(self) -> Array:
         """(T, J, 3, 3) covariances of (X' - X) / dt, X' of the next frame, m²/s²; the last as the

@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import gtsam
 import numpy as np
@@ -74,17 +75,17 @@ class BodyGraph(PersonWindow):
         self.set_graph(graph, values)
         scale, J, T = np.sqrt(self.widen), self.keys.shape[1], len(window)
         turns = self.turns()
-        slopes = Marginals(window, state, *(np.empty(0),) * 4).slopes
+        slopes, betas = Marginals(window, state, *(np.empty(0),) * 4).slopes, state.betas.ravel()
         slopes[..., 10:13] = slopes[..., 10:13] @ turns[:, None]
         bodies, joints = self._bodies(), window.joints(state)
         for key, x in zip(self.keys.ravel().tolist(), joints.reshape(-1, 3), strict=True):
             values.insert(key, x)
         for key, body in zip(self.body_keys.tolist(), bodies, strict=True):
             values.insert(key, body)
-        values.insert(self.shape_key, state.betas)
+        values.insert(self.shape_key, betas)
         factors: list[gtsam.NonlinearFactor] = [*self._seen(scale, joints)]
         at_zero = joints - state.deviation - (slopes[..., 10:] @ bodies[:, None, :, None])[..., 0]
-        at_zero -= slopes[..., :10] @ state.betas
+        at_zero -= slopes[..., :10] @ betas
         flat = slopes.reshape(T * J, 3, -1)
         sigma = np.broadcast_to(scale * np.sqrt(window.variance), (T, J))
         factors += shape_factors(
@@ -110,24 +111,49 @@ class BodyGraph(PersonWindow):
         found = graph_covariances(part, self.values, gtsam.Ordering(order))[key, key]
         return np.asarray(np.linalg.inv(found), dtype=np.float64)
 
-    def take(self, values: gtsam.Values) -> None:
-        """Take the person's variables from a solution of a graph around the state before."""
+    def take(self, values: gtsam.Values) -> float:
+        """Take the person's variables from a solution of a graph around the state before, and gate
+        the detections there. Returns the mean motion of the joints, metres.
+        """
         bodies = np.array([values.atVector(key) for key in self.body_keys.tolist()])
         joints = np.array([values.atPoint3(key) for key in self.keys.ravel().tolist()])
         others = bodies[:, 3:].copy()
-        others[:, -3:] -= self.window.origin
+        others[:, -3:] -= self.window.origin.reshape(-1, 3)
         zero = np.zeros((*self.keys.shape, 3))
         root = exp_so3(bodies[:, :3]) @ self._upright
-        state = BodyState(values.atVector(self.shape_key), root, others, zero)
-        deviation = joints.reshape(zero.shape) - self.window.joints(state)
-        self.state = replace(state, deviation=deviation)
+        betas = values.atVector(self.shape_key).reshape(self.state.betas.shape)
+        state = BodyState(betas, root, others, zero)
+        joints, before = joints.reshape(zero.shape), self.window.joints(self.state)
+        self.state = replace(state, deviation=joints - self.window.joints(state))
         of_body = self.window.joints(state) - self.window.origin
         self.window.last = self.window.around(self.state, of_body)
+        return float(np.linalg.norm(joints - before, axis=-1).mean())
+
+    def covariances(self, every: dict[tuple[int, int], Array]) -> tuple[Array, Array]:
+        """(T, J, 3, 3) covariances of positions, m², and of velocities, m²/s², from those of every
+        variable (`graph_covariances`) of a graph around the state.
+        """
+        positions = np.array([[every[key, key] for key in row] for row in self.keys.tolist()])
+        if not self.temporal:
+            return positions, np.full_like(positions, np.nan)
+        keys, turns = self.body_keys.tolist(), self.turns()
+        poses = np.array([every[key, key] for key in keys])
+        steps = np.zeros_like(poses)
+        steps[:-1] = [every[after, key] for key, after in pairwise(keys)]
+        for part, rows in ((poses, turns), (steps[:-1], turns[1:])):
+            part[:, :3] = rows @ part[:, :3]
+            part[..., :3] = part[..., :3] @ turns[: len(part)].mT
+        none = np.empty(0)
+        velocities = Marginals(self.window, self.state, poses, steps, none, none).velocities()
+        for t, joint in np.ndindex(self.keys.shape):
+            key = int(self.velocity_keys[t, joint])
+            velocities[t, joint] = every.get((key, key), velocities[t, joint])
+        return positions, velocities
 
     def _bodies(self) -> Array:
         """(T, N) values of the bodies."""
         turn, others = log_so3(self.state.root @ self._upright.mT), self.state.others.copy()
-        others[:, -3:] += self.window.origin
+        others[:, -3:] += self.window.origin.reshape(-1, 3)
         return np.concatenate([turn, others], axis=1)
 
     def turns(self) -> Array:
@@ -145,7 +171,7 @@ class BodyGraph(PersonWindow):
                 yield from ((frame, kind, key) for key in row if self.values.exists(key))
 
     def _velocities(self) -> list[gtsam.NonlinearFactor]:
-        """V = (x' - x) / dt of the velocities that user factors are on, for x as in
+        """Make v = (x' - x) / dt of the velocities that user factors are on, for x as in
         `in_time.velocities`.
         """
         if not self.temporal or len(self.ties.factors) == 0:
