@@ -104,7 +104,8 @@ class BodyGraph(PersonWindow):
         """
         key, graph, part = int(self.keys[t, joint]), self.graph, gtsam.NonlinearFactorGraph()
         order = [*self.keys[t].tolist(), int(self.body_keys[t]), self.shape_key]
-        for n in range(graph.size() - len(self.ties.active)):
+        users = 0 if self.failure else len(self.ties.active)
+        for n in range(graph.size() - users):
             keys = graph.at(n).keys()
             if keys != [key] and all(each in order for each in keys):
                 part.push_back(graph.at(n))

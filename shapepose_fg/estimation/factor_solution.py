@@ -71,7 +71,6 @@ def _solved(
         every = graph_covariances(graph, values, ordering(people, values))
     except RuntimeError as error:
         singular = "the solver failed: its system is singular"
-        ties.active = []
         for each, (state, last) in zip(people, before, strict=True):
             each.state, each.window.last = state, last
             each.failure = str(error) if isinstance(error, NotFinite) else singular

@@ -115,7 +115,7 @@ def window_solutions(
     ValueError if there are no observations.
     """
     solver = Solver.of(people, rig)
-    for _, part, solution in _solved(people, solver, extra_factors):
+    for _, part, solution in _solved(people, solver, extra_factors, again=True):
         for person in solution.people:
             as_reported = {
                 "joints": part.joints[person.rows],
@@ -139,7 +139,7 @@ def solved_around(
         people = people.rows(
             people.person == person if solver.config.temporal else people.frame == frame
         )
-    found = [solution for _, _, solution in _solved(people, solver, extra_factors, frame)]
+    found = [solution for _, _, solution in _solved(people, solver, extra_factors, frame, again=True)]
     return next(
         (each for solution in found for each in solution.people if each.person == person), None
     )
@@ -150,9 +150,12 @@ def _solved(
     solver: Solver,
     extra_factors: ExtraFactors | None,
     frame: int | None = None,
+    *,
+    again: bool = False,
 ) -> Iterator[tuple[range, Reconstruction, WindowSolution]]:
     """Solve all windows, or that of one `frame`; yields its own frames, the rows including the
-    overlap, and the solution.
+    overlap, and the solution: with `again` that of the result, from its joints and, without user
+    factors, the detections that it used.
     """
     if rows.observations is None:
         raise ValueError(
@@ -170,10 +173,13 @@ def _solved(
         if config.windows.keyframe_s > 0:
             part = part.rows(looked_at(part))
         assert part.observations is not None
-        # Initialised from the views: the current joints may be another person's.
-        observations = part.observations.observations(
-            np.full_like(part.joints, np.nan), part.time_s
-        )
+        # Initialised from the views, as the current joints may be another person's, unless they are
+        # to be found again.
+        start = part.joints if again else np.full_like(part.joints, np.nan)
+        observations = part.observations.observations(start, part.time_s)
+        if again and extra_factors is None:
+            used = np.where(part.observations.used, observations.confidence, 0.0)
+            observations = replace(observations, confidence=used)
         views = Views.of(rig, observations.time_s)
         found = solve_window(
             observations, views, solver.fitter, settings, extra_factors=extra_factors
