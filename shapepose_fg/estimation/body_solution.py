@@ -11,23 +11,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.evidence import LEAST_JOINTS
-from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, FitStatus
+from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, FitStatus, JointTargets
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Known, Status
 from shapepose_fg.estimation.association_uncertainty import DOUBTED, mirrored_spread
 from shapepose_fg.estimation.body_step import joint_targets
-from shapepose_fg.estimation.body_window import BodyFrames, BodyState, BodyWindow
+from shapepose_fg.estimation.body_window import BodyState, BodyWindow, Marginals
 from shapepose_fg.estimation.body_window_graph import BodyGraph
+from shapepose_fg.estimation.camera_pose_uncertainty import carried_covariance
 from shapepose_fg.estimation.draft import first_places
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
-from shapepose_fg.estimation.in_time import near_in_time, velocities
+from shapepose_fg.estimation.in_time import near_in_time, velocities, waited_s
 from shapepose_fg.estimation.linearisation import (
     ViewEvidence,
+    inverses,
     linearise,
     mean_confidence,
     observation_sigmas,
+)
+from shapepose_fg.estimation.missed_detections import (
+    SPEED_M_S,
+    elsewhere_variance,
+    limbs_that_hide,
 )
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.reported_covariance import WEAK_PROBABILITY, WEAK_SCORE
@@ -57,6 +64,7 @@ class BodyPerson:
     frames: NDArray[np.int64]
     rows: Index
     widen: float
+    marginals: Marginals
 
     @cached_property
     def built(self) -> BodyGraph:
@@ -102,23 +110,40 @@ def solve_bodies(
     # Bodies and joints together. Rows without a body keep what their views determine.
     found = _Found.of_views(evidence, config.refine.max_sigma_m, start.status)
     people = list[BodyPerson]()
-    tracks = [rows for rows in window_rows(observations) if start.ok[rows].any()]
-    alone = [rows for rows in tracks if len(rows) == 1]
-    over_time = [rows for rows in tracks if len(rows) > 1]
-    for rows in [*over_time, np.concatenate(alone)] if alone else over_time:
+    for rows in window_rows(observations):
+        if not start.ok[rows].any():
+            continue
         given = observations.rows(rows), sigmas[rows], views.rows(rows)
-        kind = BodyWindow if len(np.unique(observations.track[rows])) < len(rows) else BodyFrames
-        window = kind(*given, fitter.model, gates, motion, config.law)
+        window = BodyWindow(*given, fitter.model, gates, motion, config.law)
         free = window.energy.parameters(start.rows(rows), np.zeros((len(rows), 3)))
         try:
             state = window.solve(_filled(free, start.ok[rows], window.times_s))
-            found.put(rows, window, state)
+            marginals = window.covariances(state)
         except np.linalg.LinAlgError:
             continue
-        if not window.alone:
-            track, frames = int(observations.track[rows[0]]), observations.frame[rows]
-            people.append(BodyPerson(window, state, track, frames.astype(np.int64), rows, LASTS))
-    return found.solution(observations, views, config, enough, people)
+        frames = observations.frame[rows].astype(np.int64)
+        track = int(observations.track[rows[0]])
+        people.append(BodyPerson(window, state, track, frames, rows, LASTS, marginals))
+        found.put(people[-1])
+
+    # Uncertainty: unseen joints deviate from their bodies by more, above all those that cameras
+    # should see; cameras' poses and sides may be wrong.
+    sure = (observations.confidence >= WEAK_SCORE) & (observations.probability > WEAK_PROBABILITY)
+    strong = found.evidence.inlier & sure
+    limbs = limbs_that_hide(config.joints)
+    elsewhere = elsewhere_variance(found.joints, observations.frame, strong, views, limbs)
+    for person in people:
+        seen = np.asarray(strong[person.rows].any(axis=-1))
+        moved = np.square(SPEED_M_S * waited_s(seen, person.window.times_s))
+        person.window.widen_unseen(
+            LASTS * person.marginals.of_bodies, np.minimum(elsewhere[person.rows], moved)
+        )
+        found.covariance[person.rows] = LASTS * person.marginals.joints()
+    if views.carried is not None:
+        bodies = JointTargets(found.joints, inverses(found.fit.covariance + np.eye(3) * 1e-6))
+        found.covariance[:] += carried_covariance(found.evidence, bodies, sigmas, views, gates)
+    found.covariance[:] += mirrored_spread(found.joints, observations.mirrored, config.joints)
+    return found.solution(observations, enough, strong, people)
 
 
 @dataclass(frozen=True)
@@ -133,9 +158,9 @@ class _Found:
     fit: BodyFit
 
     @classmethod
-    def of_views(cls, evidence: ViewEvidence, most_m: float, status: Array) -> "_Found":
+    def of_views(cls, evidence: ViewEvidence, most_m: float, status: NDArray[np.str_]) -> "_Found":
         """What the views alone say of joints, where they determine them; NaN elsewhere."""
-        placed = evidence.sigma_m <= most_m
+        placed = np.asarray(evidence.sigma_m <= most_m)
         (N, J), nowhere = placed.shape, np.full((*placed.shape, 3), np.nan)
         covariance = np.full((N, J, 3, 3), np.nan)
         covariance[placed] = np.linalg.inv(evidence.information[placed])
@@ -143,43 +168,28 @@ class _Found:
         fit = BodyFit.failed(status, J)
         return cls(joints, covariance, nowhere, np.full_like(covariance, np.nan), evidence, fit)
 
-    def put(self, rows: Index, window: BodyWindow, state: BodyState) -> None:
-        """Store the solution of some `rows`; LinAlgError if its system is singular."""
-        joints, lasts = window.joints(state), 1.0 if window.alone else LASTS
-        if isinstance(window, BodyFrames):
-            of_bodies = window.body_covariances(state)
-        else:
-            marginals = window.covariances(state)
-            of_bodies = marginals.of_bodies
-            self.velocity[rows] = velocities(joints, window.times_s)
-            self.velocity_covariance[rows] = lasts * marginals.velocities()
-        window.widen_unseen(lasts * of_bodies)
-        covariance = lasts * window.of_joints(of_bodies)
-        self.joints[rows], self.covariance[rows] = joints, covariance
+    def put(self, person: BodyPerson) -> None:
+        """Store a person's solution."""
+        rows, window, state, fit = person.rows, person.window, person.state, self.fit
+        self.joints[rows] = joints = window.joints(state)
+        self.velocity[rows] = velocities(joints, window.times_s)
+        self.velocity_covariance[rows] = LASTS * person.marginals.velocities()
         self.evidence.put(rows, window.last.evidence)
-        fit, off = self.fit, np.square(state.deviation).sum(axis=-1)
         fit.put_bodies(rows, window.parameters(state), np.zeros((len(rows), 3)))
-        fit.joints[rows], fit.covariance[rows] = joints - state.deviation, covariance
-        fit.residual_m[rows] = np.sqrt(off.mean(axis=-1))
+        fit.joints[rows] = joints - state.deviation
+        fit.covariance[rows] = LASTS * person.marginals.of_bodies
+        fit.residual_m[rows] = np.sqrt(np.square(state.deviation).sum(axis=-1).mean(axis=-1))
         fit.status[rows] = FitStatus.OK
 
     def solution(
-        self,
-        rows: Observations,
-        views: Views,
-        config: EstimatorConfig,
-        enough: Mask,
-        people: Sequence[BodyPerson],
+        self, rows: Observations, enough: Mask, strong: Mask, people: Sequence[BodyPerson]
     ) -> WindowSolution:
-        """The solution with all uncertainty, codes and statuses."""
-        evidence, inlier = self.evidence, self.evidence.inlier
-        sure = (rows.confidence >= WEAK_SCORE) & (rows.probability > WEAK_PROBABILITY)
-        strong = inlier & sure
-        covariance = self.covariance + mirrored_spread(self.joints, rows.mirrored, config.joints)
-        recent = inlier.any(axis=-1)
+        """The solution, with codes and statuses."""
+        inlier = self.evidence.inlier
+        recent = np.asarray(inlier.any(axis=-1))
         for person in people:
-            mine, times_s = person.rows, person.window.times_s
-            recent[mine] = near_in_time(recent[mine], times_s, RECENT_S)
+            mine = person.rows
+            recent[mine] = near_in_time(recent[mine], person.window.times_s, RECENT_S)
         known = np.where(recent, Known.MOTION, Known.BODY)
         known = np.where(inlier.any(axis=-1), Known.WEAK, known)
         known = np.where(strong.sum(axis=-1) >= 2, Known.SEEN, known)
@@ -190,13 +200,13 @@ class _Found:
         return WindowSolution(
             observations=rows,
             joints=self.joints,
-            covariance=covariance,
+            covariance=self.covariance,
             velocity=self.velocity,
             velocity_covariance=self.velocity_covariance,
             confidence=mean_confidence(rows, inlier),
             inlier=inlier,
             contradicts=np.zeros(known.shape, dtype=bool),
-            residual_px=evidence.residual_px,
+            residual_px=self.evidence.residual_px,
             known=known.astype(np.uint8),
             fit=self.fit,
             status=np.where(self.fit.ok, status, failed),

@@ -103,7 +103,8 @@ def solve_window(
             break
     assigned = time.perf_counter()
 
-    if config.refine.with_body and fitter.model is not None and extra_factors is None:
+    over_time = len(np.unique(observations.track)) < len(observations)
+    if config.refine.with_body and over_time and fitter.model is not None and extra_factors is None:
         solution = solve_bodies(observations, views, fitter, config, motion)
         solution.seconds.update(
             {"associate again": assigned - began, "solve": time.perf_counter() - assigned}
