@@ -6,27 +6,35 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.evidence import LEAST_JOINTS
-from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, FitStatus
-from shapepose_fg.core.arrays import Array, Index, Mask
+from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, FitStatus, JointTargets
+from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.notes import Problem
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Known, Status
 from shapepose_fg.estimation.association_uncertainty import DOUBTED, mirrored_spread
 from shapepose_fg.estimation.body_step import joint_targets
-from shapepose_fg.estimation.body_window import BodyFrames, BodyState, BodyWindow
+from shapepose_fg.estimation.body_window import BodyWindow, Marginals
 from shapepose_fg.estimation.body_window_graph import BodyGraph
+from shapepose_fg.estimation.camera_pose_uncertainty import carried_covariance
 from shapepose_fg.estimation.draft import first_places
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.factor_solution import solve_with_factors
-from shapepose_fg.estimation.in_time import near_in_time, velocities
+from shapepose_fg.estimation.in_time import near_in_time, velocities, waited_s
 from shapepose_fg.estimation.linearisation import (
     ViewEvidence,
+    inverses,
     linearise,
     mean_confidence,
     observation_sigmas,
+)
+from shapepose_fg.estimation.missed_detections import (
+    SPEED_M_S,
+    elsewhere_variance,
+    limbs_that_hide,
 )
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.reported_covariance import WEAK_PROBABILITY, WEAK_SCORE
@@ -55,10 +63,7 @@ def solve_bodies(
     motion: MotionModel,
     functions: Sequence[FactorFunction] = (),
 ) -> WindowSolution:
-    """Joints, covariances and bodies of N rows: each track over its rows, or a row by itself.
-
-    `functions` make user factors; people with some are solved once more, by GTSAM.
-    """
+    """Joints, covariances and bodies of N rows: each track over its rows, or a row by itself."""
     assert fitter.model is not None
     # Gating of the initial estimate; what it rejects stays out, since bodies can be drawn to the
     # other leg's detections.
@@ -73,42 +78,48 @@ def solve_bodies(
 
     # Bodies and joints together. Rows without a body keep what their views determine.
     found = _Found.of_views(evidence, config.refine.max_sigma_m, start.status)
-    people = list[BodyGraph]()
-    tracks = [rows for rows in window_rows(observations) if start.ok[rows].any()]
-    alone = [rows for rows in tracks if len(rows) == 1]
-    over_time = [rows for rows in tracks if len(rows) > 1]
-    for rows in [*over_time, np.concatenate(alone)] if alone else over_time:
+    people, spread = list[BodyGraph](), list[Marginals]()
+    for rows in window_rows(observations):
+        if not start.ok[rows].any():
+            continue
         given = observations.rows(rows), sigmas[rows], views.rows(rows)
-        kind = BodyWindow if len(np.unique(observations.track[rows])) < len(rows) else BodyFrames
-        window = kind(*given, fitter.model, gates, motion, config.law)
+        window = BodyWindow(*given, fitter.model, gates, motion, config.law)
         free = window.energy.parameters(start.rows(rows), np.zeros((len(rows), 3)))
         try:
             state = window.solve(_filled(free, start.ok[rows], window.times_s))
-            found.put(rows, window, state)
+            marginals = window.covariances(state)
         except np.linalg.LinAlgError:
             continue
-        people += _people(window, state, rows)
+        frames = observations.frame[rows].astype(np.int64)
+        track = int(observations.track[rows[0]])
+        people.append(BodyGraph(window, state, track, frames, LASTS, rows))
+        spread.append(marginals)
+        found.put(people[-1], marginals)
 
-    # User factors.
+    # Uncertainty: unseen joints deviate from their bodies by more, above all those that cameras
+    # should see; cameras' poses and sides may be wrong.
+    sure = (observations.confidence >= WEAK_SCORE) & (observations.probability > WEAK_PROBABILITY)
+    strong = found.evidence.inlier & sure
+    limbs = limbs_that_hide(config.joints)
+    elsewhere = elsewhere_variance(found.joints, observations.frame, strong, views, limbs)
+    for person, marginals in zip(people, spread, strict=True):
+        seen = np.asarray(strong[person.rows].any(axis=-1))
+        moved = np.square(SPEED_M_S * waited_s(seen, person.times_s))
+        moved = np.minimum(elsewhere[person.rows], moved)
+        person.window.widen_unseen(LASTS * marginals.of_bodies, moved)
+        found.covariance[person.rows] = LASTS * marginals.joints()
+
+    # User factors: people who have some are solved once more.
     if len(functions) > 0:
         add_factors(people, functions)
         for each in solve_with_factors(people, config.graph):
-            person, covariances = each.person, (each.covariance, each.velocity_covariance)
-            found.put(person.rows, person.window, person.state, covariances)
-    return found.solution(observations, views, config, enough, people)
-
-
-def _people(window: BodyWindow, state: BodyState, rows: Index) -> list[BodyGraph]:
-    """The graphs of a solved window: one person's, or that of each single frame."""
-    tracks, frames = window.observations.track, window.observations.frame.astype(np.int64)
-    if not isinstance(window, BodyFrames):
-        return [BodyGraph(window, state, int(tracks[0]), frames, LASTS, rows)]
-    found = list[BodyGraph]()
-    for n in np.arange(len(rows))[:, None]:
-        part = window.rows(n)
-        part.last = window.last.rows(n)
-        found.append(BodyGraph(part, state.rows(n), int(tracks[n[0]]), frames[n], 1.0, rows[n]))
-    return found
+            found.put(each.person, each.marginals)
+            found.covariance[each.person.rows] = each.covariance
+    if views.carried is not None:
+        bodies = JointTargets(found.joints, inverses(found.fit.covariance + np.eye(3) * 1e-6))
+        found.covariance[:] += carried_covariance(found.evidence, bodies, sigmas, views, gates)
+    found.covariance[:] += mirrored_spread(found.joints, observations.mirrored, config.joints)
+    return found.solution(observations, enough, strong, people)
 
 
 @dataclass(frozen=True)
@@ -123,9 +134,9 @@ class _Found:
     fit: BodyFit
 
     @classmethod
-    def of_views(cls, evidence: ViewEvidence, most_m: float, status: Array) -> "_Found":
+    def of_views(cls, evidence: ViewEvidence, most_m: float, status: NDArray[np.str_]) -> "_Found":
         """What the views alone say of joints, where they determine them; NaN elsewhere."""
-        placed = evidence.sigma_m <= most_m
+        placed = np.asarray(evidence.sigma_m <= most_m)
         (N, J), nowhere = placed.shape, np.full((*placed.shape, 3), np.nan)
         covariance = np.full((N, J, 3, 3), np.nan)
         covariance[placed] = np.linalg.inv(evidence.information[placed])
@@ -133,46 +144,28 @@ class _Found:
         fit = BodyFit.failed(status, J)
         return cls(joints, covariance, nowhere, np.full_like(covariance, np.nan), evidence, fit)
 
-    def put(
-        self,
-        rows: Index,
-        window: BodyWindow,
-        state: BodyState,
-        covariances: tuple[Array, Array] | None = None,
-    ) -> None:
-        """Store the solution of some `rows`; LinAlgError if its system is singular. `covariances`
-        of positions and velocities, where they are not those of the window alone.
-        """
-        joints = window.joints(state)
-        covariance, of_velocity = covariances or _covariances(window, state)
-        if not window.alone:
-            self.velocity[rows] = velocities(joints, window.times_s)
-            self.velocity_covariance[rows] = of_velocity
-        self.joints[rows], self.covariance[rows] = joints, covariance
+    def put(self, person: BodyGraph, marginals: Marginals) -> None:
+        """Store a person's solution."""
+        rows, window, state, fit = person.rows, person.window, person.state, self.fit
+        self.joints[rows] = joints = window.joints(state)
+        self.velocity[rows] = velocities(joints, window.times_s)
+        self.velocity_covariance[rows] = LASTS * marginals.velocities()
         self.evidence.put(rows, window.last.evidence)
-        fit, off = self.fit, np.square(state.deviation).sum(axis=-1)
         fit.put_bodies(rows, window.parameters(state), np.zeros((len(rows), 3)))
-        fit.joints[rows], fit.covariance[rows] = joints - state.deviation, covariance
-        fit.residual_m[rows] = np.sqrt(off.mean(axis=-1))
+        fit.joints[rows] = joints - state.deviation
+        fit.covariance[rows] = LASTS * marginals.of_bodies
+        fit.residual_m[rows] = np.sqrt(np.square(state.deviation).sum(axis=-1).mean(axis=-1))
         fit.status[rows] = FitStatus.OK
 
     def solution(
-        self,
-        rows: Observations,
-        views: Views,
-        config: EstimatorConfig,
-        enough: Mask,
-        people: Sequence[BodyGraph],
+        self, rows: Observations, enough: Mask, strong: Mask, people: Sequence[BodyGraph]
     ) -> WindowSolution:
-        """The solution with all uncertainty, codes and statuses."""
-        evidence, inlier = self.evidence, self.evidence.inlier
-        sure = (rows.confidence >= WEAK_SCORE) & (rows.probability > WEAK_PROBABILITY)
-        strong = inlier & sure
-        covariance = self.covariance + mirrored_spread(self.joints, rows.mirrored, config.joints)
-        recent = inlier.any(axis=-1)
+        """The solution, with codes and statuses."""
+        inlier = self.evidence.inlier
+        recent = np.asarray(inlier.any(axis=-1))
         for person in people:
-            mine, times_s = person.rows, person.times_s
-            recent[mine] = near_in_time(recent[mine], times_s, RECENT_S)
+            mine = person.rows
+            recent[mine] = near_in_time(recent[mine], person.times_s, RECENT_S)
         known = np.where(recent, Known.MOTION, Known.BODY)
         known = np.where(inlier.any(axis=-1), Known.WEAK, known)
         known = np.where(strong.sum(axis=-1) >= 2, Known.SEEN, known)
@@ -191,13 +184,13 @@ class _Found:
         return WindowSolution(
             observations=rows,
             joints=self.joints,
-            covariance=covariance,
+            covariance=self.covariance,
             velocity=self.velocity,
             velocity_covariance=self.velocity_covariance,
             confidence=mean_confidence(rows, inlier),
             inlier=inlier,
             contradicts=np.zeros(known.shape, dtype=bool),
-            residual_px=evidence.residual_px,
+            residual_px=self.evidence.residual_px,
             known=known.astype(np.uint8),
             fit=self.fit,
             status=status,
@@ -207,7 +200,7 @@ class _Found:
                     PersonGraph(
                         window=each,
                         joints=self.joints[each.rows],
-                        covariance=covariance[each.rows],
+                        covariance=self.covariance[each.rows],
                         bodies=self.fit.rows(each.rows),
                     )
                     for each in people
@@ -215,17 +208,6 @@ class _Found:
             ),
             factors=factors_of(people),
         )
-
-
-def _covariances(window: BodyWindow, state: BodyState) -> tuple[Array, Array]:
-    """Covariances of a window's positions, m², and velocities, m²/s², (T, J, 3, 3)."""
-    if isinstance(window, BodyFrames):
-        of_bodies = window.body_covariances(state)
-        window.widen_unseen(of_bodies)
-        return window.of_joints(of_bodies), np.empty(0)
-    marginals = window.covariances(state)
-    window.widen_unseen(LASTS * marginals.of_bodies)
-    return LASTS * marginals.joints(), LASTS * marginals.velocities()
 
 
 def _filled(free: Array, ok: Mask, times_s: Array) -> Array:

@@ -9,7 +9,6 @@ threshold. Joints X are eliminated from every step in closed form: three unknown
 their body is connected to.
 """
 
-from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -20,16 +19,13 @@ from factors import DEFAULT_WIDTH_SIGMA, Motion
 from shapepose_fg.body.fitting.chains import Links
 from shapepose_fg.body.fitting.energy import BodyEnergy, EnergyTargets, Held, nothing
 from shapepose_fg.body.fitting.priors import MotionPrior, PosePrior
-from shapepose_fg.body.kernels.solving import eliminated, known, put_back, solved
+from shapepose_fg.body.kernels.solving import eliminated, put_back
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
-from shapepose_fg.body.model.keypoint_offsets import RIDES_ON
 from shapepose_fg.body.model.rotation import exp_so3, log_so3
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
-from shapepose_fg.core.rows import Rows
-from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.estimation.asynchronous_views import carried_to_frames, velocities_of
+from shapepose_fg.estimation.asynchronous_views import carried_to_frames, leads, velocities_of
 from shapepose_fg.estimation.in_time import motion_of
 from shapepose_fg.estimation.linearisation import (
     ObservationConfig,
@@ -58,11 +54,11 @@ _DAMPING = 1e-3
 
 
 @dataclass(frozen=True)
-class BodyState(Rows):
+class BodyState:
     """The variables of a window."""
 
     betas: Array
-    """(10,) shape, or (T, 10) one for each row of different people."""
+    """(10,) shape."""
     root: Array
     """(T, 3, 3) rotation of the root."""
     others: Array
@@ -87,14 +83,11 @@ class BodyState(Rows):
 
 
 @dataclass(frozen=True)
-class _Around(Rows):
+class _Around:
     """What the model says around a state."""
 
-    cost: Array
-    """(T,) E of each row, without the priors on motion and a common shape, in squared standard
-    deviations."""
-    motion: float
-    """E of the motion and the common shape, likewise."""
+    cost: float
+    """E, in squared standard deviations."""
     system: Array
     """(T, M, P) normal equations of each row, joints eliminated (`body/kernels/solving.py`)."""
     pull: Array
@@ -103,8 +96,6 @@ class _Around(Rows):
     """(T, J, 3) joints of the body, metres around the origin."""
     evidence: ViewEvidence
     """What the views say around the joints X."""
-    weighed: Array
-    """(T, J, 3, 3) information of the views about the body's joints, 1/m²."""
     gain: Array
     """(T, J, 3, 3) (1 + s² L)^-1 s² L: what share of the way from the body's joint to the views' X
     goes."""
@@ -115,9 +106,6 @@ class _Around(Rows):
 
 class BodyWindow:
     """The model of one person in T frames; T = 1 is a frame by itself, without motion."""
-
-    alone = False
-    """Whether each row has a shape of its own (`BodyFrames`)."""
 
     def __init__(
         self,
@@ -142,17 +130,16 @@ class BodyWindow:
         )
         self.times_s = observations.time_s.mean(axis=1)
         steps = np.diff(self.times_s)
-        over_time = len(steps) > 0 and not self.alone
-        share = min(1.0, float(np.median(steps)) / POSE_LASTS_S) if over_time else 1.0
-        self.share = share
+        share = min(1.0, float(np.median(steps)) / POSE_LASTS_S) if len(steps) > 0 else 1.0
         self.energy = BodyEnergy(model, PosePrior.default().widened(share**-0.5))
         self.variance = np.full(self.sigmas_px.shape[:2], deviation_m**2)
         self.origin = np.zeros(3)
         self._motion, self._law, self._kernel = motion, law, config.robust_kernel
         self._held = self.energy.held_by_priors(len(self.times_s))
-        if not self.alone:  # The betas have their prior once, not in every row.
-            self._held = Held(self._held.betas, np.zeros(len(self.times_s)), self._held.angles)
+        # The betas have their prior once, not in every row.
+        self._held = Held(self._held.betas, np.zeros(len(self.times_s)), self._held.angles)
         self.links: Links | None = None
+        self._asynchronous = bool(leads(observations, views).any())
 
     def __len__(self) -> int:
         return len(self.times_s)
@@ -173,7 +160,6 @@ class BodyWindow:
         if self.links is None and len(self) > 1:
             self.links = self._linked(bodies)
         here, damping, done = self.around(state, bodies), _DAMPING, False
-        cost = here.cost.sum() + here.motion
         for _ in range(_STEPS):
             if done:
                 break
@@ -182,9 +168,7 @@ class BodyWindow:
             bodies = self._bodies(there)
             there = replace(there, deviation=self._deviation(here, bodies))
             new = self.around(there, bodies)
-            least, cost = cost, new.cost.sum() + new.motion
-            if not cost <= least + 1e-3 * abs(least):
-                cost = least
+            if not new.cost <= here.cost + 1e-3 * abs(here.cost):
                 damping = max(10 * damping, 1e-2)
                 if damping > 1e3:
                     break
@@ -201,24 +185,6 @@ class BodyWindow:
         self.last = here
         return state
 
-    def offsets(self, state: BodyState, sigma_m: float) -> Array:
-        """(J, 3) by how much the person's joints lie elsewhere than the body's all the time, in the
-        bones' frames, metres, where such offsets are N(0, sigma_m²): people are not the body model,
-        nor are their clothes.
-        """
-        here, names = self.last, self.energy.model.keypoint_names
-        bones = np.array(
-            [RIDES_ON[BODY_25.joints.index(n)] if n in BODY_25.joints else 0 for n in names]
-        )
-        turn = self.energy.model.bone_rotations(self.energy.complete(state.free))[:, bones]
-        weighed = here.gain / self.variance[..., None, None] * self.share
-        inside = turn.mT @ weighed @ turn
-        away = np.where(here.gain.any(axis=(-1, -2))[..., None], here.target - here.bodies, 0.0)
-        pull = (turn.mT @ (weighed @ away[..., None]))[..., 0]
-        return np.linalg.solve(
-            inside.sum(axis=0) + np.eye(3) / sigma_m**2, pull.sum(axis=0)[..., None]
-        )[..., 0]
-
     def joints(self, state: BodyState) -> Array:
         """(T, J, 3) X, metres in the world."""
         return self._bodies(state) + state.deviation + self.origin
@@ -228,14 +194,17 @@ class BodyWindow:
         body = self.energy.complete(state.free)
         return replace(body, transl=body.transl + self.origin.reshape(-1, 3))
 
-    def widen_unseen(self, of_bodies: Array) -> None:
-        """Widen the deviation of joints without a used detection, for covariances (T, J, 3, 3) of
-        the bodies' joints. It changes no other joint, and no solution.
+    def widen_unseen(self, of_bodies: Array, elsewhere: Array) -> None:
+        """Widen the deviation of joints without a used detection. No solution changes, and no other
+        joint.
+
+        `of_bodies` (T, J, 3, 3) are the covariances of the bodies' joints, and `elsewhere` (T, J)
+        the variance along an axis of joints that cameras should see but do not, m².
         """
         variance = np.trace(of_bodies, axis1=-2, axis2=-1) / 3
         unseen = ~self.last.evidence.inlier.any(axis=-1)
-        wider = variance * np.sqrt(variance) / _STRAYS_M
-        self.variance = np.where(unseen, np.maximum(self.variance, wider), self.variance)
+        wider = self.variance + variance * np.sqrt(variance) / _STRAYS_M + elsewhere
+        self.variance = np.where(unseen, wider, self.variance)
 
     def of_joints(self, of_body: Array) -> Array:
         """(T, J, 3, 3) covariances of X for those of the body's joints, m², around the last
@@ -248,7 +217,7 @@ class BodyWindow:
     def carried(self, X: Array) -> Observations:
         """The detections as if all cameras exposed at the frames' times, for joints X (T, J, 3)."""
         observed = self.observations
-        if observed.time_s.shape[1] > 1 and np.ptp(observed.time_s, axis=1).max() > 0:
+        if self._asynchronous:
             observed = carried_to_frames(observed, X, velocities_of(observed, X), self.views)
         return observed
 
@@ -272,16 +241,12 @@ class BodyWindow:
         cost += np.einsum(
             "ti,ij,tj->t", angles, self.energy.priors.precision, angles, optimize=True
         )
-        motion = float(np.square(state.betas).sum())
+        cost = float(cost.sum() + np.square(state.betas).sum())
         pull = np.zeros((len(self), self.energy.num_free - 10))
-        if self.alone:
-            cost, motion = cost + np.square(state.betas).sum(axis=-1), 0.0
         if self.links is not None:
             moved, pull = self._moved(state)
-            motion += moved
-        return _Around(
-            cost, motion, linear.system, pull, bodies, evidence, weighed, variance * weighed, target
-        )
+            cost += moved
+        return _Around(cost, linear.system, pull, bodies, evidence, variance * weighed, target)
 
     def _seen_cost(self, evidence: ViewEvidence) -> Array:
         """(T,) robust cost of the detections; a rejected one costs as much as at its gate."""
@@ -305,7 +270,8 @@ class BodyWindow:
 
     def _deviation(self, here: _Around, bodies: Array) -> Array:
         """X - J that is best for bodies that have moved."""
-        away = np.where(here.gain.any(axis=(-1, -2))[..., None], here.target - bodies, 0.0)
+        seen = np.asarray(here.gain.any(axis=(-1, -2)))
+        away = np.where(seen[..., None], here.target - bodies, 0.0)
         return (here.gain @ away[..., None])[..., 0]
 
     def _linked(self, bodies: Array) -> Links:
@@ -403,64 +369,6 @@ class BodyWindow:
         return Marginals(
             self, state, poses + arrow @ shape @ arrow.mT, steps, shape, -arrow @ shape
         )
-
-
-class BodyFrames(BodyWindow):
-    """The model of people in single frames: T independent rows, solved together for speed."""
-
-    alone = True
-
-    def rows(self, index: Index) -> "BodyFrames":
-        """The model of some rows."""
-        part = copy(self)
-        part.observations, part.views = self.observations.rows(index), self.views.rows(index)
-        for name in ("sigmas_px", "times_s", "variance", "origin"):
-            setattr(part, name, getattr(self, name)[index])
-        part._held = self._held.rows(index)
-        return part
-
-    def solve(self, start: Array) -> BodyState:
-        """The states of least cost, from bodies (T, P) in the world on."""
-        self.origin = start[:, None, -3:]
-        free = start.copy()
-        free[:, -3:] = 0.0
-        zero = np.zeros((*self.sigmas_px.shape[:2], 3))
-        state = BodyState(free[:, :10], exp_so3(free[:, 10:13]), free[:, 13:], zero)
-        damping, left = np.full(len(free), _DAMPING), np.arange(len(free))
-        here = self.around(state, self._bodies(state))
-        for _ in range(_STEPS):
-            if len(left) == 0:
-                break
-            part, at, now = self.rows(left), state.rows(left), here.rows(left)
-            step, promised = np.empty((len(left), self.energy.num_free)), np.empty(len(left))
-            solved(now.system, damping[left], step, promised)
-            step[:, 10:13] = (at.root @ step[:, 10:13, None])[..., 0]
-            there = at.moved(step[:, :10], step[:, 10:])
-            bodies = part._bodies(there)
-            there = replace(there, deviation=part._deviation(now, bodies))
-            new = part.around(there, bodies)
-            better = new.cost <= now.cost + 1e-3 * np.abs(now.cost)
-            moved = bodies + there.deviation - now.bodies - at.deviation
-            small = np.linalg.norm(moved, axis=-1).mean(axis=-1) < _SETTLED_M
-            taken = left[better]
-            state.put(taken, there.rows(better))
-            here.put(taken, new.rows(better))
-            damping[taken] = np.maximum(damping[taken] / 5, 1e-6)
-            worse = left[~better]
-            damping[worse] = np.maximum(10 * damping[worse], 1e-2)
-            left = left[~(better & small) & (damping[left] <= 1e3)]
-        self.last = here
-        return state
-
-    def body_covariances(self, state: BodyState) -> Array:
-        """(T, J, 3, 3) covariances of the bodies' joints, m², around the last solution."""
-        targets = EnergyTargets(self.last.target, self.last.weighed)
-        system = self.energy.linearise(state.free, targets, 1e9, self._held).system
-        count, unused = len(self), np.empty((len(self), system.shape[2]))
-        solved(system, np.zeros(count), unused, np.empty(count))
-        found = np.zeros((*self.last.target.shape, 3))
-        known(system, found, np.zeros((count, 10, 10)))
-        return found
 
 
 @dataclass(frozen=True)

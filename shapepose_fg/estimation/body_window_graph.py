@@ -130,26 +130,22 @@ class BodyGraph(PersonWindow):
         self.window.last = self.window.around(self.state, of_body)
         return float(np.linalg.norm(joints - before, axis=-1).mean())
 
-    def covariances(self, every: dict[tuple[int, int], Array]) -> tuple[Array, Array]:
-        """(T, J, 3, 3) covariances of positions, m², and of velocities, m²/s², from those of every
-        variable (`graph_covariances`) of a graph around the state.
+    def marginals(self, every: dict[tuple[int, int], Array]) -> Marginals:
+        """Marginals of the model from the covariances of every variable (`graph_covariances`) of a
+        graph around the state, such as one with user factors.
         """
-        positions = np.array([[every[key, key] for key in row] for row in self.keys.tolist()])
-        if not self.temporal:
-            return positions, np.full_like(positions, np.nan)
         keys, turns = self.body_keys.tolist(), self.turns()
-        poses = np.array([every[key, key] for key in keys])
+        poses = np.array([every[key, key] for key in keys]) / self.widen
+        across = np.array([every[key, self.shape_key] for key in keys]) / self.widen
         steps = np.zeros_like(poses)
-        steps[:-1] = [every[after, key] for key, after in pairwise(keys)]
-        for part, rows in ((poses, turns), (steps[:-1], turns[1:])):
+        for t, (key, after) in enumerate(pairwise(keys)):
+            steps[t] = every[after, key] / self.widen
+        for part, rows in ((poses, turns), (across, turns), (steps[:-1], turns[1:])):
             part[:, :3] = rows @ part[:, :3]
-            part[..., :3] = part[..., :3] @ turns[: len(part)].mT
-        none = np.empty(0)
-        velocities = Marginals(self.window, self.state, poses, steps, none, none).velocities()
-        for t, joint in np.ndindex(self.keys.shape):
-            key = int(self.velocity_keys[t, joint])
-            velocities[t, joint] = every.get((key, key), velocities[t, joint])
-        return positions, velocities
+        for part in (poses, steps):
+            part[..., :3] = part[..., :3] @ turns.mT
+        shape = every[self.shape_key, self.shape_key] / self.widen
+        return Marginals(self.window, self.state, poses, steps, shape, across)
 
     def _bodies(self) -> Array:
         """(T, N) values of the bodies."""

@@ -7,6 +7,7 @@ import gtsam
 import numpy as np
 
 from shapepose_fg.core.arrays import Array
+from shapepose_fg.estimation.body_window import Marginals
 from shapepose_fg.estimation.body_window_graph import BodyGraph, ordering
 from shapepose_fg.estimation.estimator_config import WindowGraphConfig
 from shapepose_fg.estimation.graph_covariances import graph_covariances
@@ -28,9 +29,9 @@ class FactorSolution:
     person: BodyGraph
     """The person, whose state and graph are those of the solution."""
     covariance: Array
-    """(T, J, 3, 3) of the joints, m²."""
-    velocity_covariance: Array
-    """(T, J, 3, 3), m²/s²."""
+    """(T, J, 3, 3) of the joints in the graph, m²."""
+    marginals: Marginals
+    """Those of the model."""
 
 
 def solve_with_factors(
@@ -78,7 +79,14 @@ def _solved(
         return []
     for each in people:
         each.set_graph(graph, values)
-    return [FactorSolution(each, *each.covariances(every)) for each in people]
+    return [
+        FactorSolution(
+            each,
+            np.array([[every[key, key] for key in row] for row in each.keys.tolist()]),
+            each.marginals(every),
+        )
+        for each in people
+    ]
 
 
 def _joined(
