@@ -347,7 +347,8 @@ def _factor(record: Any) -> gtsam.NonlinearFactor:
     """Make a factor from its record; ValueError, KeyError or TypeError if the record is invalid."""
     kind, keys = _KINDS.get(record["kind"]), [_key(key) for key in record["keys"]]
     if record["kind"] == _LINEAR:
-        return _linear(keys, *record["data"], record.get("sizes", [3] * len(keys)))
+        A, b = record["data"]
+        return _linear(keys, A, b, record.get("sizes", [3] * len(keys)))
     if kind is None:
         raise ValueError(
             f"kind must be one of {', '.join(_KINDS)}, {_LINEAR}, got {str(record['kind'])[:40]!r}"

@@ -157,7 +157,8 @@ class BodyGraph(PersonWindow):
         """(T, 3, 3) how the root turns, in tangents of the world, where a body's first numbers
         change.
         """
-        return np.linalg.inv(right_jacobian_inverse(-self._bodies()[:, :3]))
+        found = np.linalg.inv(right_jacobian_inverse(-self._bodies()[:, :3]))
+        return np.asarray(found, dtype=np.float64)
 
     def order(self) -> Iterator[tuple[int, int, int]]:
         """Rank, within its frame, and frame of each variable, for elimination without much
