@@ -74,7 +74,9 @@ def solve_bodies(
     evidence = linearise(observations, sigmas, X, views, gates)
     enough = (evidence.sigma_m <= config.refine.max_sigma_m).sum(axis=1) >= LEAST_JOINTS
     start = fitter.fit_whole(joint_targets(evidence, enough))
-    sigmas = np.where(evidence.inlier, sigmas, 0.0)
+    # Where it rejects some detections of a joint, the others are less certain, too.
+    kept = evidence.inlier.sum(axis=-1) / np.maximum(observations.seen.sum(axis=-1), 1)
+    sigmas = np.where(evidence.inlier, sigmas / np.maximum(kept, 1e-9)[..., None], 0.0)
 
     # Bodies and joints together. Rows without a body keep what their views determine.
     found = _Found.of_views(evidence, config.refine.max_sigma_m, start.status)
