@@ -33,6 +33,10 @@ from shapepose_fg.pipeline.solve_window import solve_window
 from shapepose_fg.pipeline.windows import near_border, window_stop
 
 
+_OUTSIDE_PX = 1e6
+"""Coordinate of a detection that the result did not use, outside of all gates, px."""
+
+
 @dataclass(frozen=True)
 class Solver:
     """The data for solving rows of a result again."""
@@ -178,8 +182,8 @@ def _solved(
         start = part.joints if again else np.full_like(part.joints, np.nan)
         observations = part.observations.observations(start, part.time_s)
         if again and extra_factors is None:
-            used = np.where(part.observations.used, observations.confidence, 0.0)
-            observations = replace(observations, confidence=used)
+            used = part.observations.used[..., None] | ~observations.seen[..., None]
+            observations = replace(observations, xy=np.where(used, observations.xy, _OUTSIDE_PX))
         views = Views.of(rig, observations.time_s)
         found = solve_window(
             observations, views, solver.fitter, settings, extra_factors=extra_factors
