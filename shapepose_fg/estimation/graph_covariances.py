@@ -2,7 +2,6 @@
 
 import gtsam
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from shapepose_fg.core.arrays import Array
 
@@ -22,7 +21,7 @@ def graph_covariances(
         conditional = net.at(n)
         key, *others = conditional.keys()
         R = np.asarray(conditional.R())
-        inverse = solve_triangular(R, np.eye(len(R)), check_finite=False)
+        inverse = np.linalg.inv(R)
         own = inverse @ inverse.T
         if others:
             if others != last:
