@@ -13,7 +13,6 @@ from factors import (
     DEFAULT_WIDTH_SIGMA,
     body_keys,
     linear_factor,
-    make_camera,
     projection_factors,
     robust_kernel,
     shape_factors,
@@ -24,11 +23,11 @@ from factors.body_shape import pose_factors
 from factors.keys import MAX_FRAME
 from shapepose_fg.body.model.rotation import exp_so3, log_so3, right_jacobian_inverse
 from shapepose_fg.core.arrays import Array, Index, Mask
-from shapepose_fg.core.camera import Views
 from shapepose_fg.estimation.body_window import BodyState, BodyWindow, Marginals
 from shapepose_fg.estimation.graph_covariances import graph_covariances
 from shapepose_fg.estimation.in_time import moments
 from shapepose_fg.estimation.user_factors import PersonWindow
+from shapepose_fg.estimation.window_graph import cameras_of
 
 _DEFINED_M_S = 1e-3
 """Standard deviation with which a velocity is that of its joint's positions, m/s: it is a
@@ -196,7 +195,7 @@ class BodyGraph(PersonWindow):
         kernel, views = window.config.robust_kernel, window.views
         width = None if kernel is None else DEFAULT_WIDTH_SIGMA[kernel] / scale
         return projection_factors(
-            _cameras(views), view if views.rows_known is None else frame * len(views) + view,
+            cameras_of(views), view if views.rows_known is None else frame * len(views) + view,
             self.keys[frame, joint], xy[chosen], scale * window.sigmas_px[chosen],
             robust_kernel(kernel, width),
         )  # fmt: skip
@@ -239,12 +238,3 @@ def ordering(people: Sequence[BodyGraph], values: gtsam.Values) -> gtsam.Orderin
         last = max((frame_of.get(other, -1) for keys in factors for other in keys), default=-1)
         ranks.append((last if last >= 0 else MAX_FRAME, 3, key))
     return gtsam.Ordering([*(key for _, _, key in sorted(ranks)), *shapes])
-
-
-def _cameras(views: Views) -> list[gtsam.PinholeCameraCal3_S2]:
-    """GTSAM's cameras: V of them, or T V where they move, row by row."""
-    last = np.broadcast_to([0.0, 0.0, 0.0, 1.0], (*views.cTw.shape[:-2], 1, 4))
-    wTc = np.linalg.inv(np.concatenate([views.cTw, last], axis=-2))
-    shape = np.broadcast_shapes(views.K.shape[:-2], wTc.shape[:-2])
-    K, wTc = np.broadcast_to(views.K, (*shape, 3, 3)), np.broadcast_to(wTc, (*shape, 4, 4))
-    return list(map(make_camera, K.reshape(-1, 3, 3), wTc.reshape(-1, 4, 4)))

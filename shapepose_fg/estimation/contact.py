@@ -1,16 +1,11 @@
-"""Standing feet: their probability from speeds over a window, and the constraint on their next
-step.
-"""
+"""Standing feet: their probability from speeds over a window, and how far their next step goes."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
-from shapepose_fg.core.arrays import Array, Index, Mask
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.decompositions import principal_axes
-from shapepose_fg.estimation.in_time import near_in_time
-from shapepose_fg.estimation.joint_chains import Problem
 
 FEET = ("Ankle", "Heel", "BigToe", "SmallToe")
 """Joints that may stand, independently on either side: toes stand while the heel rises."""
@@ -31,8 +26,6 @@ LOOK_S = 0.05
 """Frames within this time count as one observation of the speed. Errors of velocities are
 correlated for longer, but their covariances are too wide. Among 0.03, 0.05 and 0.1 s this has the
 least error over all speeds in simulated recordings of 4 and 6 cameras (crowd 777, salsa 31)."""
-UNSEEN_S = 0.5
-"""Time before and after a joint is seen for which its speed is taken from the body, seconds."""
 FREE_M2_S = 0.02
 """Density above which a step is unconstrained: at 30 frames a second it corresponds to 2.6 cm,
 where the motion model is stronger."""
@@ -43,28 +36,6 @@ def feet_of(joints: Sequence[str]) -> Index:
     return np.array(
         [n for n, name in enumerate(joints) if name[:1] in "RL" and name[1:] in FEET], dtype=np.intp
     )
-
-
-def walking(problem: Problem, feet: Index, initial: Array, lost: Mask | None) -> Problem:
-    """Return the problem with constraints on standing `feet` (F,); arguments are those of
-    `WindowGraph.solve`.
-
-    The feet are first solved independently, without these constraints.
-    """
-    standing = problem.standing.copy()
-    for chains in problem.chains(feet.tolist()):
-        joints, states, at = chains.joints, chains.solved(initial), initial.copy()
-        at[:, joints], velocity = states[..., :3].swapaxes(0, 1), states[..., 3:6].swapaxes(0, 1)
-        if lost is not None:
-            # A standing guess of the body is not evidence, except for a short time.
-            velocity = np.where(
-                near_in_time(~lost[:, joints], problem.times_s, UNSEEN_S)[..., None],
-                velocity,
-                np.nan,
-            )
-        density = standing_density(velocity, chains.covariances(at)[1], problem.times_s)
-        standing[:, joints] = np.where(density > FREE_M2_S, np.inf, density)
-    return replace(problem, standing=standing)
 
 
 def standing_density(velocity: Array, covariance: Array, times_s: Array) -> Array:

@@ -48,10 +48,6 @@ class RefineConfig(Settings):
 
     alternations: Repeats = 3
     """N of Algorithm 1: maximum number of body fits and joint solutions."""
-    window_alternations: Repeats = 1
-    """N of Algorithm 1 for windows of several frames, which start from initial estimates of all
-    joints (`draft`). Windows with user factors alternate as often as single frames, because these
-    factors may move joints far from the views' estimates."""
     settled_m: MetresOrNone = 0.002
     """Maximum motion of joints per round in a converged window, m: most frames take one or two
     rounds. 0: never."""

@@ -96,11 +96,6 @@ def near_in_time(marked: Mask, times_s: Array, within_s: float) -> Mask:
     return count[last] > count[first]
 
 
-def spanned(marked: Mask) -> Mask:
-    """(T, J) frames from the first to the last that is `marked` (T, J), inclusive."""
-    return np.maximum.accumulate(marked, axis=0) & np.maximum.accumulate(marked[::-1], axis=0)[::-1]
-
-
 def waited_s(seen: Mask, times_s: Array) -> Array:
     """(T, J) time to the nearest frame in which a joint is `seen` (T, J), seconds; infinite if
     never.
@@ -118,19 +113,6 @@ def carried(values: Array, seen: Mask, times_s: Array) -> Array:
         frames = np.flatnonzero(seen[:, joint])
         nearest = frames[np.abs(times_s[:, None] - times_s[frames]).argmin(axis=1)]
         result[:, joint] = values[nearest, joint]
-    return result
-
-
-def interpolated(points: Array, times_s: Array) -> Array:
-    """Points (T, J, 3) with linearly interpolated gaps and constant ends; joints that are never
-    known stay NaN.
-    """
-    known = np.asarray(np.isfinite(points).all(axis=2))
-    result = points.copy()
-    for joint in np.flatnonzero(known.any(axis=0) & ~known.all(axis=0)).tolist():
-        there = known[:, joint]
-        for axis in range(3):
-            result[:, joint, axis] = np.interp(times_s, times_s[there], points[there, joint, axis])
     return result
 
 

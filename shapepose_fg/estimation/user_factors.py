@@ -160,11 +160,6 @@ class PersonWindow:
         self.set_graph(gtsam.NonlinearFactorGraph(), gtsam.Values())
         return self
 
-    @property
-    def states(self) -> NDArray[np.int64]:
-        """(T, J, n) keys of all variables of a joint in a frame."""
-        return self.state_keys
-
     def of_body(self, t: int, joint: int) -> Array:
         """(3, 3) information on a joint in row `t` from its body in the same frame, without the
         joint's own views, 1/m².

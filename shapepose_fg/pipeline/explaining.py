@@ -18,8 +18,7 @@ from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Known, Reconstruction, sigma_m
 from shapepose_fg.estimation.factor_shares import FactorEvidence, factor_evidence
-from shapepose_fg.estimation.linearisation import inverses, observation_sigmas, weakest_sigma
-from shapepose_fg.estimation.motion_model import LOST_M
+from shapepose_fg.estimation.linearisation import inverses, observation_sigmas
 from shapepose_fg.estimation.user_factors import ExtraFactors, functions_of, name_of
 from shapepose_fg.estimation.window_solution import PersonGraph
 from shapepose_fg.estimation.wrong_views import Seen, WrongView, wrong_view
@@ -301,7 +300,7 @@ def _view_reasons(
     sigma, seen = all_of_it.seen.sigmas_px[row, joint], gates != Gate.NOT_SEEN
     place, evidence = people.joints[row, joint], list[FactorEvidence]()
     solved = [] if graph is None else np.flatnonzero(graph.frames == people.frame[row]).tolist()
-    known = None if graph is None or not solved else graph.sources(solved[0], joint, seen_well=True)
+    known = None if graph is None or not solved else graph.sources(solved[0], joint)
     if graph is not None and known is not None:
         place, evidence = known.place, factor_evidence(graph.window, solved[0], joint)
     xy, _, slope = (each[0, 0] for each in rows.project(place[None, None]))
@@ -318,11 +317,8 @@ def _view_reasons(
             weight * slope[v].T @ slope[v],
             weight * slope[v].T @ residual[v],
         )
-    seen_well = bool(weakest_sigma(information.sum(axis=0)) <= LOST_M)
     whole, of_body = information.sum(axis=0) + np.eye(3), np.zeros((3, 3))
-    if graph is not None and known is not None:
-        known = graph.sources(solved[0], joint, seen_well=seen_well)
-        assert known is not None
+    if known is not None:
         whole, of_body = known.whole, known.of_body
         information, gradient = information / known.widen, gradient / known.widen
     of_factors = [each.information for each in evidence]

@@ -32,7 +32,6 @@ from shapepose_fg.pipeline.keyframes import looked_at, with_rows_like
 from shapepose_fg.pipeline.solve_window import solve_window
 from shapepose_fg.pipeline.windows import near_border, window_stop
 
-
 _OUTSIDE_PX = 1e6
 """Coordinate of a detection that the result did not use, outside of all gates, px."""
 
@@ -143,7 +142,8 @@ def solved_around(
         people = people.rows(
             people.person == person if solver.config.temporal else people.frame == frame
         )
-    found = [solution for _, _, solution in _solved(people, solver, extra_factors, frame, again=True)]
+    solved = _solved(people, solver, extra_factors, frame, again=True)
+    found = [solution for _, _, solution in solved]
     return next(
         (each for solution in found for each in solution.people if each.person == person), None
     )
