@@ -21,6 +21,7 @@ from shapepose_fg.estimation.body_step import joint_targets
 from shapepose_fg.estimation.body_window import BodyState, BodyWindow, Marginals
 from shapepose_fg.estimation.body_window_graph import BodyGraph
 from shapepose_fg.estimation.camera_pose_uncertainty import carried_covariance
+from shapepose_fg.estimation.condensed_graph import gtsam_step
 from shapepose_fg.estimation.draft import first_places
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.in_time import near_in_time, velocities, waited_s
@@ -120,6 +121,7 @@ def solve_bodies(
         free = window.energy.parameters(start.rows(rows), np.zeros((len(rows), 3)))
         try:
             state = window.solve(_filled(free, start.ok[rows], window.times_s))
+            state = window.take(state, *gtsam_step(window, state))
             marginals = window.covariances(state)
         except np.linalg.LinAlgError:
             continue

@@ -48,7 +48,7 @@ _STRAYS_M = 0.07
 errors of poses that nothing shows are larger than their Gaussian when they are large."""
 _STEPS, _SETTLED_M = 8, 5e-4
 """Most steps of the solver; it ends when joints move by less on average, metres."""
-_HELD = 1e-6
+HELD = 1e-6
 """Information on every unknown, so that what nothing determines stays where it is."""
 _DAMPING = 1e-3
 
@@ -163,19 +163,14 @@ class BodyWindow:
         for _ in range(_STEPS):
             if done:
                 break
-            shape, pose = self._step(state, here, damping)
-            there = state.moved(shape, pose)
-            bodies = self._bodies(there)
-            there = replace(there, deviation=self._deviation(here, bodies))
-            new = self.around(there, bodies)
+            there, new = self._after(state, here, *self._step(state, here, damping))
             if not new.cost <= here.cost + 1e-3 * abs(here.cost):
                 damping = max(10 * damping, 1e-2)
                 if damping > 1e3:
                     break
                 continue
-            moved = np.linalg.norm(
-                bodies + there.deviation - here.bodies - state.deviation, axis=-1
-            ).mean()
+            off = new.bodies + there.deviation - here.bodies - state.deviation
+            moved = np.linalg.norm(off, axis=-1).mean()
             state, here, damping, done = (
                 there,
                 new,
@@ -184,6 +179,25 @@ class BodyWindow:
             )
         self.last = here
         return state
+
+    def take(self, state: BodyState, shape: Array, pose: Array) -> BodyState:
+        """The state after another step of betas (10,) and poses (T, N) from the solution; the
+        solution itself if the step makes it worse.
+        """
+        there, new = self._after(state, self.last, shape, pose)
+        if not new.cost <= self.last.cost + 1e-3 * abs(self.last.cost):
+            return state
+        self.last = new
+        return there
+
+    def _after(
+        self, state: BodyState, here: _Around, shape: Array, pose: Array
+    ) -> tuple[BodyState, _Around]:
+        """State after a step, with the best deviations, and the model around it."""
+        there = state.moved(shape, pose)
+        bodies = self._bodies(there)
+        there = replace(there, deviation=self._deviation(here, bodies))
+        return there, self.around(there, bodies)
 
     def joints(self, state: BodyState) -> Array:
         """(T, J, 3) X, metres in the world."""
@@ -320,7 +334,7 @@ class BodyWindow:
             )
         M = (beyond.shape[-1] + 1) * N + 11
         kept, front = np.zeros((T, M, -(-N // 16) * 16)), np.zeros((M, M))
-        eliminated(here.system, root, diagonal + _HELD, beyond, here.pull, damping, kept, front)
+        eliminated(here.system, root, diagonal + HELD, beyond, here.pull, damping, kept, front)
         return kept, front
 
     def _step(self, state: BodyState, here: _Around, damping: float) -> tuple[Array, Array]:
