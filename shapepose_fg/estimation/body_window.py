@@ -18,6 +18,7 @@ from scipy.linalg import solve_triangular
 from factors import DEFAULT_WIDTH_SIGMA, Motion
 from shapepose_fg.body.fitting.chains import Links
 from shapepose_fg.body.fitting.energy import BodyEnergy, EnergyTargets, Held, nothing
+from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.body.fitting.priors import MotionPrior, PosePrior
 from shapepose_fg.body.kernels.solving import eliminated, put_back
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
@@ -26,7 +27,13 @@ from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.asynchronous_views import carried_to_frames, leads, velocities_of
-from shapepose_fg.estimation.in_time import motion_of
+from shapepose_fg.estimation.contact import (
+    FREE_M2_S,
+    UNSEEN_S,
+    held_in_place,
+    standing_density,
+)
+from shapepose_fg.estimation.in_time import moments, motion_of, near_in_time, velocities
 from shapepose_fg.estimation.linearisation import (
     ObservationConfig,
     ViewEvidence,
@@ -138,6 +145,10 @@ class BodyWindow:
         self._held = self.energy.held_by_priors(len(self.times_s))
         # The betas have their prior once, not in every row.
         self._held = Held(self._held.betas, np.zeros(len(self.times_s)), self._held.angles)
+        self.standing = JointTargets(
+            np.zeros(shape := (*self.variance.shape, 3)), np.zeros((*shape, 3))
+        )
+        """Constraint on the joints of standing feet by other frames, metres in the world."""
         self.links: Links | None = None
         self._asynchronous = bool(leads(observations, views).any())
 
@@ -159,7 +170,12 @@ class BodyWindow:
         bodies = self._bodies(state)
         if self.links is None and len(self) > 1:
             self.links = self._linked(bodies)
-        here, damping, done = self.around(state, bodies), _DAMPING, False
+        self.last = self.around(state, bodies)
+        return self._descended(state)
+
+    def _descended(self, state: BodyState) -> BodyState:
+        """The state of least cost, from one with `last` around it."""
+        here, damping, done = self.last, _DAMPING, False
         for _ in range(_STEPS):
             if done:
                 break
@@ -179,6 +195,28 @@ class BodyWindow:
             )
         self.last = here
         return state
+
+    def hold(self, state: BodyState, feet: Index) -> BodyState:
+        """The solution in which the joints `feet` (F,) stay in place between frames where they
+        stand; the state itself if none does.
+        """
+        velocity = velocities(self.joints(state), self.times_s)[:, feet]
+        covariance = self.covariances(state).velocities()[:, feet]
+        seen = near_in_time(self.last.evidence.inlier[:, feet].any(axis=-1), self.times_s, UNSEEN_S)
+        velocity = np.where(seen[..., None], velocity, np.nan)
+        density = standing_density(velocity, covariance, self.times_s)
+        density = np.where(density > FREE_M2_S, np.inf, density)
+        if not np.isfinite(density).any():
+            return state
+        evidence = self.last.evidence
+        told = JointTargets(evidence.target[:, feet], evidence.information[:, feet])
+        information, pull = held_in_place(told, density, self.times_s)
+        scale = np.trace(information, axis1=-2, axis2=-1)[..., None, None]
+        known = np.where(scale > 0, information + 1e-9 * scale * np.eye(3), np.eye(3))
+        self.standing.information[:, feet] = information
+        self.standing.xyz[:, feet] = (inverses(known) @ pull[..., None])[..., 0]
+        self.last = self.around(state, self.last.bodies)
+        return self._descended(state)
 
     def take(self, state: BodyState, shape: Array, pose: Array) -> BodyState:
         """The state after another step of betas (10,) and poses (T, N) from the solution; the
@@ -237,7 +275,11 @@ class BodyWindow:
         if self._asynchronous:
             observed = carried_to_frames(observed, X, velocities_of(observed, X), self.views)
         evidence = linearise(observed, self.sigmas_px, X, self.views, self.config)
-        information, target = evidence.information, evidence.target - self.origin
+        held = self.standing
+        information = evidence.information + held.information
+        pull = evidence.gradient + (held.information @ (X - held.xyz)[..., None])[..., 0]
+        both = replace(evidence, information=information, gradient=pull)
+        target = both.target - self.origin
         variance = self.variance[..., None, None]
         share = inverses(np.eye(3) + variance * information)
         weighed = information @ share  # (L^-1 + s²)^-1, of information that may be singular
@@ -245,6 +287,8 @@ class BodyWindow:
         targets = EnergyTargets(target, weighed)
         linear = self.energy.linearise(state.free, targets, 1e9, self._held, nothing(len(self)))
         cost = self._seen_cost(evidence)
+        off = (X - held.xyz)[..., None]
+        cost += (off.mT @ held.information @ off).sum(axis=(1, 2, 3))
         cost += (np.square(state.deviation).sum(axis=-1) / self.variance).sum(axis=-1)
         angles = state.others[:, :-3] - self._held.angles
         cost += np.einsum(
@@ -423,17 +467,25 @@ class Marginals:
         return (flat @ whole).reshape(slope.shape) @ slope.mT
 
     def velocities(self) -> Array:
-        """(T, J, 3, 3) covariances of (X' - X) / dt, X' of the next frame, m²/s²; the last as the
-        one before.
+        """(T, J, 3, 3) covariances of velocities as in `in_time.velocities`, m²/s²; NaN for a
+        single frame.
+
+        Errors between distant frames are a Markov chain of those of consecutive ones, joint by
+        joint, which is less correlated than they are.
         """
         slope = self.slopes[..., 10:]
         T, J = slope.shape[:2]
         flat = slope.reshape(T, 3 * J, -1)
         own = (flat @ self.poses).reshape(slope.shape) @ slope.mT
         both = (flat[1:] @ self.steps[:-1]).reshape(slope[1:].shape) @ slope[:-1].mT
-        dt = np.diff(self.window.times_s)[:, None, None, None]
-        found = (own[1:] + own[:-1] - both - both.mT) / dt**2
-        return np.concatenate((found, found[-1:]))
+        goes = both @ inverses(own[:-1] + HELD * np.eye(3))
+        first, last, lasts = moments(self.window.times_s)
+        across = own[first]
+        for k in range(int((last - first).max(initial=0))):
+            there = np.minimum(first + k, T - 2)
+            across = np.where((first + k < last)[:, None, None, None], goes[there] @ across, across)
+        found = own[first] + own[last] - across - across.mT
+        return found / lasts[:, None, None, None] ** 2
 
 
 def nearest_keypoint(energy: BodyEnergy) -> Index:

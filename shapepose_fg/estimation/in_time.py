@@ -6,7 +6,7 @@ import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index, Mask
 
-SPEED_S = 0.1
+SPEED_S = 0.05
 """Time before and after a frame for estimating a velocity, s."""
 _AROUND_S = 0.3
 """Time before and after a step over which motion is a median, s; errors for a quarter of it have no
@@ -75,10 +75,17 @@ def velocities(points: Array, times_s: Array) -> Array:
     """(T, J, 3) velocities of points (T, J, 3), m/s, over `SPEED_S` before and after; NaN for a
     single frame.
     """
+    first, last, lasts = moments(times_s)
+    return (points[last] - points[first]) / lasts[:, None, None]
+
+
+def moments(times_s: Array) -> tuple[Index, Index, Array]:
+    """(T,) first and last frame from which a frame's velocity is computed, and the time between
+    them, seconds; NaN for a single frame.
+    """
     first = np.searchsorted(times_s, times_s - SPEED_S, side="left")
     last = np.searchsorted(times_s, times_s + SPEED_S, side="right") - 1
-    lasts = np.where(last > first, times_s[last] - times_s[first], np.nan)
-    return (points[last] - points[first]) / lasts[:, None, None]
+    return first, last, np.where(last > first, times_s[last] - times_s[first], np.nan)
 
 
 def near_in_time(marked: Mask, times_s: Array, within_s: float) -> Mask:
