@@ -1,6 +1,7 @@
 """Joints hang on a body whose pose and shape are variables: E_shape of Eq. 3, linear in the body.
 
-A pose is a vector, the step from the pose at which the body was linearised, and so is the shape.
+A pose is a vector, and so is the shape. Derivatives are those around one pose and shape; `joints`
+are the body's where both vectors are zero, by the linear model.
 """
 
 from itertools import repeat
@@ -23,8 +24,8 @@ def shape_factors(
     """For each of D joints, metres: r = x - joints - by_pose theta - by_shape beta ~ N(0, sigma_m²
     I), with one standard deviation for all, or (D,).
 
-    `keys` (D,) of the positions, `body_keys` (D,) of their poses, `joints` (D, 3) of the body where
-    it was linearised, `by_pose` (D, 3, N) and `by_shape` (D, 3, 10) its derivatives.
+    `keys` (D,) of the positions, `body_keys` (D,) of their poses, `joints` (D, 3) of the body
+    where theta and beta are zero, `by_pose` (D, 3, N) and `by_shape` (D, 3, 10) its derivatives.
     """
     position, pose = np.asarray(keys), np.asarray(body_keys)
     points, to_pose, to_shape = (

@@ -116,12 +116,12 @@ def reported_keys(person: int, joints: ArrayLike, frames: ArrayLike = 0) -> NDAr
 
 
 def body_keys(person: int, frames: ArrayLike) -> NDArray[np.int64]:
-    """Keys of a person's body pose in each of some `frames`: a vector, the step from where it was linearised."""
+    """Keys of a person's body pose in each of some `frames`: a vector of root, angles, place."""
     return _pack(_BODY, person, 0, frames)
 
 
 def shape_key(person: int) -> int:
-    """Key of a person's body shape: a vector (10,), the step of the betas from where they were linearised."""
+    """Key of a person's body shape: a vector (10,), the betas."""
     return int(_pack(_BODY, person, 1, 0))
 
 

@@ -4,27 +4,27 @@ bodies.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.evidence import LEAST_JOINTS
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, FitStatus, JointTargets
-from shapepose_fg.core.arrays import Array, Index, Mask
+from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.core.camera import Views
+from shapepose_fg.core.notes import Problem
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Known, Status
 from shapepose_fg.estimation.association_uncertainty import DOUBTED, mirrored_spread
 from shapepose_fg.estimation.body_step import joint_targets
-from shapepose_fg.estimation.body_window import BodyState, BodyWindow, Marginals
+from shapepose_fg.estimation.body_window import BodyWindow, Marginals
 from shapepose_fg.estimation.body_window_graph import BodyGraph
 from shapepose_fg.estimation.camera_pose_uncertainty import carried_covariance
 from shapepose_fg.estimation.condensed_graph import gtsam_step
 from shapepose_fg.estimation.contact import feet_of
 from shapepose_fg.estimation.draft import first_places
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
+from shapepose_fg.estimation.factor_solution import solve_with_factors
 from shapepose_fg.estimation.in_time import near_in_time, velocities, waited_s
 from shapepose_fg.estimation.linearisation import (
     ViewEvidence,
@@ -41,7 +41,8 @@ from shapepose_fg.estimation.missed_detections import (
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.reported_covariance import WEAK_PROBABILITY, WEAK_SCORE
 from shapepose_fg.estimation.state import window_rows
-from shapepose_fg.estimation.window_solution import WindowSolution
+from shapepose_fg.estimation.user_factors import FactorFunction, add_factors, factors_of
+from shapepose_fg.estimation.window_solution import PersonGraph, WindowSolution, tied
 
 LASTS = 2.0
 """Covariances over time are this many times those of errors that are new in every frame: detectors'
@@ -56,45 +57,13 @@ RECENT_S = 0.25
 """Time since a view last detected a joint, s, within which its motion determines it."""
 
 
-@dataclass(frozen=True)
-class BodyPerson:
-    """One person of a solved window; the graph is made when it is asked for."""
-
-    window: BodyWindow
-    state: BodyState
-    person: int
-    frames: NDArray[np.int64]
-    rows: Index
-    widen: float
-    marginals: Marginals
-
-    @cached_property
-    def built(self) -> BodyGraph:
-        """The graph with its keys and values."""
-        return BodyGraph(self.window, self.state, self.person, self.frames, self.widen).build()
-
-    @property
-    def graph(self) -> gtsam.NonlinearFactorGraph:
-        """All factors; marginals of `keys` are the reported covariances."""
-        return self.built.graph
-
-    @property
-    def values(self) -> gtsam.Values:
-        """The solution."""
-        return self.built.values
-
-    @property
-    def keys(self) -> NDArray[np.int64]:
-        """(T, J) keys of the joints' positions."""
-        return self.built.keys
-
-
 def solve_bodies(
     observations: Observations,
     views: Views,
     fitter: BodyFitter,
     config: EstimatorConfig,
     motion: MotionModel,
+    functions: Sequence[FactorFunction] = (),
 ) -> WindowSolution:
     """Joints, covariances and bodies of N rows: each track over its rows, or a row by itself."""
     assert fitter.model is not None
@@ -113,7 +82,7 @@ def solve_bodies(
 
     # Bodies and joints together. Rows without a body keep what their views determine.
     found = _Found.of_views(evidence, config.refine.max_sigma_m, start.status)
-    people = list[BodyPerson]()
+    people, spread = list[BodyGraph](), list[Marginals]()
     feet = feet_of(config.joints if config.motion.contact else ())
     for rows in window_rows(observations):
         if not start.ok[rows].any():
@@ -131,8 +100,9 @@ def solve_bodies(
             continue
         frames = observations.frame[rows].astype(np.int64)
         track = int(observations.track[rows[0]])
-        people.append(BodyPerson(window, state, track, frames, rows, LASTS, marginals))
-        found.put(people[-1])
+        people.append(BodyGraph(window, state, track, frames, LASTS, rows))
+        spread.append(marginals)
+        found.put(people[-1], marginals)
 
     # Uncertainty: unseen joints deviate from their bodies by more, above all those that cameras
     # should see; cameras' poses and sides may be wrong.
@@ -140,13 +110,19 @@ def solve_bodies(
     strong = found.evidence.inlier & sure
     limbs = limbs_that_hide(config.joints)
     elsewhere = elsewhere_variance(found.joints, observations.frame, strong, views, limbs)
-    for person in people:
+    for person, marginals in zip(people, spread, strict=True):
         seen = np.asarray(strong[person.rows].any(axis=-1))
-        moved = np.square(SPEED_M_S * waited_s(seen, person.window.times_s))
-        person.window.widen_unseen(
-            LASTS * person.marginals.of_bodies, np.minimum(elsewhere[person.rows], moved)
-        )
-        found.covariance[person.rows] = LASTS * person.marginals.joints()
+        moved = np.square(SPEED_M_S * waited_s(seen, person.times_s))
+        moved = np.minimum(elsewhere[person.rows], moved)
+        person.window.widen_unseen(LASTS * marginals.of_bodies, moved)
+        found.covariance[person.rows] = LASTS * marginals.joints()
+
+    # User factors: people who have some are solved once more.
+    if len(functions) > 0:
+        add_factors(people, functions)
+        for each in solve_with_factors(people, config.graph):
+            found.put(each.person, each.marginals)
+            found.covariance[each.person.rows] = each.covariance
     if views.carried is not None:
         bodies = JointTargets(found.joints, inverses(found.fit.covariance + np.eye(3) * 1e-6))
         found.covariance[:] += carried_covariance(found.evidence, bodies, sigmas, views, gates)
@@ -176,28 +152,28 @@ class _Found:
         fit = BodyFit.failed(status, J)
         return cls(joints, covariance, nowhere, np.full_like(covariance, np.nan), evidence, fit)
 
-    def put(self, person: BodyPerson) -> None:
+    def put(self, person: BodyGraph, marginals: Marginals) -> None:
         """Store a person's solution."""
         rows, window, state, fit = person.rows, person.window, person.state, self.fit
         self.joints[rows] = joints = window.joints(state)
         self.velocity[rows] = velocities(joints, window.times_s)
-        self.velocity_covariance[rows] = person.marginals.velocities()
+        self.velocity_covariance[rows] = marginals.velocities()
         self.evidence.put(rows, window.last.evidence)
         fit.put_bodies(rows, window.parameters(state), np.zeros((len(rows), 3)))
         fit.joints[rows] = joints - state.deviation
-        fit.covariance[rows] = LASTS * person.marginals.of_bodies
+        fit.covariance[rows] = LASTS * marginals.of_bodies
         fit.residual_m[rows] = np.sqrt(np.square(state.deviation).sum(axis=-1).mean(axis=-1))
         fit.status[rows] = FitStatus.OK
 
     def solution(
-        self, rows: Observations, enough: Mask, strong: Mask, people: Sequence[BodyPerson]
+        self, rows: Observations, enough: Mask, strong: Mask, people: Sequence[BodyGraph]
     ) -> WindowSolution:
         """The solution, with codes and statuses."""
         inlier = self.evidence.inlier
         recent = np.asarray(inlier.any(axis=-1))
         for person in people:
             mine = person.rows
-            recent[mine] = near_in_time(recent[mine], person.window.times_s, RECENT_S)
+            recent[mine] = near_in_time(recent[mine], person.times_s, RECENT_S)
         known = np.where(recent, Known.MOTION, Known.BODY)
         known = np.where(inlier.any(axis=-1), Known.WEAK, known)
         known = np.where(strong.sum(axis=-1) >= 2, Known.SEEN, known)
@@ -205,6 +181,14 @@ class _Found:
         doubted = np.median(rows.mirrored.max(axis=2, initial=0.0), axis=1) > DOUBTED
         status = np.where(doubted, Status.CONTRADICTED, Status.OK)
         failed = np.where(enough, Status.BODY_UNDETERMINED, Status.TOO_FEW_VIEWS)
+        wrong = tuple(
+            Problem(int(row), each.track, int(rows.frame[row]), joint, each.failure)
+            for each in people
+            for row in (each.rows if each.failure else ())
+            for joint in np.flatnonzero(each.touched).tolist()
+        )
+        status = np.where(self.fit.ok, status, failed)
+        status[[problem.row for problem in wrong]] = Status.NOT_SOLVED
         return WindowSolution(
             observations=rows,
             joints=self.joints,
@@ -217,8 +201,20 @@ class _Found:
             residual_px=self.evidence.residual_px,
             known=known.astype(np.uint8),
             fit=self.fit,
-            status=np.where(self.fit.ok, status, failed),
-            people=tuple(people),
+            status=status,
+            problems=wrong,
+            people=tied(
+                [
+                    PersonGraph(
+                        window=each,
+                        joints=self.joints[each.rows],
+                        covariance=self.covariance[each.rows],
+                        bodies=self.fit.rows(each.rows),
+                    )
+                    for each in people
+                ]
+            ),
+            factors=factors_of(people),
         )
 
 

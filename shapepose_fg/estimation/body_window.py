@@ -266,14 +266,19 @@ class BodyWindow:
         found = kept @ of_body @ kept.mT + self.variance[..., None, None] * kept
         return (found + found.mT) / 2
 
+    def carried(self, X: Array) -> Observations:
+        """The detections as if all cameras exposed at the frames' times, for joints X (T, J, 3)."""
+        observed = self.observations
+        if self._asynchronous:
+            observed = carried_to_frames(observed, X, velocities_of(observed, X), self.views)
+        return observed
+
     def around(self, state: BodyState, bodies: Array) -> _Around:
         """Cost and normal equations, joints eliminated, around a state with these `bodies` (T, J,
         3).
         """
         X = bodies + state.deviation + self.origin
-        observed = self.observations
-        if self._asynchronous:
-            observed = carried_to_frames(observed, X, velocities_of(observed, X), self.views)
+        observed = self.carried(X)
         evidence = linearise(observed, self.sigmas_px, X, self.views, self.config)
         held = self.standing
         information = evidence.information + held.information

@@ -2,9 +2,6 @@
 problems.
 """
 
-from collections import Counter
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -39,8 +36,9 @@ from shapepose_fg.estimation.motion_model import LOST_M
 from shapepose_fg.estimation.noise_law import core_sigma_m, variance_ratio
 from shapepose_fg.estimation.state import State
 from shapepose_fg.estimation.state_covariances import state_covariances
+from shapepose_fg.estimation.user_factors import factors_of
 from shapepose_fg.estimation.window_graph import WindowGraph
-from shapepose_fg.estimation.window_solution import PersonGraph, WindowSolution, tied
+from shapepose_fg.estimation.window_solution import CorrectedGraph, WindowSolution, tied
 
 RUNAWAY_M = 1.0
 """Distance of a joint with a user factor from its initial position at which it has diverged, m."""
@@ -107,25 +105,16 @@ def outcome(state: State, fitter: BodyFitter) -> WindowSolution:
         status=status,
         problems=wrong,
         people=tied([
-            PersonGraph(
-                person, X[person.rows], covariance[person.rows], fit.rows(person.rows),
-                state.joints[person.rows], solved[person.rows], state.motion.views,
-                state.of_body.rows(person.rows),
+            CorrectedGraph(
+                window=person, joints=X[person.rows], covariance=covariance[person.rows],
+                bodies=fit.rows(person.rows), solved=state.joints[person.rows],
+                solved_covariance=solved[person.rows], lasting=state.motion.views,
+                body=state.of_body.rows(person.rows),
             )
             for person in people
         ]),
         factors=factors_of(people),
     )  # fmt: skip
-
-
-def factors_of(people: Sequence[WindowGraph]) -> dict[str, tuple[int, int]]:
-    """Number of factors by user function, and how many were inactive in the last problem."""
-    ties = {id(person.ties): person.ties for person in people}.values()
-    made, active = (
-        Counter(factor.name for each in ties for factor in of(each))
-        for of in (lambda each: each.factors, lambda each: each.active)
-    )
-    return {name: (count, count - active[name]) for name, count in made.items()}
 
 
 def final_bodies(state: State, covariance: Array, fitter: BodyFitter) -> BodyFit:

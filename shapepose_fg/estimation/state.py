@@ -13,7 +13,8 @@ from shapepose_fg.estimation.draft import first_places
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.linearisation import ViewEvidence, observation_sigmas
 from shapepose_fg.estimation.motion_model import MotionModel
-from shapepose_fg.estimation.window_graph import FactorFunction, WindowGraph, add_factors
+from shapepose_fg.estimation.user_factors import FactorFunction, add_factors
+from shapepose_fg.estimation.window_graph import WindowGraph
 
 
 @dataclass

@@ -5,9 +5,7 @@ With several frames, joints also have velocities, and motion factors between the
 """
 
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from collections.abc import Iterable, Sequence
 
 import gtsam
 import numpy as np
@@ -17,7 +15,6 @@ from factors import (
     KernelName,
     body_prior_factors,
     diagonal,
-    format_key,
     lasting_prior_factors,
     make_camera,
     moving_projection_factors,
@@ -41,64 +38,13 @@ from shapepose_fg.estimation.in_time import motion_of, near_in_time, spanned
 from shapepose_fg.estimation.joint_chains import Chains, Problem, Projections, Said
 from shapepose_fg.estimation.minimise import NotFinite, confirmed, descend, undetermined_key
 from shapepose_fg.estimation.motion_model import MotionModel
+from shapepose_fg.estimation.user_factors import PersonWindow
 
 _OF_VIEWS, _OF_BODY = 0, 1
 """Numbers of the sources of estimates, for the keys of their offsets."""
 
 
-@dataclass(frozen=True)
-class UserFactor:
-    """A user factor."""
-
-    factor: gtsam.NonlinearFactor
-    keys: tuple[int, ...]
-    """Variables of the factor: states of joints of people in the window, and user variables."""
-    name: str
-    """Name of the function that created the factor."""
-
-
-@dataclass
-class CoupledGraph:
-    """People of a window, and user variables, that user factors couple, and that are solved as one
-    graph.
-
-    A person without such factors is separate.
-    """
-
-    people: list["WindowGraph"]
-    """The people in this graph."""
-    factors: list[UserFactor] = field(default_factory=list)
-    """The user factors that couple these people."""
-    start: gtsam.Values = field(default_factory=gtsam.Values)
-    """Initial values of user variables."""
-    parts: list[frozenset[tuple[int, int]]] = field(default_factory=list)
-    """Disjoint sets of coupled variables: (track, joint), or (-1, key) for user variables."""
-    active: list[UserFactor] = field(default_factory=list)
-    """Factors with all variables in the last problem; the others were inactive."""
-
-    def tie(self, nodes: Iterable[tuple[int, int]]) -> None:
-        """Record that a factor couples these variables."""
-        joined = frozenset(nodes)
-        apart = [each for each in self.parts if not each & joined]
-        self.parts = [*apart, joined.union(*(each for each in self.parts if each & joined))]
-
-    def take_in(self, other: "CoupledGraph") -> None:
-        """Merge with the coupling of other people, who share this object from now on."""
-        if other is self:
-            return
-        for key in other.start.keys():  # noqa: SIM118 - GTSAM's, not a dictionary's
-            if self.start.exists(key):
-                raise ValueError(f"your variable {format_key(key)} has two initial values")
-        self.start.insert(other.start)
-        self.people += other.people
-        self.factors += other.factors
-        for part in other.parts:
-            self.tie(part)
-        for person in other.people:
-            person.ties = self
-
-
-class WindowGraph:
+class WindowGraph(PersonWindow):
     """Graph of one person in T frames; T = 1 is a single frame, without velocities.
 
     Joints, and people, are coupled only by user factors, so that marginal covariances are cheap.
@@ -139,25 +85,16 @@ class WindowGraph:
         T, J, _ = sigmas_px.shape
         if np.any(np.diff(observations.frame) <= 0):
             raise ValueError(f"frames of a person must increase, got {observations.frame}")
+        frames, joints = observations.frame, np.arange(J)
+        super().__init__(
+            int(observations.track[0]),
+            frames,
+            observations.time_s.mean(axis=1),
+            state_keys(int(observations.track[0]), joints, frames[:, None], motion.law.order),
+            rows,
+            first,
+        )
         self.config = config.graph
-        self.rows = np.arange(T) if rows is None else rows
-        """(T,) row indices in the whole problem."""
-        self.track = int(observations.track[0])
-        """Track number of the person."""
-        self.frames = observations.frame
-        """(T,) frame of each row."""
-        self.times_s = observations.time_s.mean(axis=1)
-        """(T,) time of each frame, seconds."""
-        joints = np.arange(J)
-        self.state_keys = state_keys(self.track, joints, self.frames[:, None], motion.law.order)
-        """(T, J, n) keys of each joint's state, a `Point3` each: position, velocity, and further
-        derivatives of the motion model; in the graph of a single frame, positions only."""
-        self.graph = gtsam.NonlinearFactorGraph()
-        """The factors of the last solution."""
-        self.values = gtsam.Values()
-        """The last solution, for `gtsam.Marginals` and for graphs to which this one is added."""
-        self.failure = ""
-        """Reason why the last solution failed; empty on success."""
         self._motion = motion
         self._observations, self._sigmas_px, self._views = observations, sigmas_px, views
         self._names = config.joints
@@ -169,15 +106,6 @@ class WindowGraph:
                 for source in (_OF_VIEWS, _OF_BODY)
             ]
         )
-        self.first: Array = np.full((T, J, 3), np.nan) if first is None else first
-        """(T, J, 3) initial joints, accurate to decimetres, metres; NaN if unknown. Functions may
-        use them to choose what their factors connect."""
-        self.people: list[WindowGraph] = [self]
-        """All people in the window, including this one; for single frames, in the frame."""
-        self.ties = CoupledGraph([self])
-        """The people coupled to this one by user factors, and these factors."""
-        self.touched: Mask = np.zeros(J, dtype=bool)
-        """(J,) joints with a user factor."""
         self.present: Mask = np.zeros((T, J), dtype=bool)
         """(T, J) joints in the last problem."""
         self.positions = self.velocity = np.full((T, J, 3), np.nan)
@@ -187,111 +115,11 @@ class WindowGraph:
         """The last multi-frame problem, as chains of joints without user factors."""
 
     @property
-    def keys(self) -> NDArray[np.int64]:
-        """(T, J) key of each joint's position, `Point3`, metres."""
-        return self.state_keys[..., 0]
-
-    @property
-    def velocity_keys(self) -> NDArray[np.int64]:
-        """(T, J) key of each joint's velocity, `Point3`, m/s; not in the graph of a single
-        frame.
-        """
-        return self.state_keys[..., 1]
-
-    def __len__(self) -> int:
-        """Number of frames, T."""
-        return len(self.frames)
-
-    @property
     def states(self) -> NDArray[np.int64]:
         """(T, J, n + 2) keys of all variables of a joint in a frame: state, offset of the views,
         offset of the body.
         """
         return np.concatenate([self.state_keys, np.moveaxis(self._offset_keys, 0, -1)], axis=-1)
-
-    @property
-    def seen(self) -> Mask:
-        """(T, J, V) whether there is a detection of the joint."""
-        return self._observations.seen
-
-    @property
-    def temporal(self) -> bool:
-        """Whether there are several frames, so that joints have velocities and motion factors."""
-        return len(self) > 1
-
-    @property
-    def partners(self) -> "list[WindowGraph]":
-        """The window's people after this one, so that each pair occurs once."""
-        return self.people[next(n for n, each in enumerate(self.people) if each is self) + 1 :]
-
-    def shared(self, other: "WindowGraph") -> tuple[Index, Index]:
-        """Rows (S,) of this person and of another in their common frames."""
-        _, mine, theirs = np.intersect1d(
-            self.frames, other.frames, assume_unique=True, return_indices=True
-        )
-        return mine, theirs
-
-    def add(self, item: gtsam.NonlinearFactor | gtsam.Values, name: str = "") -> None:
-        """Add a user factor, which stays through all alternations, or initial values of user
-        variables.
-
-        A factor may be on `state_keys` of this person and of all others of the window (`people`),
-        who are then solved jointly, and on user variables with initial values given before. It is
-        inactive while one of its variables is not in the problem, because neither views nor body
-        nor motion determine it, and `run` counts it under `name`, the function that created it.
-        Raises ValueError for any other key, and for initial values of a joint.
-        """
-        if isinstance(item, gtsam.Values):
-            self._add_start(item)
-            return
-        nodes, touched = list[tuple[int, int]](), list[tuple[WindowGraph, int]]()
-        whose = f"your factor{f' ({name})' if name else ''}"
-        for key in item.keys():  # noqa: SIM118 - GTSAM's, not a dictionary's
-            person = next((each for each in (self, *self.people) if key in each._own), None)
-            if person is not None:
-                joint = split_key(key).joint
-                touched.append((person, joint))
-                nodes.append((person.track, joint))
-                continue
-            holder = self._holder(key)
-            if holder is None:
-                raise ValueError(
-                    f"{whose} uses {format_key(key)}, which is not in this window: use keys of "
-                    "its people (`keys` and `velocity_keys` of `window.people`; people are not "
-                    "in every frame), or first yield gtsam.Values with the initial value of your "
-                    "variable"
-                )
-            nodes.append((-1, key))
-            self.ties.take_in(holder)
-        for person, joint in touched:
-            self.ties.take_in(person.ties)
-            person.touched[joint] = True
-        if len(touched) == 0 and len(nodes) == 0:
-            raise ValueError(f"{whose} has no variable")
-        self.ties.factors.append(UserFactor(item, tuple(item.keys()), name))
-        self.ties.tie(nodes)
-
-    def _add_start(self, start: gtsam.Values) -> None:
-        """Add initial values of user variables; existing ones are kept."""
-        new = gtsam.Values(start)
-        for key in start.keys():  # noqa: SIM118 - GTSAM's, not a dictionary's
-            if any(key in person._own for person in self.people):
-                raise ValueError(
-                    f"{format_key(key)} is the key of a joint: use gtsam.symbol for your variables"
-                )
-            if self._holder(key) is not None:
-                new.erase(key)
-        self.ties.start.insert(new)
-
-    def _holder(self, key: int) -> CoupledGraph | None:
-        """The coupling that contains a user variable."""
-        return next(
-            (each.ties for each in (self, *self.people) if each.ties.start.exists(key)), None
-        )
-
-    @cached_property
-    def _own(self) -> frozenset[int]:
-        return frozenset(self.state_keys.ravel().tolist())
 
     @property
     def coupled(self) -> list[frozenset[int]]:
@@ -308,6 +136,11 @@ class WindowGraph:
         offsets.
         """
         return self.touched if self.temporal else np.zeros_like(self.touched)
+
+    @property
+    def seen(self) -> Mask:
+        """(T, J, V) whether there is a detection of the joint."""
+        return self._observations.seen
 
     def solve(
         self,
@@ -358,7 +191,6 @@ class WindowGraph:
             for chains in self.chains:
                 chains.put(chains.solved(initial), states)
         self._start(states)
-        self.graph = gtsam.NonlinearFactorGraph()
         self._add(self._seen(problem.seen))
         if problem.seen.lead_s.any():
             self._add(self._seen_between(problem.seen, states))
@@ -375,29 +207,8 @@ class WindowGraph:
         GTSAM takes a single step if that suffices, else Levenberg-Marquardt steps. `graph` and
         `values` of all of them are then those of the whole problem.
         """
-        ties, people = self.ties, self.ties.people
-        graph, values = self.graph, self.values
-        if len(people) > 1:
-            graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-            for person in people:
-                graph.push_back(person.graph)
-                values.insert(person.values)
-        there = values.exists
-        ties.active = [
-            each
-            for each in ties.factors
-            if all(there(key) or ties.start.exists(key) for key in each.keys)
-        ]
-        for each in ties.active:
-            graph.add(each.factor)
-        if not ties.start.empty():
-            values = gtsam.Values(values)
-            idle = gtsam.Values(ties.start)
-            used = {key for each in ties.active for key in each.keys}
-            for key in ties.start.keys():  # noqa: SIM118 - GTSAM's, not a dictionary's
-                if key not in used:
-                    idle.erase(key)
-            values.insert(idle)
+        people = self.ties.people
+        graph, values = self.ties.joined()
         failure = ""
         if not values.empty():
             try:
@@ -405,9 +216,13 @@ class WindowGraph:
             except NotFinite as error:
                 failure = str(error)
             except RuntimeError as error:
-                failure = f"the solver failed: its system is singular{_where(error, people)}"
+                failure = (
+                    f"the solver failed: its system is singular{_where(error, people, self._names)}"
+                )
         for person in people:
-            person.graph, person.values, person.failure = graph, values, failure
+            person.set_graph(graph, values)
+            person.failure = failure
+            assert isinstance(person, WindowGraph)
             person.positions, person.velocity = person._points()
 
     def _problem(
@@ -549,7 +364,7 @@ class WindowGraph:
     def _start(self, states: Array) -> None:
         """Set `values` from `states` (T, J, S, 3), NaN where absent."""
         self._there = np.isfinite(states[..., 0])
-        self.values = gtsam.Values()
+        self.build()
         deque(
             map(self.values.insert, self.states[self._there].tolist(), states[self._there]),
             maxlen=0,
@@ -574,45 +389,7 @@ class WindowGraph:
         return positions, speeds
 
 
-FactorFunction = Callable[
-    [WindowGraph, NDArray[np.int64]], Iterable[gtsam.NonlinearFactor | gtsam.Values]
-]
-"""Function that makes your own factors for a person's window, from its keys (T, J) and those of
-`window.people`."""
-ExtraFactors = FactorFunction | Sequence[FactorFunction]
-"""One function for user factors, or several."""
-
-
-def add_factors(people: Sequence[WindowGraph], functions: Sequence[FactorFunction]) -> None:
-    """Add the factors of user functions to the people of a window; if all have a single frame, to
-    those of each frame.
-    """
-    alone = all(len(person) == 1 for person in people)
-    together: dict[int, list[WindowGraph]] = {}
-    for person in people:
-        together.setdefault(int(person.frames[0]) if alone else 0, []).append(person)
-    for person in people:
-        person.people = together[int(person.frames[0]) if alone else 0]
-    for function in functions:
-        for person in people:
-            for item in function(person, person.keys):
-                person.add(item, name_of(function))
-
-
-def functions_of(given: ExtraFactors | None) -> tuple[FactorFunction, ...]:
-    """User functions as a tuple."""
-    if given is None:
-        return ()
-    return (given,) if callable(given) else tuple(given)
-
-
-def name_of(function: FactorFunction) -> str:
-    """Name of a user function."""
-    inner = getattr(function, "func", function)  # of functools.partial
-    return str(getattr(inner, "__name__", type(inner).__name__))
-
-
-def _where(error: RuntimeError, people: Sequence[WindowGraph]) -> str:
+def _where(error: RuntimeError, people: Sequence[PersonWindow], names: Sequence[str]) -> str:
     """Description of the joint that a singular system leaves undetermined."""
     key = undetermined_key(error)
     if key is None or all(key not in set(person.states.ravel().tolist()) for person in people):
@@ -620,8 +397,7 @@ def _where(error: RuntimeError, people: Sequence[WindowGraph]) -> str:
     joint = split_key(key)
     whose = f" of person {joint.person}" if len(people) > 1 else ""
     return (
-        f" near {people[0]._names[joint.joint]}{whose} in frame {joint.frame}: no factor "
-        "determines it there"
+        f" near {names[joint.joint]}{whose} in frame {joint.frame}: no factor determines it there"
     )
 
 

@@ -25,7 +25,8 @@ from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.reported_covariance import outcome
 from shapepose_fg.estimation.smoothing import smoothed
 from shapepose_fg.estimation.state import State, parts_of
-from shapepose_fg.estimation.window_graph import ExtraFactors, WindowGraph, functions_of
+from shapepose_fg.estimation.user_factors import ExtraFactors, functions_of
+from shapepose_fg.estimation.window_graph import WindowGraph
 from shapepose_fg.estimation.window_solution import WindowSolution
 from shapepose_fg.tracking.reassociation import LEAST_PROBABILITY, changed, reassociate
 
@@ -104,15 +105,16 @@ def solve_window(
     assigned = time.perf_counter()
 
     over_time = len(np.unique(observations.track)) < len(observations)
-    if config.refine.with_body and over_time and fitter.model is not None and extra_factors is None:
-        solution = solve_bodies(observations, views, fitter, config, motion)
+    functions = functions_of(extra_factors)
+    if config.refine.with_body and over_time and fitter.model is not None:
+        solution = solve_bodies(observations, views, fitter, config, motion, functions)
         solution.seconds.update(
             {"associate again": assigned - began, "solve": time.perf_counter() - assigned}
         )
         return solution
 
     # Initial estimate: X_0, standard deviations of the observations there, and all graphs.
-    state = State.start(observations, views, fitter, config, motion, functions_of(extra_factors))
+    state = State.start(observations, views, fitter, config, motion, functions)
     moving, velocity = state.people, velocities_of(observations, state.joints)
     for n in range(config.refine.alternations if len(moving) > 0 else 0):  # Algorithm 1
         rows = np.concatenate([person.rows for person in moving])

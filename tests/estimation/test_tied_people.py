@@ -15,7 +15,8 @@ from shapepose_fg.estimation.estimator_config import EstimatorConfig, WindowGrap
 from shapepose_fg.estimation.linearisation import ObservationConfig
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.state_covariances import state_covariances
-from shapepose_fg.estimation.window_graph import WindowGraph, add_factors
+from shapepose_fg.estimation.user_factors import add_factors
+from shapepose_fg.estimation.window_graph import WindowGraph
 
 R, L = BODY_25.index("RWrist"), BODY_25.index("LWrist")
 EXACT = WindowGraphConfig(max_iterations=100, tolerance=1e-12)
