@@ -68,6 +68,7 @@ def complete(app: Any, page: str, source: list[str]) -> None:
     """Add to the text of a page what is generated for it."""
     parts = {
         "README": navigation,
+        "docs/examples/README": scripts,
         "docs/reference/commands": commands,
         "docs/reference/settings": settings,
         "docs/reference/api": api,
@@ -81,6 +82,14 @@ def navigation() -> str:
     return "".join(
         f"```{{toctree}}\n:hidden:\n:caption: {title}\n\n" + "\n".join(pages) + "\n```\n\n"
         for title, pages in NAVIGATION.items()
+    )
+
+
+def scripts() -> str:
+    """The text of every example, below the gallery."""
+    names = [each.name for each in sorted((ROOT / "docs/examples").glob("[0-9]*.py"))]
+    return "".join(
+        f"## {name}\n\n```{{literalinclude}} {name}\n:language: python\n```\n\n" for name in names
     )
 
 
