@@ -203,16 +203,27 @@ def _directive(module: str, name: str) -> str:
         return f".. autoclass:: {module}.{name}\n   :members:\n\n"
     if inspect.isroutine(value):
         return f".. autofunction:: {module}.{name}\n\n"
-    return f".. autodata:: {_home(module, name)}.{name}\n   :no-value:\n\n"
+    lines = _constant(module, name).splitlines()
+    as_text(None, "data", name, value, None, lines)
+    return f".. py:data:: {module}.{name}\n\n" + "".join(f"   {line}\n" for line in lines) + "\n"
 
 
-def _home(module: str, name: str) -> str:
-    """The module that assigns a constant, and documents it, of those that import it one another."""
-    source = inspect.getsource(importlib.import_module(module))
-    for node in ast.parse(source).body:
-        if isinstance(node, ast.ImportFrom) and name in [each.name for each in node.names]:
-            return _home(str(node.module), name)
-    return module
+def _constant(module: str, name: str) -> str:
+    """The docstring below the assignment of a constant, in the module that others import it from."""
+    nodes = ast.parse(inspect.getsource(importlib.import_module(module))).body
+    for node, below in zip(nodes, [*nodes[1:], None], strict=True):
+        match node, below:
+            case ast.ImportFrom(names=names), _ if name in [each.name for each in names]:
+                return _constant(str(node.module), name)
+            case (
+                (
+                    ast.Assign(targets=[ast.Name(id=target)])
+                    | ast.AnnAssign(target=ast.Name(id=target))
+                ),
+                ast.Expr(value=ast.Constant(value=str(text))),
+            ) if target == name:
+                return inspect.cleandoc(text)
+    return ""
 
 
 def as_text(app: Any, what: str, name: str, value: Any, options: Any, lines: list[str]) -> None:
