@@ -6,9 +6,8 @@ midpoint of the hips, x to the front and z to the head. Time stamps are on the c
 pictures.
 """
 
-import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,8 @@ from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.decompositions import rigid
 from shapepose_fg.core.drawing import bones_of, colour_of
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.reconstruction import BODY, Reconstruction
+from shapepose_fg.io.ros.humans import Human
 
 Message = dict[str, Any]
 MAP, WORLD = "map", "world"
@@ -29,8 +29,12 @@ _LAST_S = 2**31
 _SPHERES, _LINES = 7, 5
 """`SPHERE_LIST` and `LINE_LIST` of visualization_msgs/Marker."""
 _JOINT_M, _BONE_M = 0.05, 0.03
-_BODY_FROM_FRONT = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
-"""Rotation to SMPL's axes (x left, y up, z front) from a frame with x front, y left and z up."""
+COVARIANCES: dict[str, tuple[str, ...]] = {
+    "none": (),
+    "joints": ("covariance",),
+    "all": ("covariance", "velocity_covariance"),
+}
+"""Columns of a result with covariances, by level of detail."""
 _LENSES = {4: "equidistant", 5: "plumb_bob"}
 """Names of lens models by the number of coefficients; those with more are `rational_polynomial`."""
 
@@ -50,18 +54,24 @@ def header(frame_id: str, time_s: float) -> Message:
     return {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": frame_id}
 
 
-def people_message(rows: Reconstruction, kind: str, time_s: float) -> Message:
-    """shapepose_msgs/People: one frame's rows, the arrays of people.npz, flat, NaN if unknown."""
-    names = (
-        "joints covariance velocity velocity_covariance betas global_orient body_pose transl"
-    ).split()
+def people_message(
+    rows: Reconstruction, kind: str, time_s: float, covariances: str = "all"
+) -> Message:
+    """shapepose_msgs/People: one frame's rows, the arrays of people.npz, flat, NaN if unknown.
+    Covariances that a level of `COVARIANCES` leaves out are empty.
+    """
+    columns = ("joints", "velocity", *BODY)
+    kept = (*columns, *COVARIANCES[covariances])
     people = [
         {
             "person": int(rows.person[n]),
             "status": str(rows.status[n]),
             "known": rows.known[n].tolist(),
         }
-        | {name: getattr(rows, name)[n].ravel().tolist() for name in names}
+        | {
+            name: getattr(rows, name)[n].ravel().tolist() if name in kept else []
+            for name in (*columns, *COVARIANCES["all"])
+        }
         for n in range(len(rows))
     ]
     return {
@@ -72,17 +82,44 @@ def people_message(rows: Reconstruction, kind: str, time_s: float) -> Message:
     }
 
 
-def body_transforms(rows: Reconstruction, time_s: float) -> Message:
-    """tf2_msgs/TFMessage: `body_<identity>` of all people with known hips and a body."""
-    from scipy.spatial.transform import Rotation
+def body_transforms(people: Sequence[Human], time_s: float) -> list[Message]:
+    """geometry_msgs/TransformStamped: `body_<identity>` in the world, and the links of people in
+    their bodies.
+    """
+    return [
+        _transform(parent, f"{name}_{each.body_id}", pose, time_s)
+        for each in people
+        for parent, name, pose in (
+            (WORLD, "body", each.world_from_body),
+            *((f"body_{each.body_id}", name, link) for name, link in each.links.items()),
+        )
+    ]
 
-    made = []
-    for n in range(len(rows)):
-        hips, turn = _hips(rows, n), rows.global_orient[n]
-        if np.isfinite(hips).all() and np.isfinite(turn).all():
-            R = Rotation.from_rotvec(turn).as_matrix() @ _BODY_FROM_FRONT
-            made.append(_transform(WORLD, f"body_{rows.person[n]}", rigid(R, hips), time_s))
-    return {"transforms": made}
+
+def joint_state(human: Human, time_s: float) -> Message:
+    """sensor_msgs/JointState of one person."""
+    return {
+        "header": header(f"body_{human.body_id}", time_s),
+        "name": [f"{name}_{human.body_id}" for name in human.angles],
+        "position": list(human.angles.values()),
+        "velocity": [],
+        "effort": [],
+    }
+
+
+def skeleton_and_region(
+    points: Sequence[tuple[float, float, float]], camera: Camera, time_s: float
+) -> tuple[Message, Message]:
+    """hri_msgs/Skeleton2D and hri_msgs/NormalizedRegionOfInterest2D of the points of one person in
+    the picture of a camera.
+    """
+    stamped = {"header": header(optical(camera), time_s)}
+    inside = np.array([each for each in points if each[2] > 0]).reshape(-1, 3)
+    box = np.stack([inside.min(axis=0), inside.max(axis=0)]) if len(inside) else np.zeros((2, 3))
+    (xmin, ymin, _), (xmax, ymax, c) = box.tolist()
+    skeleton = [dict(zip("xyc", each, strict=True)) for each in points]
+    region = {"xmin": xmin, "ymin": ymin, "xmax": xmax, "ymax": ymax, "c": c}
+    return stamped | {"skeleton": skeleton}, stamped | region
 
 
 def fixed_transforms(rig: Rig, time_s: float) -> Message:
@@ -102,15 +139,12 @@ def fixed_transforms(rig: Rig, time_s: float) -> Message:
     return {"transforms": made}
 
 
-def carrier_transforms(rig: Rig, time_s: float) -> Message:
-    """tf2_msgs/TFMessage: transforms from the world to each camera carrier (such as a robot)."""
+def carrier_transforms(rig: Rig, time_s: float) -> list[Message]:
+    """geometry_msgs/TransformStamped from the world to each camera carrier (such as a robot)."""
     at = np.full(1, time_s)
-    return {
-        "transforms": [
-            _transform(WORLD, ros_name(each.name), each.at(at)[0], time_s)
-            for each in rig.trajectories
-        ]
-    }
+    return [
+        _transform(WORLD, ros_name(each.name), each.at(at)[0], time_s) for each in rig.trajectories
+    ]
 
 
 def camera_info(camera: Camera, time_s: float) -> Message:
@@ -174,17 +208,6 @@ def ros_name(name: str) -> str:
 def optical(camera: Camera) -> str:
     """Name of a camera's optical frame, z forward."""
     return f"{ros_name(camera.name)}_optical"
-
-
-def _hips(rows: Reconstruction, n: int) -> Array:
-    """(3,) midpoint of the hips, metres; NaN if unknown."""
-    names = rows.joint_names.tolist()
-    at = [
-        names.index(each)
-        for each in (["MidHip"] if "MidHip" in names else ["RHip", "LHip"])
-        if each in names
-    ]
-    return rows.joints[n, at].mean(axis=0) if at else np.full(3, math.nan)
 
 
 def _transform(parent: str, child: str, pose: Array, time_s: float) -> Message:
