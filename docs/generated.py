@@ -221,7 +221,7 @@ def _constant(module: str, name: str) -> str:
                     | ast.AnnAssign(target=ast.Name(id=target))
                 ),
                 ast.Expr(value=ast.Constant(value=str(text))),
-            ) if target == name:
+            ) if to == name:
                 return inspect.cleandoc(text)
     return ""
 
