@@ -118,8 +118,10 @@ def _command(name: str, command: Any, heading: str) -> Iterator[str]:
     """The section of one command, and of the commands below it."""
     yield f"{heading} {name}\n\n{inspect.cleandoc(command.help or '')}\n\n"
     arguments = [each for each in command.params if each.param_type_name == "argument"]
-    usage = " ".join([name, *(each.metavar or each.name.upper() for each in arguments)])
-    yield f"```text\n{usage} [OPTIONS]\n```\n\n"
+    words = [each.metavar or each.name.upper() for each in arguments]
+    required = [each for each in command.params if each.required and each not in arguments]
+    words += [f"{each.opts[0]} {each.metavar or each.name.upper()}" for each in required]
+    yield f"```text\n{' '.join([name, *words, '[OPTIONS]'])}\n```\n\n"
     rows = [_row(each) for each in command.params if not getattr(each, "hidden", False)]
     if rows:
         yield "| option | meaning |\n|---|---|\n" + "".join(rows) + "\n"
@@ -209,20 +211,16 @@ def _directive(module: str, name: str) -> str:
 
 
 def _constant(module: str, name: str) -> str:
-    """The docstring below the assignment of a constant, in the module that others import it from."""
+    """The docstring below the assignment of a constant, in the module where it is assigned."""
     nodes = ast.parse(inspect.getsource(importlib.import_module(module))).body
     for node, below in zip(nodes, [*nodes[1:], None], strict=True):
-        match node, below:
-            case ast.ImportFrom(names=names), _ if name in [each.name for each in names]:
-                return _constant(str(node.module), name)
-            case (
-                (
-                    ast.Assign(targets=[ast.Name(id=target)])
-                    | ast.AnnAssign(target=ast.Name(id=target))
-                ),
-                ast.Expr(value=ast.Constant(value=str(text))),
-            ) if to == name:
-                return inspect.cleandoc(text)
+        if isinstance(node, ast.ImportFrom) and name in [each.name for each in node.names]:
+            return _constant(str(node.module), name)
+        targets = getattr(node, "targets", [getattr(node, "target", None)])
+        if [getattr(each, "id", None) for each in targets] == [name]:
+            match below:
+                case ast.Expr(value=ast.Constant(value=str(text))):
+                    return inspect.cleandoc(text)
     return ""
 
 
