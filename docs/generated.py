@@ -68,6 +68,7 @@ def complete(app: Any, page: str, source: list[str]) -> None:
     """Add to the text of a page what is generated for it."""
     parts = {
         "README": navigation,
+        "docs/examples/README": scripts,
         "docs/reference/commands": commands,
         "docs/reference/settings": settings,
         "docs/reference/api": api,
@@ -81,6 +82,14 @@ def navigation() -> str:
     return "".join(
         f"```{{toctree}}\n:hidden:\n:caption: {title}\n\n" + "\n".join(pages) + "\n```\n\n"
         for title, pages in NAVIGATION.items()
+    )
+
+
+def scripts() -> str:
+    """The text of every example, below the gallery."""
+    names = [each.name for each in sorted((ROOT / "docs/examples").glob("[0-9]*.py"))]
+    return "".join(
+        f"## {name}\n\n```{{literalinclude}} {name}\n:language: python\n```\n\n" for name in names
     )
 
 
@@ -109,8 +118,10 @@ def _command(name: str, command: Any, heading: str) -> Iterator[str]:
     """The section of one command, and of the commands below it."""
     yield f"{heading} {name}\n\n{inspect.cleandoc(command.help or '')}\n\n"
     arguments = [each for each in command.params if each.param_type_name == "argument"]
-    usage = " ".join([name, *(each.metavar or each.name.upper() for each in arguments)])
-    yield f"```text\n{usage} [OPTIONS]\n```\n\n"
+    words = [each.metavar or each.name.upper() for each in arguments]
+    required = [each for each in command.params if each.required and each not in arguments]
+    words += [f"{each.opts[0]} {each.metavar or each.name.upper()}" for each in required]
+    yield f"```text\n{' '.join([name, *words, '[OPTIONS]'])}\n```\n\n"
     rows = [_row(each) for each in command.params if not getattr(each, "hidden", False)]
     if rows:
         yield "| option | meaning |\n|---|---|\n" + "".join(rows) + "\n"
@@ -194,16 +205,23 @@ def _directive(module: str, name: str) -> str:
         return f".. autoclass:: {module}.{name}\n   :members:\n\n"
     if inspect.isroutine(value):
         return f".. autofunction:: {module}.{name}\n\n"
-    return f".. autodata:: {_home(module, name)}.{name}\n   :no-value:\n\n"
+    lines = _constant(module, name).splitlines()
+    as_text(None, "data", name, value, None, lines)
+    return f".. py:data:: {module}.{name}\n\n" + "".join(f"   {line}\n" for line in lines) + "\n"
 
 
-def _home(module: str, name: str) -> str:
-    """The module that assigns a constant, and documents it, of those that import it one another."""
-    source = inspect.getsource(importlib.import_module(module))
-    for node in ast.parse(source).body:
+def _constant(module: str, name: str) -> str:
+    """The docstring below the assignment of a constant, in the module where it is assigned."""
+    nodes = ast.parse(inspect.getsource(importlib.import_module(module))).body
+    for node, below in zip(nodes, [*nodes[1:], None], strict=True):
         if isinstance(node, ast.ImportFrom) and name in [each.name for each in node.names]:
-            return _home(str(node.module), name)
-    return module
+            return _constant(str(node.module), name)
+        targets = getattr(node, "targets", [getattr(node, "target", None)])
+        if [getattr(each, "id", None) for each in targets] == [name]:
+            match below:
+                case ast.Expr(value=ast.Constant(value=str(text))):
+                    return inspect.cleandoc(text)
+    return ""
 
 
 def as_text(app: Any, what: str, name: str, value: Any, options: Any, lines: list[str]) -> None:
