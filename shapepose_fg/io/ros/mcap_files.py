@@ -85,6 +85,17 @@ class McapWriter(AbstractContextManager["McapWriter"]):
         self._file.write_message(topic, self._schemas[kind], message, log_time=nanoseconds(time_s))
 
 
+def view_of_message(
+    message: Any, place: str, rig: Rig, skeleton: Skeleton
+) -> tuple[str, Detections, float]:
+    """Camera, detections and time in seconds of a shapepose_msgs/Detections. InputError naming
+    `place` if it is invalid.
+    """
+    people = [list(map(float, each.pose_keypoints_2d)) for each in message.people]
+    time_s = stamp_ns(message.header) / NS
+    return view_of(message.camera, time_s, people, place, rig, skeleton)
+
+
 def read_views(
     file: Path, rig: Rig, skeleton: Skeleton, note: Callable[[str], None]
 ) -> Iterator[View]:
@@ -133,11 +144,7 @@ def read_views(
                 with _whole(file, _CURE):
                     if message.camera in rig.unwanted:
                         continue
-                    people = [list(map(float, each.pose_keypoints_2d)) for each in message.people]
-                    time_s = stamp_ns(message.header) / NS
-                    view = view_of(
-                        message.camera, time_s, people, f"{file}, message {number}", rig, skeleton
-                    )
+                    view = view_of_message(message, f"{file}, message {number}", rig, skeleton)
                     goes = carrier[message.camera]
                     waiting.append(
                         (view, frame_of(goes) if goes else message.header.frame_id.lstrip("/"))

@@ -7,7 +7,7 @@ pictures.
 """
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -122,9 +122,9 @@ def skeleton_and_region(
     return stamped | {"skeleton": skeleton}, stamped | region
 
 
-def fixed_transforms(rig: Rig, time_s: float) -> Message:
+def fixed_transforms(rig: Rig, time_s: float, moving: Collection[str] = ()) -> Message:
     """tf2_msgs/TFMessage of static frames: from `map` to `world`, and from `world`, or from their
-    carriers, to the cameras.
+    carriers, to the cameras. Cameras that are `moving` without a carrier are left out.
     """
     from scipy.spatial.transform import Rotation
 
@@ -132,6 +132,8 @@ def fixed_transforms(rig: Rig, time_s: float) -> Message:
     R = np.diag([1.0, -1, -1]) if up @ z < 0 else Rotation.align_vectors(z, up)[0].as_matrix()
     made = [_transform(MAP, WORLD, rigid(R, np.zeros(3)), time_s)]
     for camera in rig.cameras:
+        if camera.name in moving and not camera.carrier:
+            continue
         parent, pose = (
             (ros_name(camera.carrier), camera.bTc) if camera.carrier else (WORLD, camera.wTc)
         )

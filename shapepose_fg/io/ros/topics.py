@@ -1,6 +1,6 @@
 """Topics on which people are published, for MCAP files and for nodes."""
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.reconstruction import Reconstruction
@@ -33,21 +33,31 @@ class PeopleTopics:
 
     `rig` may be None: then there are no messages about cameras. `covariances` is a level of
     `COVARIANCES`. With the name of a camera as `picture`, people get their 2D skeleton and region
-    in its picture.
+    in its picture. Cameras that are `moving` without a carrier have no static frame.
     """
 
-    def __init__(self, rig: Rig | None, covariances: str = "all", picture: str = "") -> None:
-        self._rig, self._covariances = rig, covariances
+    def __init__(
+        self,
+        rig: Rig | None,
+        covariances: str = "all",
+        picture: str = "",
+        moving: Collection[str] = (),
+    ) -> None:
+        self._rig, self._covariances, self._moving = rig, covariances, moving
         self._camera = (
             rig.cameras[rig.names.index(picture)] if rig is not None and picture else None
         )
         self._described = set[str]()
-        """Identifiers of bodies whose URDF has been published."""
+        """Identifiers of the people whose URDF has been published; who returns gets another."""
 
     def fixed(self, time_s: float) -> Iterator[Published]:
         """Yield /tf_static and the cameras, which are published once."""
         if self._rig is not None:
-            yield "/tf_static", "tf2_msgs/TFMessage", fixed_transforms(self._rig, time_s)
+            yield (
+                "/tf_static",
+                "tf2_msgs/TFMessage",
+                fixed_transforms(self._rig, time_s, self._moving),
+            )
             for camera in self._rig.cameras:
                 topic = f"/{ros_name(camera.name)}/camera_info"
                 yield topic, "sensor_msgs/CameraInfo", camera_info(camera, time_s)
@@ -75,6 +85,7 @@ class PeopleTopics:
             yield "/tf", "tf2_msgs/TFMessage", {"transforms": moved}
         ids = {"header": header("", time_s), "ids": [each.body_id for each in people]}
         yield f"{_BODIES}/tracked", "hri_msgs/IdsList", ids
+        self._described &= {each.body_id for each in people}
         for each in people:
             here = f"{_BODIES}/{each.body_id}"
             yield f"{here}/joint_states", "sensor_msgs/JointState", joint_state(each, time_s)
