@@ -66,7 +66,7 @@ NAVIGATION = {
 
 
 def complete(app: Any, page: str, source: list[str]) -> None:
-    """Add to the text of a page what is generated for it; links to folders lead to the repository."""
+    """Add to a page what is generated for it; links to folders lead to the repository."""
     link = r"(?<=\]\()[^):#\s]+(?=\))"
     source[0] = re.sub(link, lambda found: _outside(page, found[0]), source[0])
     parts = {
