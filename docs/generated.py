@@ -4,6 +4,7 @@ import ast
 import importlib
 import inspect
 import re
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -48,6 +49,10 @@ NAVIGATION = {
         "Data flow <docs/data_flow>",
         "The body model <docs/body_model>",
         "Body fitting <docs/body_fitting>",
+        "Data of the body <shapepose_fg/body/data/README>",
+        "The fitter's weights <shapepose_fg/body/data/fitter>",
+        "The prior of poses <shapepose_fg/body/data/pose_prior>",
+        "The prior of motion <shapepose_fg/body/data/motion_prior>",
     ],
     "Judge": [
         "Evaluation <docs/evaluation>",
@@ -55,17 +60,15 @@ NAVIGATION = {
         "Contributing and support <CONTRIBUTING>",
         "Security <SECURITY>",
         "Licences <docs/licences>",
-        "Data of the body <shapepose_fg/body/data/README>",
-        "The fitter's weights <shapepose_fg/body/data/fitter>",
-        "The prior of poses <shapepose_fg/body/data/pose_prior>",
-        "The prior of motion <shapepose_fg/body/data/motion_prior>",
     ],
 }
 """Titles of the sidebar's groups, and their pages."""
 
 
 def complete(app: Any, page: str, source: list[str]) -> None:
-    """Add to the text of a page what is generated for it."""
+    """Add to a page what is generated for it; links to folders lead to the repository."""
+    link = r"(?<=\]\()[^):#\s]+(?=\))"
+    source[0] = re.sub(link, lambda found: _outside(page, found[0]), source[0])
     parts = {
         "README": navigation,
         "docs/examples/README": scripts,
@@ -75,6 +78,15 @@ def complete(app: Any, page: str, source: list[str]) -> None:
     }
     if page in parts:
         source[0] = f"{source[0].rstrip()}\n\n{parts[page]()}"
+
+
+def _outside(page: str, link: str) -> str:
+    """A link of a page; if it leads to a folder, as its address in the repository."""
+    there = (ROOT / page).parent.joinpath(link).resolve()
+    if not there.is_dir():
+        return link
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    return f"{project['urls']['Repository']}/tree/main/{there.relative_to(ROOT).as_posix()}"
 
 
 def navigation() -> str:
