@@ -110,7 +110,7 @@ def test_bodies_face_along_x_with_the_head_along_z(file, people):
     bodies = [each for each in seen if each.child_frame_id.startswith("body_")]
     assert len(bodies) == 2 * T - 1  # one body is not known
     in_world = {each.child_frame_id for each in seen if each.header.frame_id == "world"}
-    assert in_world == {"body_3", "body_12", "robot_tum"}
+    assert in_world == {"body_p3", "body_p12", "robot_tum"}
     R = gtsam.Rot3.Rodrigues(people.global_orient[0]).matrix()
     np.testing.assert_allclose(matrix(bodies[0])[:3, 0], R[:, 2], atol=1e-12)  # SMPL faces +z
     np.testing.assert_allclose(
@@ -232,7 +232,7 @@ def test_a_second_reader_with_definitions_of_its_own_agrees(file, people):
             if connection.msgtype == "visualization_msgs/msg/MarkerArray":
                 assert message.markers[0].mesh_use_embedded_materials is False
             if connection.topic == "/humans/bodies/tracked":
-                assert set(message.ids) <= {"3", "12"}
+                assert set(message.ids) <= {"p3", "p12"}
         assert (
             counts["tf2_msgs/msg/TFMessage"] == T + 1 and counts["sensor_msgs/msg/CameraInfo"] == 5
         )

@@ -3,6 +3,7 @@ messages.
 """
 
 import json
+import re
 from dataclasses import replace
 from itertools import pairwise
 from xml.etree import ElementTree
@@ -12,6 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
+from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.reconstruction import Known, Reconstruction
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.io.ros.definitions import FIELDS, definition, type_name
@@ -114,6 +116,7 @@ def test_joint_states_put_limbs_where_people_have_them(people):
                 assert angle_deg(along[0], upper) < 1e-4
                 bend = angle_deg(upper, lower)
                 assert angle_deg(along[1], lower) < (2 if bend > 30 else 7)
+            assert -0.41 < each.angles[f"{side}_p_shoulder"] < 3.3
         np.testing.assert_allclose(rotation["head"], each.links["head"][:3, :3], atol=1e-9)
 
 
@@ -132,6 +135,7 @@ def test_limbs_bend_as_those_of_people_do(people):
         assert 1.2 < human.angles[f"{side}_elbow"] < 1.9
         assert -1.9 < human.angles[f"{side}_knee"] < -1.2
         assert abs(human.angles[f"{side}_p_shoulder"]) < 0.4
+        assert -1.2 < human.angles[f"{side}_y_shoulder"] < 2.0
         assert abs(human.angles[f"{side}_r_hip"]) < 0.3 > abs(human.angles[f"{side}_y_hip"])
 
 
@@ -139,15 +143,15 @@ def test_frames_are_those_of_the_standard(people):
     published = list(PeopleTopics(None).frame(people, 2.5, "settled", True))
     (tf,) = [fields for topic, _, fields in published if topic == "/tf"]
     parents = {each["child_frame_id"]: each["header"]["frame_id"] for each in tf["transforms"]}
-    assert parents["body_3"] == "world"
+    assert parents["body_p3"] == "world"
     others = {child for child in parents if not child.startswith("body_")}
     links = {child for _, child, _ in CHAIN.values()}
     for child in others:
         link, _, body = child.rpartition("_")
         assert link in links and parents[child] == f"body_{body}"
-    assert {f"l_wrist_{n + 3}" for n in range(N)} <= others
+    assert {f"l_wrist_p{n + 3}" for n in range(N)} <= others
     (tracked,) = [fields for topic, _, fields in published if topic == "/humans/bodies/tracked"]
-    assert tracked["ids"] == [str(n + 3) for n in range(N)]
+    assert tracked["ids"] == [f"p{n + 3}" for n in range(N)]
     for each in humans(people):
         wrist = each.world_from_body @ each.links["r_wrist"] @ [0, 0, 0, 1]
         at = BODY_25.index("RWrist")
@@ -158,20 +162,20 @@ def test_the_urdf_is_the_reference_model_with_a_persons_lengths(people):
     first, *_ = humans(people)
     robot = ElementTree.fromstring(first.urdf() or "")
     vector = lambda element, key: tuple(float(x) for x in element.get(key).split())  # noqa: E731
-    found, place = {}, {"body_3": np.zeros(3)}
-    rotation = {f"{name}_3": R for name, R in turned(first.angles).items()}
+    found, place = {}, {"body_p3": np.zeros(3)}
+    rotation = {f"{name}_p3": R for name, R in turned(first.angles).items()}
     for joint in robot.findall("joint"):
         parent, child = joint.find("parent").get("link"), joint.find("child").get("link")
         axis = None if joint.get("type") == "fixed" else vector(joint.find("axis"), "xyz")
-        found[joint.get("name").removesuffix("_3")] = (
-            parent.removesuffix("_3"), child.removesuffix("_3"), axis,
+        found[joint.get("name").removesuffix("_p3")] = (
+            parent.removesuffix("_p3"), child.removesuffix("_p3"), axis,
         )  # fmt: skip
         place[child] = place[parent] + rotation[parent] @ vector(joint.find("origin"), "xyz")
     assert found == CHAIN
     assert {link.get("name") for link in robot.findall("link")} == place.keys()
     # The trunk of the model bends in one direction only; legs start at the hips.
     for limb in ("l_knee", "r_knee", "l_ankle", "r_ankle"):
-        np.testing.assert_allclose(place[f"{limb}_3"], first.links[limb][:3, 3], atol=0.08)
+        np.testing.assert_allclose(place[f"{limb}_p3"], first.links[limb][:3, 3], atol=0.08)
 
 
 def test_who_is_not_known_whole_is_published_as_far_as_known(people):
@@ -202,6 +206,14 @@ def test_points_of_the_picture_are_those_of_the_camera(people, five_cameras):
     np.testing.assert_allclose(points[7, :2] * camera.image_size, camera.distort(xy[None])[0])
     behind = replace(rows, joints=2 * camera.centre - rows.joints)
     assert not np.any(skeleton_2d(behind, 0, camera))
+
+
+def test_names_of_topics_are_those_that_ros_allows(people, five_cameras):
+    """Parts of names begin with a letter or an underscore."""
+    rig = Rig((replace(five_cameras.cameras[0], name="2 left"), *five_cameras.cameras[1:]), "z")
+    topics = PeopleTopics(rig, picture="2 left")
+    for topic, *_ in (*topics.fixed(2.5), *topics.frame(people, 2.5, "now", True)):
+        assert re.fullmatch(r"(/[A-Za-z_][A-Za-z0-9_]*)+", topic)
 
 
 def test_urdf_is_published_once(people):

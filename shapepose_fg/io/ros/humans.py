@@ -7,7 +7,6 @@ trunk bends only forwards and backwards, elbows and knees are hinges.
 """
 
 import math
-import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import reduce
@@ -24,8 +23,8 @@ from shapepose_fg.core.reconstruction import Reconstruction
 
 _FRONT_LEFT_UP = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
 """Rotation to SMPL's axes (x left, y up, z front) from axes to the front, to the left and up."""
-_HEAD = (0, 3, 6, 9, 12, 15)
-"""SMPL's joints from the pelvis to the head."""
+_HEAD = (3, 6, 9, 12, 15)
+"""SMPL's joints from above the pelvis to the head."""
 _HINGE = (0, -1, 0)
 """Axis of elbows and knees."""
 _HEAD_NAMES, _HEAD_AXES = ("r_head", "y_head", "p_head"), ((1, 0, 0), (0, 0, 1), _HINGE)
@@ -39,6 +38,9 @@ _SKELETON_2D = (
     "LEye REye LEar REar"
 ).split()
 """Points of hri_msgs/Skeleton2D in their order."""
+_LEAST_LIFT, _MIDDLE_YAW = 0.4, 0.4
+"""Limits of the shoulder in the reference model, radians: largest lift to the back, and the middle
+of its turns about the vertical."""
 _RADIUS_M = 0.03
 """Radius of the limbs that the URDF draws, m."""
 
@@ -54,7 +56,7 @@ class _Limb(NamedTuple):
     joints: tuple[str, ...]
     """Joints at the origins of these links, in the result."""
     smpl: tuple[int, ...]
-    """SMPL's joints from the pelvis to the upper link."""
+    """SMPL's joints from above the pelvis to the upper link."""
     side: float
     """1 on the left, -1 on the right: direction along y."""
 
@@ -86,10 +88,10 @@ _LIMBS = tuple(
         1.0 if side == "L" else -1.0,
     )
     for side, names, smpl in (
-        ("L", _ARM, (0, 3, 6, 9, 13, 16)),
-        ("R", _ARM, (0, 3, 6, 9, 14, 17)),
-        ("L", _LEG, (0, 1)),
-        ("R", _LEG, (0, 2)),
+        ("L", _ARM, (3, 6, 9, 13, 16)),
+        ("R", _ARM, (3, 6, 9, 14, 17)),
+        ("L", _LEG, (1,)),
+        ("R", _LEG, (2,)),
     )
 )
 
@@ -101,7 +103,8 @@ class Human:
     row: int
     """Row of the result."""
     body_id: str
-    """Identifier in the names of topics, frames and joints."""
+    """Identifier in the names of topics, frames and joints: p and the identity, because ROS 2 does
+    not allow parts of topics that begin with a digit."""
     world_from_body: Array
     """(4, 4) pose of the frame at the middle of the hips, x to the front and z to the head."""
     links: dict[str, Array]
@@ -167,17 +170,54 @@ def humans(rows: Reconstruction) -> Iterator[Human]:
     Origins of links are joints of the result. Angles turn the limbs of the model towards the next
     joint; an almost straight elbow or knee may differ from it by a few degrees.
     """
-    for n in range(len(rows)):
-        joints = dict(zip(rows.joint_names.tolist(), rows.joints[n], strict=True))
-        hips = joints.get("MidHip", _middle(joints, "RHip", "LHip"))
-        turns = np.concatenate([rows.global_orient[n, None], rows.body_pose[n]])
-        if np.isfinite(hips).all() and np.isfinite(turns).all():
-            smpl = exp_so3(turns)
-            R = smpl[0] @ _FRONT_LEFT_UP
-            places = {name: (each - hips) @ R for name, each in joints.items()}
-            links, angles = _links(places, smpl)
-            known = {name: link for name, link in links.items() if np.isfinite(link).all()}
-            yield Human(n, str(int(rows.person[n])), rigid(R, hips), known, angles)
+    names = rows.joint_names.tolist()
+    xyz = np.concatenate([rows.joints, np.full((len(rows), 1, 3), np.nan)], axis=1)
+
+    def place(*wanted: str) -> Array:
+        """(N, 3) middle of joints; NaN if one is unknown."""
+        return xyz[:, [names.index(each) if each in names else -1 for each in wanted]].mean(axis=1)
+
+    hips = place(*_present(names, "MidHip", "RHip", "LHip"))
+    turns = np.concatenate([rows.global_orient[:, None], rows.body_pose], axis=1)
+    known = np.isfinite(hips).all(axis=1) & np.isfinite(turns).all(axis=(1, 2))
+    smpl = exp_so3(np.where(known[:, None, None], turns, 0.0))
+    world_from_body = rigid(smpl[:, 0] @ _FRONT_LEFT_UP, hips)
+    xyz = (xyz - hips[:, None]) @ world_from_body[:, :3, :3]
+
+    def by_body(chain: tuple[int, ...]) -> Array:
+        """(N, 3, 3) rotations of a bone in the body's frame; the identity in SMPL's rest pose."""
+        return _FRONT_LEFT_UP.T @ reduce(np.matmul, (smpl[:, n] for n in chain)) @ _FRONT_LEFT_UP
+
+    neck = place(*_present(names, "Neck", "LShoulder", "RShoulder"))
+    pitch = np.nan_to_num(np.arctan2(neck[:, 0], neck[:, 2]))
+    torso, head = exp_so3(pitch[:, None] * [0.0, 1.0, 0.0]), by_body(_HEAD)
+    links = {
+        "waist": rigid(torso, np.zeros((len(rows), 3))),
+        "torso": rigid(torso, neck),
+        "head": rigid(head, place("LEar", "REar")),
+    }
+    angles = {"waist": pitch} | _head_angles(torso.mT @ head)
+    for limb in _LIMBS:
+        points = [place(name) for name in limb.joints]
+        # SMPL's arms point to the sides at rest, those of this model hang.
+        hang = exp_so3(np.array([limb.side * math.pi / 2 if limb.is_arm else 0.0, 0.0, 0.0]))
+        upper, bend = _hinged(*np.diff(points, axis=0), by_body(limb.smpl) @ hang, limb.is_arm)
+        lower = upper @ exp_so3(np.nan_to_num(bend)[:, None] * _HINGE)
+        for name, turn, point in zip(limb.links, (upper, lower, lower), points, strict=True):
+            links[name] = rigid(turn, point)
+        turned = torso.mT @ upper if limb.is_arm else upper
+        mirrored = turned * np.outer((1, limb.side, 1), (1, limb.side, 1))
+        three = _shoulder_angles(mirrored) if limb.is_arm else _hip_angles(mirrored, limb.side)
+        angles |= zip(limb.names, three, strict=True)
+        angles[limb.links[1]] = bend
+    for n in np.flatnonzero(known).tolist():
+        yield Human(
+            n,
+            f"p{int(rows.person[n])}",
+            world_from_body[n],
+            {name: link[n] for name, link in links.items() if np.isfinite(link[n]).all()},
+            {name: float(each[n]) for name, each in angles.items() if math.isfinite(each[n])},
+        )
 
 
 def skeleton_2d(rows: Reconstruction, row: int, camera: Camera) -> list[tuple[float, float, float]]:
@@ -194,69 +234,52 @@ def skeleton_2d(rows: Reconstruction, row: int, camera: Camera) -> list[tuple[fl
     return [(x, y, c) for x, y, c in points.tolist()]
 
 
-def _links(places: dict[str, Array], smpl: Array) -> tuple[dict[str, Array], dict[str, float]]:
-    """Links, NaN if unknown, and angles, from joints in the body's frame and SMPL's rotations (24,
-    3, 3).
+def _present(names: list[str], whole: str, *parts: str) -> tuple[str, ...]:
+    """The joint `whole` if the result has it, otherwise those whose middle it is."""
+    return (whole,) if whole in names else parts
+
+
+def _hinged(upper: Array, lower: Array, by_body: Array, is_arm: bool) -> tuple[Array, Array]:
+    """Rotations (N, 3, 3) of upper arms or thighs along -z, and the angles (N,) of their hinges,
+    from the vectors (N, 3) to the next joint and from there to the end; NaN if unknown.
+
+    `by_body` (N, 3, 3) are the rotations according to the fitted body.
     """
-
-    def by_body(chain: tuple[int, ...]) -> Array:
-        """Rotation of a bone in the body's frame; the identity in SMPL's rest pose."""
-        return _FRONT_LEFT_UP.T @ reduce(np.matmul, smpl[list(chain[1:])]) @ _FRONT_LEFT_UP
-
-    neck = places.get("Neck", _middle(places, "LShoulder", "RShoulder"))
-    pitch = math.atan2(neck[0], neck[2]) if np.isfinite(neck).all() else 0.0
-    torso, head = exp_so3(np.array([0.0, pitch, 0.0])), by_body(_HEAD)
-    links = {
-        "waist": rigid(torso, np.zeros(3)),
-        "torso": rigid(torso, neck),
-        "head": rigid(head, _middle(places, "LEar", "REar")),
-    }
-    angles = {"waist": pitch}
-    angles |= zip(_HEAD_NAMES, _angles(torso.T @ head, _HEAD_AXES), strict=True)
-    for limb in _LIMBS:
-        # SMPL's arms point to the sides at rest, those of this model hang.
-        hang = exp_so3(np.array([limb.side * math.pi / 2 if limb.is_arm else 0.0, 0.0, 0.0]))
-        start, middle, end = (places.get(name, np.full(3, np.nan)) for name in limb.joints)
-        forwards = 1.0 if limb.is_arm else -1.0
-        upper, bend = _hinged(middle - start, end - middle, by_body(limb.smpl) @ hang, forwards)
-        lower = upper @ exp_so3(np.array(_HINGE) * np.nan_to_num(bend))
-        turns, points = (upper, lower, lower), (start, middle, end)
-        links |= {
-            name: rigid(turn, point)
-            for name, turn, point in zip(limb.links, turns, points, strict=True)
-        }
-        if np.isfinite(upper).all():
-            root = torso if limb.is_arm else np.eye(3)
-            angles |= zip(limb.names, _angles(root.T @ upper, limb.axes), strict=True)
-            angles |= {limb.links[1]: bend} if math.isfinite(bend) else {}
-    return links, angles
+    z = -upper / np.linalg.norm(upper, axis=-1, keepdims=True)
+    along = lower / np.linalg.norm(lower, axis=-1, keepdims=True)
+    across = np.nan_to_num(along - (along * z).sum(axis=-1, keepdims=True) * z)
+    bent = across * np.linalg.norm(across, axis=-1, keepdims=True)
+    x = by_body[..., 0] * _STRAIGHT**2 + (bent if is_arm else -bent)
+    x -= (x * z).sum(axis=-1, keepdims=True) * z
+    x /= np.maximum(np.linalg.norm(x, axis=-1, keepdims=True), 1e-12)
+    R = np.stack([x, np.cross(z, x), z], axis=-1)
+    return R, np.arctan2((along * x).sum(axis=-1), -(along * z).sum(axis=-1))
 
 
-def _hinged(upper: Array, lower: Array, by_body: Array, forwards: float) -> tuple[Array, float]:
-    """Rotation (3, 3) of an upper arm or thigh along -z, and the angle of its hinge, from the
-    vectors to the next joint and from there to the end; NaN if unknown.
+def _head_angles(R: Array) -> dict[str, Array]:
+    """Angles of R (N, 3, 3) = X(r_head) Z(y_head) Y(-p_head)."""
+    yaw = np.arctan2(-R[:, 0, 1], np.hypot(R[:, 1, 1], R[:, 2, 1]))
+    roll, pitch = np.arctan2(R[:, 2, 1], R[:, 1, 1]), -np.arctan2(R[:, 0, 2], R[:, 0, 0])
+    return dict(zip(_HEAD_NAMES, (roll, yaw, pitch), strict=True))
 
-    `by_body` is the rotation according to the fitted body, and `forwards` the direction in which
-    the hinge bends.
+
+def _hip_angles(R: Array, side: float) -> tuple[Array, Array, Array]:
+    """Angles y, p, r of R (N, 3, 3) = Z(-y) X(p) Y(-r), on the right mirrored: y is not mirrored in
+    the model.
     """
-    z, along = -upper / np.linalg.norm(upper), lower / np.linalg.norm(lower)
-    across = np.nan_to_num(along - (along @ z) * z)
-    x = by_body[:, 0] * _STRAIGHT**2 + forwards * across * np.linalg.norm(across)
-    x -= (x @ z) * z
-    x /= max(float(np.linalg.norm(x)), 1e-12)
-    return np.column_stack([x, np.cross(z, x), z]), math.atan2(along @ x, -(along @ z))
+    lift = np.arctan2(R[:, 2, 1], np.hypot(R[:, 0, 1], R[:, 1, 1]))
+    return side * np.arctan2(R[:, 0, 1], R[:, 1, 1]), lift, np.arctan2(R[:, 2, 0], R[:, 2, 2])
 
 
-def _angles(R: Array, axes: _Axes) -> list[float]:
-    """Angles of three consecutive joints about `axes` that together turn by R, radians."""
-    from scipy.spatial.transform import Rotation
-
-    with warnings.catch_warnings():  # of aligned axes: any split of their turn is right
-        warnings.simplefilter("ignore")
-        return Rotation.from_matrix(R).as_davenport(np.array(axes, float), "intrinsic").tolist()
-
-
-def _middle(places: dict[str, Array], first: str, second: str) -> Array:
-    """(3,) midpoint of two joints; NaN if unknown."""
-    unknown = np.full(3, np.nan)
-    return (places.get(first, unknown) + places.get(second, unknown)) / 2
+def _shoulder_angles(R: Array) -> tuple[Array, Array, Array]:
+    """Angles y, p, r of R (N, 3, 3) = Z(-y) X(p) Z(r), on the right mirrored. Of the two solutions
+    this is the one within the limits of the reference model.
+    """
+    lift = np.arctan2(np.hypot(R[:, 0, 2], R[:, 1, 2]), R[:, 2, 2])
+    yaw = np.arctan2(-R[:, 0, 2], -R[:, 1, 2])
+    backwards = (lift <= _LEAST_LIFT) & (np.cos(yaw - _MIDDLE_YAW) < 0)
+    yaw, lift = np.where(backwards, yaw + math.pi, yaw), np.where(backwards, -lift, lift)
+    x = np.cos(yaw) * R[:, 0, 0] - np.sin(yaw) * R[:, 1, 0]
+    y = np.sin(yaw) * R[:, 0, 0] + np.cos(yaw) * R[:, 1, 0]
+    roll = np.arctan2(np.cos(lift) * y + np.sin(lift) * R[:, 2, 0], x)
+    return (yaw + math.pi) % (2 * math.pi) - math.pi, lift, roll

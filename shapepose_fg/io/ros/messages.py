@@ -1,7 +1,7 @@
 """Converts rows of a result, and cameras, to the contents of ROS 2 messages.
 
 Coordinate frames follow REP 103 and 105: `map` has z up and is the parent of `world`, the frame of
-the calibration; `<camera>_optical` is a camera, z forward; `body_<identity>` is a person, at the
+the calibration; `<camera>_optical` is a camera, z forward; `body_p<identity>` is a person, at the
 midpoint of the hips, x to the front and z to the head. Time stamps are on the clock of the
 pictures.
 """
@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from shapepose_fg.body.model.rotation import quaternion
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.decompositions import rigid
@@ -83,17 +84,18 @@ def people_message(
 
 
 def body_transforms(people: Sequence[Human], time_s: float) -> list[Message]:
-    """geometry_msgs/TransformStamped: `body_<identity>` in the world, and the links of people in
+    """geometry_msgs/TransformStamped: `body_p<identity>` in the world, and the links of people in
     their bodies.
     """
-    return [
-        _transform(parent, f"{name}_{each.body_id}", pose, time_s)
+    made = [
+        (parent, f"{name}_{each.body_id}", pose)
         for each in people
         for parent, name, pose in (
             (WORLD, "body", each.world_from_body),
             *((f"body_{each.body_id}", name, link) for name, link in each.links.items()),
         )
     ]
+    return _transforms(made, time_s)
 
 
 def joint_state(human: Human, time_s: float) -> Message:
@@ -130,23 +132,20 @@ def fixed_transforms(rig: Rig, time_s: float, moving: Collection[str] = ()) -> M
 
     up, z = rig.up_vector, np.array([0.0, 0, 1])
     R = np.diag([1.0, -1, -1]) if up @ z < 0 else Rotation.align_vectors(z, up)[0].as_matrix()
-    made = [_transform(MAP, WORLD, rigid(R, np.zeros(3)), time_s)]
+    made = [(MAP, WORLD, rigid(R, np.zeros(3)))]
     for camera in rig.cameras:
-        if camera.name in moving and not camera.carrier:
-            continue
-        parent, pose = (
-            (ros_name(camera.carrier), camera.bTc) if camera.carrier else (WORLD, camera.wTc)
-        )
-        made.append(_transform(parent, optical(camera), pose, time_s))
-    return {"transforms": made}
+        if camera.carrier:
+            made.append((ros_name(camera.carrier), optical(camera), camera.bTc))
+        elif camera.name not in moving:
+            made.append((WORLD, optical(camera), camera.wTc))
+    return {"transforms": _transforms(made, time_s)}
 
 
 def carrier_transforms(rig: Rig, time_s: float) -> list[Message]:
     """geometry_msgs/TransformStamped from the world to each camera carrier (such as a robot)."""
     at = np.full(1, time_s)
-    return [
-        _transform(WORLD, ros_name(each.name), each.at(at)[0], time_s) for each in rig.trajectories
-    ]
+    made = [(WORLD, ros_name(each.name), each.at(at)[0]) for each in rig.trajectories]
+    return _transforms(made, time_s)
 
 
 def camera_info(camera: Camera, time_s: float) -> Message:
@@ -189,7 +188,7 @@ def _markers(rows: Reconstruction, time_s: float, lasts_s: float) -> Iterator[Me
             yield {
                 "header": header(WORLD, time_s), "ns": ns, "id": int(rows.person[n]) % _LAST_S,
                 "type": kind, "action": 0,
-                "pose": {"position": _xyz(np.zeros(3)), "orientation": _quaternion(np.eye(3))},
+                "pose": {"position": _xyz(np.zeros(3)), "orientation": _wxyz(np.eye(4)[0])},
                 "scale": _xyz(np.array(size)), "color": color,
                 "lifetime": {"sec": sec, "nanosec": nanosec}, "frame_locked": False,
                 "points": list(map(_xyz, points)), "colors": [], "texture_resource": "",
@@ -212,16 +211,24 @@ def optical(camera: Camera) -> str:
     return f"{ros_name(camera.name)}_optical"
 
 
-def _transform(parent: str, child: str, pose: Array, time_s: float) -> Message:
-    turn = {"translation": _xyz(pose[:3, 3]), "rotation": _quaternion(pose[:3, :3])}
-    return {"header": header(parent, time_s), "child_frame_id": child, "transform": turn}
+def _transforms(made: Sequence[tuple[str, str, Array]], time_s: float) -> list[Message]:
+    """geometry_msgs/TransformStamped of parents, children and poses (4, 4)."""
+    poses = np.array([pose for *_, pose in made]).reshape(-1, 4, 4)
+    return [
+        {
+            "header": header(parent, time_s),
+            "child_frame_id": child,
+            "transform": {"translation": _xyz(place), "rotation": _wxyz(turn)},
+        }
+        for (parent, child, _), place, turn in zip(
+            made, poses[:, :3, 3], quaternion(poses[:, :3, :3]), strict=True
+        )
+    ]
 
 
 def _xyz(point: Array) -> Message:
     return dict(zip("xyz", point.tolist(), strict=True))
 
 
-def _quaternion(R: Array) -> Message:
-    from scipy.spatial.transform import Rotation
-
-    return dict(zip("xyzw", Rotation.from_matrix(R).as_quat().tolist(), strict=True))
+def _wxyz(turn: Array) -> Message:
+    return dict(zip("wxyz", turn.tolist(), strict=True))

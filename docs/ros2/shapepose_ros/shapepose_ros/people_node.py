@@ -41,7 +41,7 @@ PARAMETERS: dict[str, Any] = {
 }
 """Parameters and their defaults; config/people.yaml explains them."""
 QUEUE = 50
-"""Maximum number of pictures of moving cameras that wait for a pose."""
+"""Maximum number of pictures of a camera that wait to be processed, or for a pose."""
 POSES_S = 3.0
 """Time for which poses of moving cameras are kept, s."""
 LATCH = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -80,8 +80,8 @@ class PeopleNode(Node):
             self._listen_to_poses(TFMessage, "/tf_static", LATCH)
             if own["odometry"]:
                 self._listen_to_poses(Odometry, own["odometry"], 100)
-        best_effort = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
-        quality = 50 if own["reliable_detections"] else best_effort
+        best_effort = QoSProfile(depth=QUEUE, reliability=ReliabilityPolicy.BEST_EFFORT)
+        quality = QUEUE if own["reliable_detections"] else best_effort
         for name in self.rig.names:
             topic = f"{ros_name(name)}/detections"
             self.create_subscription(Detections, topic, self.take_detections, quality)
@@ -145,9 +145,11 @@ class PeopleNode(Node):
             if topic not in self.publisher_of:
                 quality = LATCH if topic.endswith(LATCHED) else 100
                 self.publisher_of[topic] = self.create_publisher(message_type, topic, quality)
-            message = message_type()
-            set_message_fields(message, fields)
-            self.publisher_of[topic].publish(message)
+            publisher = self.publisher_of[topic]
+            if topic.endswith(LATCHED) or publisher.get_subscription_count() > 0:
+                message = message_type()
+                set_message_fields(message, fields)
+                publisher.publish(message)
             if topic == "/humans/bodies/tracked":
                 self._remove_others(fields["ids"])
 
