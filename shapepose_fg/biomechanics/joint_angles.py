@@ -275,4 +275,4 @@ def _rotation_covariance(people: Reconstruction, model: BodyModel, posed: BodyPa
     information[:, 3:72, 3:72] += blocks.swapaxes(1, 2) @ prior @ blocks
     information[:, range(75), range(75)] += 1e-6
     covariance = np.linalg.inv(information)[:, :72, :72]
-    return np.where(seen.any(axis=1)[:, None, None], covariance, np.nan)
+    return np.where(seen.any(axis=1).reshape(-1, 1, 1), covariance, np.nan)
