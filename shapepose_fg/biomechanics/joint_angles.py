@@ -10,17 +10,19 @@ movements have equal angles.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.priors import NUM_ANGLES, PosePrior
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
+from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model.rotation import exp_so3, right_jacobian_inverse
+from shapepose_fg.body.model.smpl_file import NUM_BETAS
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Axis
-from shapepose_fg.core.errors import InputError, optional
+from shapepose_fg.core.errors import InputError, naming, optional
 from shapepose_fg.core.reconstruction import BODY, Known, Reconstruction, with_body
 from shapepose_fg.core.skeleton import SMPL_24
 from shapepose_fg.io.export.take import opensim_axes
@@ -70,6 +72,12 @@ DEFINITIONS = (
 """The angles; docs/conventions.md describes them."""
 _BONES_ALONG = {"hip": "knee", "knee": "ankle", "shoulder": "elbow", "elbow": "wrist"}
 """Bones with a long axis: the joint at its proximal end, and the one at its distal end."""
+_LIMBS = np.array([NUM_BETAS + 3 * SMPL_24.index(f"{side}_{joint}") + axis
+                   for joint in ("hip", "knee", "ankle", "foot", "shoulder", "elbow", "wrist")
+                   for side in ("left", "right") for axis in range(3)])  # fmt: skip
+"""Columns of the Jacobian of the body's keypoints that belong to arms and legs."""
+_LEAST_INFORMATION = 1e-6
+"""Added to the diagonal of the information, so that a row with few joints has an inverse."""
 _STEP = 1e-4
 """Step of the central differences, rad."""
 _BLOCK = 256
@@ -95,25 +103,32 @@ def sides(definitions: Sequence[AngleDefinition]) -> list[tuple[AngleDefinition,
     return [(each, side) for each in definitions for side in (pairs if each.sided else ("",))]
 
 
-NAMES = tuple(f"{side}{each.name}_{angle}" for each, side in sides(DEFINITIONS)
-              for angle in each.angles)  # fmt: skip
+def _names(definitions: Sequence[AngleDefinition]) -> tuple[str, ...]:
+    return tuple(
+        f"{side}{each.name}_{angle}" for each, side in sides(definitions) for angle in each.angles
+    )
+
+
+NAMES = _names(DEFINITIONS)
 """(36,) names of the angles, such as `right_knee_flexion`."""
 
 
 @dataclass(frozen=True)
 class JointAngles:
-    """Angles of N rows, NaN in rows without a body."""
+    """A angles of N rows, NaN in rows without a body."""
 
     people: Reconstruction
     """The rows."""
+    names: tuple[str, ...]
+    """(A,) names of the angles, such as `right_knee_flexion`; `NAMES` by default."""
     degrees: Array
-    """(N, 36) angles of `NAMES`, degrees, -180 to 180."""
+    """(N, A) angles, degrees, -180 to 180."""
     covariance: Array
-    """(N, 36, 36) their covariance, square degrees; NaN where the result has no covariances."""
+    """(N, A, A) their covariance, square degrees; NaN where the result has no covariances."""
 
     @property
     def sigma(self) -> Array:
-        """(N, 36) standard deviations, degrees."""
+        """(N, A) standard deviations, degrees."""
         return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
     def columns(self) -> dict[str, NDArray[Any]]:
@@ -123,7 +138,7 @@ class JointAngles:
         columns: dict[str, NDArray[Any]] = {
             name: getattr(self.people, name) for name in ("frame", "time_s", "person")
         }
-        for name, degrees, sigma in zip(NAMES, self.degrees.T, self.sigma.T, strict=True):
+        for name, degrees, sigma in zip(self.names, self.degrees.T, self.sigma.T, strict=True):
             columns |= {f"{name}_deg": degrees, f"{name}_sigma_deg": sigma}
         return columns
 
@@ -133,34 +148,41 @@ class JointAngles:
 
 
 def joint_angles(
-    people: Reconstruction, up: Axis | None = None, model: BodyModel | None = None
+    people: Reconstruction,
+    up: Axis | None = None,
+    model: BodyModel | None = None,
+    definitions: Sequence[AngleDefinition] = DEFINITIONS,
 ) -> JointAngles:
-    """Angles of the bodies of `people`.
+    """Angles of the bodies of `people`, by `definitions`.
 
     `up` is the axis of the world that points up, by default that of `people.rig`; `model` is the
     body with which they were fitted, by default the one that `people.run` names. InputError if they
-    are unknown. Covariances: the joints that a view saw are measurements of the body's rotations,
-    with their covariances; the pose prior is added. An angle that they do not determine, such as
-    the axial rotation of a straight limb, has the variance of the prior.
+    are unknown. The joints that a view saw are measurements of the body's rotations, with their
+    covariances; the priors of pose and shape are added. An angle that they do not determine, such
+    as the axial rotation of a straight limb, has the variance of the prior.
     """
-    if up is None and people.rig is None:
-        raise InputError("joint_angles: the up axis is unknown; give up=, such as up='z'")
-    world = opensim_axes(people.rig.up if up is None else up)  # type: ignore[union-attr]
+    axis: Any = people.rig.up if up is None and people.rig is not None else up
+    if axis not in get_args(Axis):
+        raise InputError(f"up={axis}: must be the axis of the world that points up, such as 'z'")
+    world = opensim_axes(axis)
     model = BodyModel(body_of(people.run)) if model is None else model
     there = np.flatnonzero(with_body(*(getattr(people, name) for name in BODY)))
-    degrees = np.full((len(people), len(NAMES)), np.nan)
-    covariance = np.full((*degrees.shape, len(NAMES)), np.nan)
+    names = _names(definitions)
+    degrees = np.full((len(people), len(names)), np.nan)
+    covariance = np.full((*degrees.shape, len(names)), np.nan)
+    if (offsets := people.run.get("keypoint_offsets")) is not None:
+        with naming("run.json", "restore it"):
+            model = model.with_keypoint_offsets(KeypointOffsets.from_dict(offsets))
     model = model.with_keypoints(tuple(people.joint_names.tolist()))
     for start in range(0, len(there), _BLOCK):
         rows = there[start : start + _BLOCK]
         part = people.rows(rows)
         posed = BodyParameters(*(getattr(part, name) for name in BODY))
-        local = posed.local
+        local, rotations = _rotations(part, model, posed)
         axes = segment_axes(model, posed.betas)
-        degrees[rows], slope = angles_and_slopes(local, axes, world)
-        rotations = _rotation_covariance(part, model, posed)
+        degrees[rows], slope = angles_and_slopes(local, axes, world, definitions)
         covariance[rows] = slope @ rotations @ slope.swapaxes(1, 2)
-    return JointAngles(people, degrees, covariance)
+    return JointAngles(people, names, degrees, covariance)
 
 
 def segment_axes(model: BodyModel, betas: Array) -> dict[str, Array]:
@@ -257,22 +279,38 @@ def angles_and_slopes(
     return degrees, slopes.reshape(*degrees.shape, 72)
 
 
-def _rotation_covariance(people: Reconstruction, model: BodyModel, posed: BodyParameters) -> Array:
-    """(B, 72, 72) covariance of the right tangents of the 24 rotations, rad²."""
-    _, jacobian = model.keypoints_with_jacobian(posed)
-    jacobian = jacobian[..., 10:]
+def _rotations(
+    people: Reconstruction, model: BodyModel, posed: BodyParameters
+) -> tuple[Array, Array]:
+    """Rotations (B, 24, 3, 3) of the bodies, and the covariance (B, 72, 72) of their right
+    tangents, rad².
+
+    The joints x that a view saw, with covariances C, measure the keypoints of the body, which have
+    the Jacobian J. With the precision P of the prior of shape and pose, the covariance is
+    (J^T C^-1 J + P)^-1. Arms and legs are moved by a Gauss-Newton step to these joints; pelvis and
+    trunk stay as they were fitted, because few joints determine them.
+    """
+    points, jacobian = model.keypoints_with_jacobian(posed)
+    count, columns = len(points), jacobian.shape[-1]
     seen = Known.observed(people.known) & np.isfinite(people.covariance).all(axis=(2, 3))
-    safe = np.where(seen[..., None, None], people.covariance, np.eye(3))
-    weight = np.where(seen[..., None, None], np.linalg.inv(safe), 0)
-    flat = jacobian.reshape(len(jacobian), -1, jacobian.shape[-1])
+    known = seen[..., None, None]
+    weight = np.where(known, np.linalg.inv(np.where(known, people.covariance, np.eye(3))), 0)
+    flat = jacobian.reshape(count, -1, columns)
     weighted = (weight @ jacobian).reshape(flat.shape)
     information = flat.swapaxes(1, 2) @ weighted
     prior = PosePrior.default().marginal_precision(np.arange(NUM_ANGLES))
-    inverse = right_jacobian_inverse(posed.body_pose)
-    blocks = np.zeros((len(jacobian), 23, 3, 23, 3))
-    blocks[:, np.arange(23), :, np.arange(23)] = inverse.swapaxes(0, 1)
-    blocks = blocks.reshape(len(jacobian), NUM_ANGLES, NUM_ANGLES)
-    information[:, 3:72, 3:72] += blocks.swapaxes(1, 2) @ prior @ blocks
-    information[:, range(75), range(75)] += 1e-6
-    covariance = np.linalg.inv(information)[:, :72, :72]
-    return np.where(seen.any(axis=1).reshape(-1, 1, 1), covariance, np.nan)
+    blocks = np.zeros((count, 23, 3, 23, 3))
+    blocks[:, np.arange(23), :, np.arange(23)] = right_jacobian_inverse(posed.body_pose).swapaxes(
+        0, 1
+    )
+    blocks = blocks.reshape(count, NUM_ANGLES, NUM_ANGLES)
+    information[:, 13:82, 13:82] += blocks.swapaxes(1, 2) @ prior @ blocks
+    information[:, range(NUM_BETAS), range(NUM_BETAS)] += 1
+    information[:, range(columns), range(columns)] += _LEAST_INFORMATION
+    covariance = np.linalg.inv(information)[:, 10:82, 10:82]
+    residual = np.where(seen[..., None], people.joints - points, 0).reshape(count, -1, 1)
+    pull = weighted.swapaxes(1, 2) @ residual
+    step = np.zeros((count, columns, 1))
+    step[:, _LIMBS] = np.linalg.solve(information[:, _LIMBS[:, None], _LIMBS], pull[:, _LIMBS])
+    local = posed.local @ exp_so3(step[:, 10:82, 0].reshape(-1, 24, 3))
+    return local, np.where(seen.any(axis=1).reshape(-1, 1, 1), covariance, np.nan)

@@ -9,9 +9,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from shapepose_fg.biomechanics.joint_angles import OPENSIM, angles_and_slopes, segment_axes, sides
-from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
-from shapepose_fg.core.reconstruction import BODY, with_body
+from shapepose_fg.biomechanics.joint_angles import OPENSIM, joint_angles
+from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.core.skeleton import SKELETONS
 from shapepose_fg.io.export.markers import Markers, markers_of, write_trc
 from shapepose_fg.io.export.registry import Job, MarkerSet, Written
@@ -95,21 +94,25 @@ def mot_text(take: Take, person: int, model: BodyModel, name: str) -> str | None
     """The angles of one person in the coordinates of OpenSim's models, degrees, and the position of
     the pelvis, metres; None for a person without a body.
     """
-    columns = [take.column(each, person) for each in BODY]
-    rows = np.flatnonzero(with_body(*columns))
-    if len(rows) == 0:
+    rows = np.flatnonzero(take.rows[person] >= 0)
+    people = take.people.rows(take.rows[person][rows])
+    angles = joint_angles(people, take.up, model, OPENSIM)
+    there = np.flatnonzero(np.isfinite(angles.degrees[:, 0]))
+    if len(there) == 0:
         return None
-    posed, world = BodyParameters(*(each[rows] for each in columns)), opensim_axes(take.up)
-    degrees, _ = angles_and_slopes(posed.local, segment_axes(model, posed.betas), world, OPENSIM)
-    degrees = np.unwrap(degrees, axis=0, period=360)
+    people, rows = people.rows(there), rows[there]
+    degrees = np.unwrap(angles.degrees[there], axis=0, period=360)
     values = {"time": take.times_s[rows]}
-    every = [(each.name, angle, side) for each, side in sides(OPENSIM) for angle in each.angles]
-    for column, (joint, angle, side) in enumerate(every):
-        coordinate = _NAMES.get(f"{joint}_{angle}", f"{joint}_{angle}")
-        if coordinate not in _LEFT_OUT:
-            values[coordinate + {"right_": "_r", "left_": "_l"}.get(side, "")] = degrees[:, column]
+    for name_of, column in zip(angles.names, degrees.T, strict=True):
+        joint, side = name_of, ""
+        for prefix in ("right_", "left_"):
+            if name_of.startswith(prefix):
+                joint, side = name_of.removeprefix(prefix), f"_{prefix[0]}"
+        if joint not in _LEFT_OUT:
+            values[_NAMES.get(joint, joint) + side] = column
+    pelvis = model.rest_pelvis(people.betas) + people.transl
     values |= dict(zip(("pelvis_tx", "pelvis_ty", "pelvis_tz"),
-                       world @ model.joints(posed)[:, 0].T, strict=True))  # fmt: skip
+                       opensim_axes(take.up) @ pelvis.T, strict=True))  # fmt: skip
     head = [name, "version=1", f"nRows={len(rows)}", f"nColumns={len(values)}", "inDegrees=yes",
             "endheader", "\t".join(values)]  # fmt: skip
     lines = (
