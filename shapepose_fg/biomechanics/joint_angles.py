@@ -22,7 +22,7 @@ from shapepose_fg.body.model.rotation import exp_so3, right_jacobian_inverse
 from shapepose_fg.body.model.smpl_file import NUM_BETAS
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Axis
-from shapepose_fg.core.errors import InputError, naming, optional
+from shapepose_fg.core.errors import InputError, optional
 from shapepose_fg.core.reconstruction import BODY, Known, Reconstruction, with_body
 from shapepose_fg.core.skeleton import SMPL_24
 from shapepose_fg.io.export.take import opensim_axes
@@ -171,8 +171,11 @@ def joint_angles(
     degrees = np.full((len(people), len(names)), np.nan)
     covariance = np.full((*degrees.shape, len(names)), np.nan)
     if (offsets := people.run.get("keypoint_offsets")) is not None:
-        with naming("run.json", "restore it"):
+        try:
             model = model.with_keypoint_offsets(KeypointOffsets.from_dict(offsets))
+        except (KeyError, TypeError, ValueError):
+            cure = "restore the file or remove the entry"
+            raise InputError(f"run.json: keypoint_offsets is not valid; {cure}") from None
     model = model.with_keypoints(tuple(people.joint_names.tolist()))
     for start in range(0, len(there), _BLOCK):
         rows = there[start : start + _BLOCK]

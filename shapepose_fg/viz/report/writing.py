@@ -17,7 +17,8 @@ from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.export.take import Take
 from shapepose_fg.io.solved_setup import CAMERAS, body_of
 from shapepose_fg.tracking.listing import list_tracks
-from shapepose_fg.viz.report.figures import angle_curves
+from shapepose_fg.viz.report.facts import objects
+from shapepose_fg.viz.report.figures import Curve, angle_curves
 from shapepose_fg.viz.report.page import page_text
 from shapepose_fg.viz.report.scene import Scene, scene_of
 
@@ -70,8 +71,12 @@ def write_report(
         except ValueError as error:
             remarks.append(f"the scene is not drawn: {error}")
     title = str(people.run.get("project") or folder.resolve().name or folder)
-    over_time = people.run.get("configuration", {}).get("temporal", True)
-    curves = angle_curves(people, up, BodyModel(arrays)) if arrays and over_time else {}
+    curves = dict[int, list[Curve]]()
+    if arrays is not None and objects(people.run.get("configuration")).get("temporal", True):
+        try:
+            curves = angle_curves(people, up, BodyModel(arrays))
+        except InputError as error:
+            remarks.append(f"joint angles are not drawn: {error}")
     text = page_text(title, people, list_tracks(people, arrays, every), scene, remarks, curves)
     file = folder / REPORT
     # A name may contain half of a surrogate pair, which cannot be written to a file.
