@@ -52,8 +52,8 @@ class LensOptions:
     )
     field_of_view: list[str] | None = option(
         INPUT,
-        "Instead of a calibration: horizontal field of view in degrees, or a photo with EXIF; of "
-        "one camera: CAMERA=...",
+        "Instead of a calibration: field of view along the longer side of a picture in degrees, "
+        "or a photo with EXIF; of one camera: CAMERA=...",
         metavar="DEG",
     )
     image_size: str | None = option(INPUT, "Picture size, if no file contains it.", metavar="WxH")
