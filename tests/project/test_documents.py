@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import typer
 
 from factors import MOTIONS
-from shapepose_fg.cli.main import main
+from shapepose_fg.cli.main import app, main
 from shapepose_fg.core.detections import Detections, Recording
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25
@@ -21,7 +22,7 @@ from shapepose_fg.pipeline.pipeline import PipelineConfig
 from shapepose_fg.simulation import Scene, built_in_scene, simulate
 
 ROOT = Path(__file__).parents[2]
-PAGES = [ROOT / "README.md", ROOT / "SECURITY.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
 
 
 def blocks(page: Path, language: str) -> list[str]:
@@ -176,6 +177,51 @@ def test_extending(tmp_path, monkeypatch):
     # The skeleton.
     assert names["skeletons"].joints.shape == (24, 15, 3)
     assert joint_metrics(names["skeletons"], truth[:, :, :15]).recall > 0.98
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_command_on_a_page_is_one_that_the_program_takes(page):
+    """Names of commands and options, required ones too, and values of the right kind."""
+    group = typer.main.get_command(app)
+    for command in commands_on(page):
+        words = shlex.split(command)[1:]
+        assert words[0] in group.commands, f"{command}: there is no such command"
+        if "..." not in words:
+            parse(group, words, command)
+
+
+def commands_on(page: Path) -> list[str]:
+    """The program's commands in the shell blocks of a page, without comments and redirections."""
+    text = "\n".join(block for kind in ("bash", "sh") for block in blocks(page, kind))
+    lines = re.sub(r"\\\n\s*", " ", text).splitlines()
+    found = [re.sub(r"\s+(#|[<>|&;]).*", "", line) for line in lines]
+    return [line for line in found if line.startswith("shapepose-fg")]
+
+
+def parse(command, words: list[str], whole: str) -> None:
+    """Parse the words of a command as the program does, without running it."""
+    commands = getattr(command, "commands", {})
+    at = next((at for at, word in enumerate(words) if word in commands), len(words))
+    try:
+        if not commands or at > 0:
+            command.make_context(None, words[:at])
+    except typer.Exit:  # of --help
+        return
+    except Exception as error:
+        reason = error.format_message() if hasattr(error, "format_message") else error
+        pytest.fail(f"{whole}: {reason}")
+    if at < len(words):
+        parse(commands[words[at]], words[at + 1 :], whole)
+
+
+@pytest.mark.parametrize(
+    "command",
+    ["shapepose-fg recontruct", "shapepose-fg report", "shapepose-fg demo --outptu x"],
+)
+def test_a_command_that_the_program_does_not_take_is_noticed(command, tmp_path):
+    (tmp_path / "page.md").write_text(f"```bash\n{command}  # so\n```\n")
+    with pytest.raises((AssertionError, pytest.fail.Exception), match=command.split()[1]):
+        test_every_command_on_a_page_is_one_that_the_program_takes(tmp_path / "page.md")
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
