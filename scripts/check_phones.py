@@ -11,8 +11,12 @@ starts anywhere. docs/evaluation.md has the results. About three minutes per roo
 """
 
 import argparse
+import contextlib
+import io
+import json
 import os
 import sys
+import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -23,22 +27,30 @@ from scipy.spatial.transform import Rotation
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
 from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.cli.main import main as command
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Camera, Rig
-from shapepose_fg.core.decompositions import rigid
+from shapepose_fg.core.decompositions import nearest_rotation, rigid
 from shapepose_fg.core.detections import Detections, Recording
+from shapepose_fg.core.rig_file import write_trajectory
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.core.trajectory import Trajectory
+from shapepose_fg.io.calibration import read_rig
+from shapepose_fg.io.recording import read_recording
+from shapepose_fg.io.timestamps import write_timestamps
+from shapepose_fg.io.write_detections import write_association
+from shapepose_fg.pipeline.pipeline import refine_trajectories
 from shapepose_fg.simulation.bystanders import walk_along, walking_clips, way_through
 from shapepose_fg.simulation.detector import Detector, DetectorConfig
 from shapepose_fg.simulation.mocap import Mocap
 from shapepose_fg.simulation.performance import together
-from shapepose_fg.simulation.scene import UP, Scene, keypoints_of
+from shapepose_fg.simulation.scene import UP, Scene
 from shapepose_fg.simulation.visibility import Skin, see
 from shapepose_fg.viz.rendering import look_at
 
-SECONDS, FPS = 60.0, 60.0
-"""Duration of a recording, s, and rate of the simulated motion, Hz."""
+SECONDS, FPS, REFINED = 60.0, 60.0, 400
+"""Duration of a recording, s, rate of the simulated motion, Hz, and number of frames in which the
+carried phone is refined."""
 LAYOUTS = {
     "corners, landscape": ([40, 130, 220, 310], False),
     "around, portrait": ([20, 95, 170, 275], True),
@@ -61,8 +73,8 @@ class Phone:
     """(F, 4, 4) true pose of each frame at its first row, stabilisation included."""
 
 
-def film(room: int, mocap: Mocap) -> tuple[list[Phone], Scene, Recording]:
-    """The phones of a room, its people, and the detections in each phone's own frames."""
+def film(room: int, mocap: Mocap) -> tuple[list[Phone], Recording]:
+    """The phones of a room, the last one carried, and the detections in each phone's frames."""
     rng = np.random.default_rng([room, 45])
     (angles, upright), walkers = list(LAYOUTS.values())[room // 2 % 3], 1 + room % 2
     scene = _walkers(walkers, mocap, rng)
@@ -84,7 +96,7 @@ def film(room: int, mocap: Mocap) -> tuple[list[Phone], Scene, Recording]:
         pairs = np.concatenate([each.pairs + at for each, at in zip(parts, begin, strict=True)])
         affinity = np.concatenate([each.affinity for each in parts])
         frames.append(Detections(view, *columns, pairs, affinity))
-    return phones, scene, Recording(BODY_25, frames)
+    return phones, Recording(BODY_25, frames)
 
 
 def _walkers(count: int, mocap: Mocap, rng: np.random.Generator) -> Scene:
@@ -171,26 +183,27 @@ def _carried(name: str, rng: np.random.Generator) -> Phone:
 
 
 def odometry(phone: Phone, rng: np.random.Generator, drift: float = 0.01) -> Trajectory:
-    """What the carried phone logs: y up, anywhere, drifting, on the phone's own clock."""
-    steps = np.linalg.inv(phone.wTc[:-1]) @ phone.wTc[1:]
-    steps[:, :3, 3] *= 1 + rng.normal(0, drift / 2)
-    own = [np.eye(4)]
-    for step in steps:
-        way = np.linalg.norm(step[:3, 3])
-        error = rng.normal(0, drift * np.sqrt(way), 6) * [0.3, 0.3, 0.3, 0.6, 0.6, 0.6]
-        own.append(
-            own[-1] @ step @ rigid(Rotation.from_rotvec(error[:3]).as_matrix(), error[3:])
-        )
-    # Gravity is known: the log's y axis is up, its heading and origin are arbitrary.
+    """What the carried phone logs, on its own clock: y up, with any heading and origin.
+
+    Scale, heading and position drift; gravity keeps the other two rotations.
+    """
+    steps = np.diff(phone.wTc[:, :3, 3], axis=0)
+    root = np.sqrt(np.linalg.norm(steps, axis=1))
+    steps = (
+        steps * (1 + rng.normal(0, drift / 2)) + rng.normal(0, drift, steps.shape) * root[:, None]
+    )
+    heading = np.cumsum(np.append(0, np.radians(0.1) * rng.normal(size=len(root)) * root))
+    turn = Rotation.from_euler("z", heading[:, None]).as_matrix()
+    moved = np.cumsum(np.r_[np.zeros((1, 3)), np.einsum("fij,fj->fi", turn[1:], steps)], axis=0)
+    own = rigid(turn @ phone.wTc[:, :3, :3], moved)
     R = Rotation.from_euler("y", rng.uniform(0, 360), degrees=True).as_matrix()
-    R = R @ np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]) @ phone.wTc[0, :3, :3]
-    oTw = rigid(R, rng.normal(0, 1, 3))
-    return Trajectory(phone.camera.name, phone.time_s - phone.time_s[0], oTw @ np.array(own))
+    oTw = rigid(R @ np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), rng.normal(0, 1, 3))
+    return Trajectory(phone.camera.name, phone.time_s - phone.time_s[0], oTw @ own)
 
 
 def _seen(phone: Phone, scene: Scene, skin: Skin, seed: int) -> list[Detections]:
     """The detections of a phone, frame by frame."""
-    camera, (W, H) = phone.camera, phone.camera.image_size
+    camera, H = phone.camera, phone.camera.image_size[1]
     ideal = replace(camera, distortion=np.zeros(5))
     detector = Detector(Rig((ideal,), "z"), scene.people, 30.0, DetectorConfig(), seed)
     found = []
@@ -214,3 +227,83 @@ def _between(scene: Scene, at: Array) -> Array:
     who, joint = np.indices(at.shape)
     points = scene.keypoints
     return (1 - part) * points[low, who, joint] + part * points[low + 1, who, joint]
+
+
+def similarity(rig: Rig, truth: Rig) -> tuple[Array, Array, float]:
+    """Rotation, translation and scale from a rig to the true one: R x / scale + t."""
+    near, far = (np.stack([each.wTc[:3, :3] for each in one.cameras]) for one in (rig, truth))
+    a, b = (one.centres - one.centres.mean(axis=0) for one in (rig, truth))
+    scale = float(np.linalg.norm(a) / np.linalg.norm(b))
+    R = nearest_rotation(
+        b.T @ a / (scale * (b**2).sum() / len(rig)) + np.sum(far @ near.mT, axis=0)
+    )
+    return R, truth.centres.mean(axis=0) - R @ rig.centres.mean(axis=0) / scale, scale
+
+
+def errors(poses: Array, true: Array, by: tuple[Array, Array, float]) -> tuple[Array, Array]:
+    """Angles, degrees, and distances, mm, between poses (N, 4, 4) moved `by` a similarity, and true
+    ones.
+    """
+    R, t, scale = by
+    turn = Rotation.from_matrix((R @ poses[:, :3, :3]).mT @ true[:, :3, :3]).magnitude()
+    away = poses[:, :3, 3] @ R.T / scale + t - true[:, :3, 3]
+    return np.degrees(turn), 1e3 * np.linalg.norm(away, axis=1)
+
+
+def measure(room: int, mocap: Mocap, folder: Path) -> dict[str, object]:
+    """Film a room, type the commands, and compare the result with the truth."""
+    phones, recording = film(room, mocap)
+    rng, fixed = np.random.default_rng([room, 46]), phones[:-1]
+    names, truth = [each.camera.name for each in phones], Rig(tuple(p.camera for p in fixed), "z")
+    write_association(recording, Rig(tuple(each.camera for each in phones), "z"), folder)
+    own = np.column_stack([each.time_s - each.time_s[0] for each in phones])
+    write_timestamps(folder / "detection" / "times.csv", names, own)
+    write_trajectory(odometry(phones[-1], rng), folder / "log.tum")
+    far = np.linalg.norm(truth.centres[0] - truth.centres[1]) + rng.normal(0, 0.01)
+    words = ["--detections", folder / "detection", "--field-of-view", "65", "--focal", "--json"]
+    words += ["--image-size", "{}x{}".format(*fixed[0].camera.image_size)]
+    words += ["--distance", f"phone1,phone2={far:.2f}", "--times", folder / "times.csv"]
+    words += ["--trajectory", f"{names[-1]}={folder / 'log.tum'}"]
+    said, rig_file = io.StringIO(), folder / "calibration.json"
+    with contextlib.redirect_stdout(said), contextlib.suppress(SystemExit):
+        command(["calibrate", *map(str, words), "--output", str(rig_file)])
+    found: dict[str, object] = {"room": room, "people": 1 + room % 2}
+    if not rig_file.exists():
+        return found | {"refused": True}
+    rig, cameras = read_rig(rig_file), json.loads(said.getvalue())["cameras"]
+    by = similarity(rig.only(names[:-1]), truth)
+    turn, move = errors(rig.wTc[:-1], truth.wTc, by)
+    sigma = np.array([each["sigma_turn_deg"] for each in cameras]) / np.sqrt(3)
+    found |= {"deg": turn.round(2).tolist(), "mm": move.round().tolist()}
+    found |= {"inside": int((turn < np.sqrt(7.815) * sigma).sum()), "scale": round(by[2], 4)}
+    recording, times = read_recording(
+        folder / "detection", rig, None, folder / "kept", timestamps=folder / "times.csv"
+    )
+    span = range(len(recording) // 3, len(recording) // 3 + REFINED)
+    begin, end = times.frame_s[[span.start, span.stop]]
+    frame_s = np.genfromtxt(folder / "times.csv", delimiter=",", skip_header=1)[:, -1]
+    used = (frame_s > begin) & (frame_s < end)
+    refined = refine_trajectories(recording, rig, frames=span, times=times)
+    for name, each in (("start", rig), ("refined", refined)):
+        poses = each.trajectories[0].at(frame_s[used]) @ each.cameras[-1].bTc
+        figures = errors(poses, phones[-1].wTc[used], by)
+        found[name] = [round(float(np.sqrt((figure**2).mean())), 2) for figure in figures]
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    given = os.environ.get("SHAPEPOSE_DATA", Path(__file__).parents[2] / "shared")
+    parser.add_argument("--rooms", default="0:6", help="which rooms, first:stop")
+    parser.add_argument("--data", type=Path, default=given)
+    arguments = parser.parse_args()
+    mocap = Mocap.load(arguments.data / "data" / "cmu_mocap" / "cmu_smpl24.npz")
+    for room in range(*map(int, arguments.rooms.split(":"))):
+        with tempfile.TemporaryDirectory() as folder:
+            print(json.dumps(measure(room, mocap, Path(folder))), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -165,7 +165,10 @@ def calibrate(
         done += more
         progress(done, total)
 
-    footage, freedom = Footage.of(detections, rig, times, frames), replace(lens, turn_deg=20.0, move_m=1.0)
+    footage, freedom = (
+        Footage.of(detections, rig, times, frames),
+        replace(lens, turn_deg=20.0, move_m=1.0),
+    )
     taken = np.unique(footage.sightings.frame)
     how = _How(rig, times, freedom, detections.skeleton, measured.stature_m, told)
     if start is None:

@@ -48,9 +48,9 @@ _MOST_TURN_DEG, _MOST_MOVE_M = 1.0, 0.1
 _RIGID, _LONG_M, _FEWEST = 0.1, 0.25, 3
 """Maximum relative variation of the distance of two joints of a bone, its minimum, m, and minimum
 number of bones that give the distance of a person."""
-_LEAST_DEPTH_M, _SIGMA_M = 0.3, 0.03
-"""Minimum depth, and standard deviation of a detected joint from its position by other cameras,
-m."""
+_LEAST_DEPTH_M, _SIGMA_M, _MOUNT_RAD = 0.3, 0.03, np.radians(0.5)
+"""Minimum depth, and standard deviation of a detected joint from its position by other cameras, m;
+and that of the principal point of a lens without calibration, as an angle."""
 _QUARTERS = rigid(
     Rotation.from_euler("z", [[90 * n] for n in range(4)], degrees=True).as_matrix(),
     np.zeros((4, 3)),
@@ -145,9 +145,28 @@ class Start:
     sigma_move_m: float = np.inf
     """Standard deviation of the camera's position, metres."""
 
+    def of(self, camera: Camera, odometry: Trajectory) -> tuple[Camera, Trajectory]:
+        """The camera on its trajectory, in the world and on the clock of the fixed cameras."""
+        K = camera.K.copy()
+        K[[0, 1], [0, 1]] *= self.focal
+        moved = replace(
+            odometry, time_s=odometry.time_s + self.offset_s, wTb=self.wTo @ odometry.wTb
+        )
+        return replace(camera, K=K, bTc=self.bTc), moved
+
+    def words(self, name: str) -> str:
+        """How well the start of a camera is known."""
+        return (
+            f"camera {name}: its trajectory starts {self.offset_s:+.3f} s after the first camera; "
+            f"{self.share:.0%} of the people in its view agree; its start is known to "
+            f"{self.sigma_turn_deg:.1f} degrees and {1e3 * self.sigma_move_m:.0f} mm (one sigma)"
+        )
+
     def differs(self, other: "Start") -> bool:
         """Whether two starts are different solutions."""
-        turn = Rotation.from_matrix((self.wTo @ self.bTc)[:3, :3].T @ (other.wTo @ other.bTc)[:3, :3])
+        turn = Rotation.from_matrix(
+            (self.wTo @ self.bTc)[:3, :3].T @ (other.wTo @ other.bTc)[:3, :3]
+        )
         return bool(
             abs(self.offset_s - other.offset_s) > _OTHER_S
             or np.degrees(turn.magnitude()) > _OTHER_DEG
@@ -250,7 +269,14 @@ class Filmed:
                 score = np.where(np.abs(offset) <= most_s + _STEP_S, score, 0.0)
                 for _ in range(_PEAKS):
                     if score[at := int(score.argmax())] > 0:
-                        found.append(Start(wTo[at], bTc, float(offset[at]), agreeing=score[at]))
+                        found.append(
+                            Start(
+                                wTo[at],
+                                bTc,
+                                float(np.clip(offset[at], -most_s, most_s)),
+                                agreeing=score[at],
+                            )
+                        )
                     score = np.where(np.abs(offset - offset[at]) > _OTHER_S, score, 0.0)
         return found
 
@@ -264,14 +290,17 @@ class Filmed:
         rows = np.flatnonzero(frame >= 0)
         frame = frame[rows]
         at = self._seen(start, placed, rows, frame)
-        depth = np.nanmedian(at[..., 2], axis=1)
+        depth = median_of(at[..., 2], 5)
         with np.errstate(divide="ignore", invalid="ignore"):
             xy = at[..., :2] / at[..., 2:] * start.focal
         away = np.linalg.norm(self.rays[frame][..., :2] - xy[:, None], axis=-1)
         away = median_of(away, 5) * depth[:, None] / start.focal
         person = away.argmin(axis=1)
         away = away[np.arange(len(rows)), person]
-        middle = np.nanmedian(xy, axis=1) @ self.camera.K[:2, :2].T + self.camera.K[:2, 2]
+        middle = (
+            np.stack([median_of(xy[..., n], 5) for n in (0, 1)], axis=-1) @ self.camera.K[:2, :2].T
+            + self.camera.K[:2, 2]
+        )
         inside = (middle > 0).all(axis=1) & (middle < self.camera.image_size).all(axis=1)
         inside &= depth > _LEAST_DEPTH_M
         return rows, frame, person, np.where(depth > _LEAST_DEPTH_M, away, np.inf), inside
@@ -291,42 +320,71 @@ class Filmed:
 
     def _refined(self, start: Start, placed: Placed, most_s: float, focal: bool) -> Start:
         """The start adjusted to the projections of the people that agree."""
-        free = np.flatnonzero([True] * 6 + [most_s > 0, focal])
+        free = np.array([True] * 6 + [most_s > 0] + [focal] * 4)
         for near_m in _NEAR_M:
             rows, frame, person, away, _ = self._matched(start, placed, near_m)
             used = away < near_m
             if used.sum() < _LEAST_PEOPLE:
                 return self._judged(start, placed, near_m)
-            rows, frame, rays = rows[used], frame[used], self.rays[frame[used], person[used]]
-            middle = (start.wTo @ self._poses(start.bTc)[frame])[:, :3, 3].mean(axis=0)
-            given, known = start, np.isfinite(rays[..., 0] + placed.points[rows][..., 0])
-
-            def moved(x: Array, given: Start = given, middle: Array = middle) -> Start:
-                every = np.zeros(8)
-                every[free] = x
-                turn = Rotation.from_rotvec(every[:3]).as_matrix()
-                by = rigid(turn, middle + every[3:6] - turn @ middle)
-                offset_s, focal = given.offset_s + every[6], given.focal * np.exp(every[7])
-                return replace(given, wTo=by @ given.wTo, offset_s=offset_s, focal=float(focal))
-
-            def residuals(x: Array, rows: Index = rows, frame: Index = frame) -> Array:
-                now = moved(x)
-                at = self._seen(now, placed, rows, frame)[known]
-                depth = np.maximum(at[:, 2:], _LEAST_DEPTH_M)
-                away = rays[known][:, :2] / now.focal * depth - at[:, :2]  # noqa: B023
-                return away.ravel() / _SIGMA_M
-
-            fit = least_squares(residuals, np.zeros(len(free)), x_scale=0.01, loss="cauchy")
-            start = moved(fit.x)
-        count = dilution(placed.time_s[rows])
-        misfit = max(1.0, float(np.median(np.abs(residuals(fit.x))) / 0.6745))
-        sigma = misfit * np.sqrt(count * np.diag(np.linalg.inv(fit.jac.T @ fit.jac)))
+            fit = _Fit(self, placed, start, free, rows[used], frame[used], person[used])
+            start, sigma = fit.solved()
         start = replace(
             start,
             sigma_turn_deg=float(np.degrees(np.linalg.norm(sigma[:3]))),
             sigma_move_m=float(np.linalg.norm(sigma[3:6])),
         )
         return self._judged(start, placed, _NEAR_M[-1])
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Adjustment of a start: rotation and translation about the middle of the path, offset, log of
+    the focal length, and rotation of the camera on its carrier, which is that of an unknown
+    principal point, too.
+    """
+
+    filmed: Filmed
+    placed: Placed
+    start: Start
+    free: Mask
+    """(11,) mask of the parameters that are adjusted."""
+    rows: Index
+    frame: Index
+    person: Index
+
+    def moved(self, x: Array) -> Start:
+        """The start changed by the free parameters."""
+        every, given = np.zeros(len(self.free)), self.start
+        every[self.free] = x
+        middle = (given.wTo @ self.filmed._poses(given.bTc)[self.frame])[:, :3, 3].mean(axis=0)
+        turn, mount = Rotation.from_rotvec(every[[[0, 1, 2], [8, 9, 10]]]).as_matrix()
+        return replace(
+            given,
+            wTo=rigid(turn, middle + every[3:6] - turn @ middle) @ given.wTo,
+            bTc=given.bTc @ rigid(mount, np.zeros(3)),
+            offset_s=given.offset_s + every[6],
+            focal=given.focal * float(np.exp(every[7])),
+        )
+
+    def solved(self) -> tuple[Start, Array]:
+        """The adjusted start, and standard deviations of the free parameters."""
+        rays = self.filmed.rays[self.frame, self.person]
+        known = np.isfinite(rays[..., 0] + self.placed.points[self.rows][..., 0])
+        count = dilution(self.placed.time_s[self.rows])
+        mount = np.flatnonzero(np.flatnonzero(self.free) >= 8)
+
+        def residuals(x: Array) -> Array:
+            now = self.moved(x)
+            at = self.filmed._seen(now, self.placed, self.rows, self.frame)[known]
+            depth = np.maximum(at[:, 2:], _LEAST_DEPTH_M)
+            away = (rays[known][:, :2] / now.focal * depth - at[:, :2]) / _SIGMA_M
+            return np.concatenate([away.ravel(), np.sqrt(count) * x[mount] / _MOUNT_RAD])
+
+        begin = np.zeros(self.free.sum())
+        fit = least_squares(residuals, begin, x_scale=0.01, loss="cauchy")
+        misfit = max(1.0, float(np.median(np.abs(fit.fun)) / 0.6745))
+        inverse = np.linalg.pinv(fit.jac.T @ fit.jac)
+        return self.moved(fit.x), misfit * np.sqrt(count * np.diag(inverse))
 
 
 @dataclass(frozen=True)
@@ -391,8 +449,8 @@ def _lasts(grid: Array) -> bool:
 
 
 def _nearest(own: Array, times: Array) -> Index:
-    """(M,) frame, of those at `own` (T,), ascending or NaN, nearest to each time; -1 if it is half a
-    moment away.
+    """(M,) frame, of those at `own` (T,), ascending or NaN, nearest to each time; -1 if half a
+    moment lies between.
     """
     there = np.flatnonzero(np.isfinite(own))
     after = np.searchsorted(own[there], times).clip(1, len(there) - 1)
@@ -411,7 +469,9 @@ def _depth(rays: Array, points: Array) -> Array:
     )
     bones = (high - low < 2 * _RIGID * middle) & (middle > _LONG_M)
     a, b, length = a[bones], b[bones], middle[bones]
-    depth = length / np.maximum(np.linalg.norm(rays[:, :, a, :2] - rays[:, :, b, :2], axis=-1), 1e-6)
+    depth = length / np.maximum(
+        np.linalg.norm(rays[:, :, a, :2] - rays[:, :, b, :2], axis=-1), 1e-6
+    )
     # Bones that are inclined to the picture seem farther away.
     depth = np.sort(depth, axis=-1)
     enough = np.isfinite(depth).sum(axis=-1) >= _FEWEST

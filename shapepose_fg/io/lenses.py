@@ -34,9 +34,9 @@ def lenses_of(detections: Path, fields: Sequence[str], size: tuple[int, int] | N
     names.
 
     `fields` are fields of view along the longer side of a picture in degrees, upright or not, or
-    photos of the same lens with the focal length in EXIF; `CAMERA=` before a value restricts it to one camera. `size` is (width, height)
-    of the pictures, pixels; by default it is read from footage.json, which `detect` writes.
-    InputError names what is missing.
+    photos of the same lens with the focal length in EXIF; `CAMERA=` before a value restricts it to
+    one camera. `size` is (width, height) of the pictures, pixels; by default it is read from
+    footage.json, which `detect` writes. InputError names what is missing.
     """
     names = camera_names(detections)
     given = dict(
