@@ -7,6 +7,7 @@ most people agree is refined by their projections. An ambiguous result is reject
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import product
 
 import numpy as np
@@ -20,7 +21,7 @@ from shapepose_fg.calibration.people import Footage
 from shapepose_fg.calibration.refinement import dilution
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Camera, Rig
-from shapepose_fg.core.decompositions import rigid
+from shapepose_fg.core.decompositions import nearest_rotation, rigid
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.trajectory import Trajectory
 from shapepose_fg.setup_check.matching import Sightings, median_of
@@ -43,8 +44,8 @@ _OTHER_S, _OTHER_DEG = 1.0, 10.0
 _LEAST_SHARE, _LEAST_LEAD, _LEAST_PEOPLE = 0.5, 1.25, 25
 """Minimum share of the people in view that agree with the start, minimum ratio of their number to
 that of any other start, and minimum number."""
-_MOST_TURN_DEG, _MOST_MOVE_M = 1.0, 0.1
-"""Maximum standard deviations of a start."""
+_STEPS = 12
+"""Maximum number of evaluations in each round of adjustment."""
 _RIGID, _LONG_M, _FEWEST = 0.1, 0.25, 3
 """Maximum relative variation of the distance of two joints of a bone, its minimum, m, and minimum
 number of bones that give the distance of a person."""
@@ -162,16 +163,6 @@ class Start:
             f"{self.sigma_turn_deg:.1f} degrees and {1e3 * self.sigma_move_m:.0f} mm (one sigma)"
         )
 
-    def differs(self, other: "Start") -> bool:
-        """Whether two starts are different solutions."""
-        turn = Rotation.from_matrix(
-            (self.wTo @ self.bTc)[:3, :3].T @ (other.wTo @ other.bTc)[:3, :3]
-        )
-        return bool(
-            abs(self.offset_s - other.offset_s) > _OTHER_S
-            or np.degrees(turn.magnitude()) > _OTHER_DEG
-        )
-
 
 @dataclass(frozen=True)
 class Filmed:
@@ -209,13 +200,6 @@ class Filmed:
 
         Raises Undetermined, with a sentence, if it is ambiguous or too inaccurate.
         """
-        tried = sorted(self._registered(placed, most_s), key=lambda each: -each.agreeing)[:_TRIED]
-        tried = [self._judged(each, placed, _NEAR_M[0]) for each in tried]
-        best = list[Start]()
-        for each in sorted(tried, key=lambda each: -each.agreeing):
-            if len(best) < _PEAKS and all(each.differs(other) for other in best):
-                best.append(self._refined(each, placed, most_s, focal))
-        best.sort(key=lambda each: -each.agreeing)
         cure = (
             "film the people whom the other cameras see for half a minute while they walk about, "
             "and check its log and its field of view"
@@ -224,22 +208,48 @@ class Filmed:
         def refuse(why: str) -> Undetermined:
             return Undetermined((f"camera {self.camera.name}: {why}; {cure}",))
 
+        if min(len(self.own_s), len(placed.time_s)) < _LEAST_PEOPLE:
+            raise refuse("too few people are seen by it, or by two other cameras")
+        tried = sorted(self._registered(placed, most_s), key=lambda each: -each.agreeing)[:_TRIED]
+        tried = [self._judged(each, placed, _NEAR_M[0]) for each in tried]
+        tried.sort(key=lambda each: -each.agreeing)
+        best = list[Start]()
+        for each in tried:
+            rival = each.agreeing > tried[0].agreeing / 2 and len(best) < _PEAKS
+            if rival and all(self._differ(each, other) for other in best):
+                best.append(self._refined(each, placed, most_s, focal))
+        best.sort(key=lambda each: -each.agreeing)
         if not best or best[0].agreeing < _LEAST_PEOPLE or best[0].share < _LEAST_SHARE:
             raise refuse("no start of its trajectory agrees with the people of the other cameras")
         first = best[0]
-        others = [each.agreeing for each in best[1:] if each.differs(first)]
+        others = [each.agreeing for each in best[1:] if self._differ(each, first)]
         if first.agreeing < _LEAST_LEAD * max(others, default=0.0):
             raise refuse("two starts of its trajectory agree with the people about equally well")
-        if first.sigma_turn_deg > _MOST_TURN_DEG or first.sigma_move_m > _MOST_MOVE_M:
+        # The refinement of trajectories assumes that the start of an odometry is known so well.
+        assumed = np.diag(replace(self.trajectory, covariance=None).start_covariance())
+        if np.radians(first.sigma_turn_deg) > np.sqrt(
+            assumed[:3].sum()
+        ) or first.sigma_move_m > np.sqrt(assumed[3:].sum()):
             raise refuse(
                 f"the people determine the start of its trajectory to {first.sigma_turn_deg:.1f} "
                 f"degrees and {100 * first.sigma_move_m:.0f} cm only"
             )
         return first
 
+    def _differ(self, one: Start, other: Start) -> bool:
+        """Whether two starts are different poses or times of the camera."""
+        middle = len(self.own_s) // 2
+        a, b = ((each.wTo @ self._poses(each.bTc)[middle])[:3, :3] for each in (one, other))
+        turn = np.degrees(Rotation.from_matrix(a.T @ b).magnitude())
+        return bool(abs(one.offset_s - other.offset_s) > _OTHER_S or turn > _OTHER_DEG)
+
     def _poses(self, bTc: Array) -> Array:
         """(F, 4, 4) odometry from camera, for a mount."""
-        return self.trajectory.at(self.own_s) @ bTc
+        return self._oTb @ bTc
+
+    @cached_property
+    def _oTb(self) -> Array:
+        return self.trajectory.at(self.own_s)
 
     def _registered(self, placed: Placed, most_s: float) -> list[Start]:
         """Approximate starts from pairs of tracks; `agreeing` is a score."""
@@ -381,7 +391,7 @@ class _Fit:
             return np.concatenate([away.ravel(), np.sqrt(count) * x[mount] / _MOUNT_RAD])
 
         begin = np.zeros(self.free.sum())
-        fit = least_squares(residuals, begin, x_scale=0.01, loss="cauchy")
+        fit = least_squares(residuals, begin, x_scale=0.01, loss="cauchy", max_nfev=_STEPS)
         misfit = max(1.0, float(np.median(np.abs(fit.fun)) / 0.6745))
         inverse = np.linalg.pinv(fit.jac.T @ fit.jac)
         return self.moved(fit.x), misfit * np.sqrt(count * np.diag(inverse))
@@ -429,15 +439,12 @@ class _Spectrum:
                 ((self.known, other.square), q),
             )
         ]
-        U, s, Vt = np.linalg.svd(both)
-        sign = np.linalg.det(U @ Vt)
-        U[..., 2] *= sign[:, None]
-        s[:, 2] *= sign
-        left = np.maximum(spread[0] + spread[1] - 2 * s.sum(axis=-1), 0.0)
+        R = nearest_rotation(both)
+        agreed = np.einsum("lij,lij->l", R, both)
+        left = np.maximum(spread[0] + spread[1] - 2 * agreed, 0.0)
         least = _LEAST_S / _STEP_S * self.known.shape[1] / 2
         score = count * np.clip(1 - left / _AGREE_M**2, 0.0, None)
         score[(count < least) | (spread[0] < _LEAST_WAY_M**2)] = 0.0
-        R = U @ Vt
         t = p + self.centre - np.einsum("lij,lj->li", R, q + other.centre)
         length = len(count)
         return (np.arange(length) + length // 2) % length - length // 2, rigid(R, t), score
