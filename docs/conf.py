@@ -24,8 +24,7 @@ version = release = shapepose_fg.__version__
 root_doc = "README"
 include_patterns = ["*.md", "docs/**", "shapepose_fg/body/data/*.md"]
 exclude_patterns = [".*", "build", "dist", "demo", "results", "tests", "**/*.egg-info"]
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.viewcode"]
-nitpicky = False
+extensions = ["myst_parser", "sphinx.ext.autodoc"]
 
 myst_enable_extensions = ["colon_fence", "deflist"]
 myst_heading_anchors = 4

@@ -4,6 +4,7 @@ import ast
 import importlib
 import inspect
 import re
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -48,6 +49,10 @@ NAVIGATION = {
         "Data flow <docs/data_flow>",
         "The body model <docs/body_model>",
         "Body fitting <docs/body_fitting>",
+        "Data of the body <shapepose_fg/body/data/README>",
+        "The fitter's weights <shapepose_fg/body/data/fitter>",
+        "The prior of poses <shapepose_fg/body/data/pose_prior>",
+        "The prior of motion <shapepose_fg/body/data/motion_prior>",
     ],
     "Judge": [
         "Evaluation <docs/evaluation>",
@@ -55,19 +60,18 @@ NAVIGATION = {
         "Contributing and support <CONTRIBUTING>",
         "Security <SECURITY>",
         "Licences <docs/licences>",
-        "Data of the body <shapepose_fg/body/data/README>",
-        "The fitter's weights <shapepose_fg/body/data/fitter>",
-        "The prior of poses <shapepose_fg/body/data/pose_prior>",
-        "The prior of motion <shapepose_fg/body/data/motion_prior>",
     ],
 }
 """Titles of the sidebar's groups, and their pages."""
 
 
 def complete(app: Any, page: str, source: list[str]) -> None:
-    """Add to the text of a page what is generated for it."""
+    """Add to a page what is generated for it; links to folders lead to the repository."""
+    link = r"(?<=\]\()[^):#\s]+(?=\))"
+    source[0] = re.sub(link, lambda found: _outside(page, found[0]), source[0])
     parts = {
         "README": navigation,
+        "docs/examples/README": scripts,
         "docs/reference/commands": commands,
         "docs/reference/settings": settings,
         "docs/reference/api": api,
@@ -76,11 +80,28 @@ def complete(app: Any, page: str, source: list[str]) -> None:
         source[0] = f"{source[0].rstrip()}\n\n{parts[page]()}"
 
 
+def _outside(page: str, link: str) -> str:
+    """A link of a page; if it leads to a folder, as its address in the repository."""
+    there = (ROOT / page).parent.joinpath(link).resolve()
+    if not there.is_dir():
+        return link
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    return f"{project['urls']['Repository']}/tree/main/{there.relative_to(ROOT).as_posix()}"
+
+
 def navigation() -> str:
     """The sidebar, as hidden tables of contents."""
     return "".join(
         f"```{{toctree}}\n:hidden:\n:caption: {title}\n\n" + "\n".join(pages) + "\n```\n\n"
         for title, pages in NAVIGATION.items()
+    )
+
+
+def scripts() -> str:
+    """The text of every example, below the gallery."""
+    names = [each.name for each in sorted((ROOT / "docs/examples").glob("[0-9]*.py"))]
+    return "".join(
+        f"## {name}\n\n```{{literalinclude}} {name}\n:language: python\n```\n\n" for name in names
     )
 
 
@@ -109,8 +130,10 @@ def _command(name: str, command: Any, heading: str) -> Iterator[str]:
     """The section of one command, and of the commands below it."""
     yield f"{heading} {name}\n\n{inspect.cleandoc(command.help or '')}\n\n"
     arguments = [each for each in command.params if each.param_type_name == "argument"]
-    usage = " ".join([name, *(each.metavar or each.name.upper() for each in arguments)])
-    yield f"```text\n{usage} [OPTIONS]\n```\n\n"
+    words = [each.metavar or each.name.upper() for each in arguments]
+    required = [each for each in command.params if each.required and each not in arguments]
+    words += [f"{each.opts[0]} {each.metavar or each.name.upper()}" for each in required]
+    yield f"```text\n{' '.join([name, *words, '[OPTIONS]'])}\n```\n\n"
     rows = [_row(each) for each in command.params if not getattr(each, "hidden", False)]
     if rows:
         yield "| option | meaning |\n|---|---|\n" + "".join(rows) + "\n"
@@ -194,16 +217,23 @@ def _directive(module: str, name: str) -> str:
         return f".. autoclass:: {module}.{name}\n   :members:\n\n"
     if inspect.isroutine(value):
         return f".. autofunction:: {module}.{name}\n\n"
-    return f".. autodata:: {_home(module, name)}.{name}\n   :no-value:\n\n"
+    lines = _constant(module, name).splitlines()
+    as_text(None, "data", name, value, None, lines)
+    return f".. py:data:: {module}.{name}\n\n" + "".join(f"   {line}\n" for line in lines) + "\n"
 
 
-def _home(module: str, name: str) -> str:
-    """The module that assigns a constant, and documents it, of those that import it one another."""
-    source = inspect.getsource(importlib.import_module(module))
-    for node in ast.parse(source).body:
+def _constant(module: str, name: str) -> str:
+    """The docstring below the assignment of a constant, in the module where it is assigned."""
+    nodes = ast.parse(inspect.getsource(importlib.import_module(module))).body
+    for node, below in zip(nodes, [*nodes[1:], None], strict=True):
         if isinstance(node, ast.ImportFrom) and name in [each.name for each in node.names]:
-            return _home(str(node.module), name)
-    return module
+            return _constant(str(node.module), name)
+        targets = getattr(node, "targets", [getattr(node, "target", None)])
+        if [getattr(each, "id", None) for each in targets] == [name]:
+            match below:
+                case ast.Expr(value=ast.Constant(value=str(text))):
+                    return inspect.cleandoc(text)
+    return ""
 
 
 def as_text(app: Any, what: str, name: str, value: Any, options: Any, lines: list[str]) -> None:

@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.table import Table
 
-from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.arrays import Array, Whole
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import spans_of
 from shapepose_fg.core.run_summary import covered_frames
@@ -20,7 +19,7 @@ from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation.metrics import People, PlainPeople
 from shapepose_fg.evaluation.shelf_annotation import SHELF_JOINTS
 
-_LIMBS = {
+LIMB_ENDS = {
     "left upper arm": ("LShoulder", "LElbow"),
     "right upper arm": ("RShoulder", "RElbow"),
     "left lower arm": ("LElbow", "LWrist"),
@@ -32,9 +31,10 @@ _LIMBS = {
     "head": ("Neck", "HeadTop"),
     "torso": ("Neck", "MidHip"),
 }
-LIMB_NAMES = tuple(_LIMBS)
+"""The joints at the ends of each limb."""
+LIMB_NAMES = tuple(LIMB_ENDS)
 """The 10 scored limbs."""
-LIMBS = np.array([[SHELF_JOINTS.index(joint) for joint in ends] for ends in _LIMBS.values()])
+LIMBS = np.array([[SHELF_JOINTS.index(joint) for joint in ends] for ends in LIMB_ENDS.values()])
 """(10, 2) indices of their ends in `SHELF_JOINTS`."""
 ACTORS = (0, 1, 2)
 """The scored ids of the annotation: actors 1, 2 and 3."""
@@ -81,49 +81,6 @@ class ShelfScore:
         """Share of correct limbs among all, of all actors, per cent."""
         return float(_percent(self.limbs_right.sum(), self.limbs_all.sum()))
 
-    def as_dict(self) -> dict[str, Any]:
-        """The figures by plain names, for JSON; None if there is nothing to score."""
-        by_limb = _percent(self.limbs_right, self.limbs_all)
-        limbs = {
-            f"actor {a + 1}": dict(zip(LIMB_NAMES, map(_plain, by_limb[a]), strict=True))
-            for a in ACTORS
-        }
-        return {
-            "pcp_average": _plain(self.pcp_average),
-            "pcp_actor": {f"actor {a + 1}": _plain(self.pcp[a]) for a in ACTORS},
-            "pcp_limb": limbs,
-            "limbs_right": int(self.limbs_right.sum()),
-            "limbs": int(self.limbs_all.sum()),
-            "mpjpe_mm": _plain(self.mpjpe_mm),
-            "recall_at_200mm": _plain(100 * self.recall),
-            "people_found": self.people_found,
-            "people": self.people,
-            "frames": self.frames,
-            "frames_annotated": self.frames_annotated,
-        }
-
-    def table(self) -> Table:
-        """PCP by limb and actor, for a terminal."""
-        table = Table(
-            title=f"Shelf, {self.frames} of {self.frames_annotated} annotated frames: PCP@0.5, %"
-        )
-        table.add_column("limb")
-        for heading in (*(f"actor {actor + 1}" for actor in ACTORS), "pooled", "right / all"):
-            table.add_column(heading, justify="right")
-        by_actor = _percent(self.limbs_right, self.limbs_all)
-        right, count = self.limbs_right.sum(axis=0), self.limbs_all.sum(axis=0)
-        for i, name in enumerate(LIMB_NAMES):
-            cells = [*by_actor[:, i], float(_percent(right[i], count[i]))]
-            table.add_row(name, *map(_cell, cells), f"{right[i]} / {count[i]}")
-        table.add_section()
-        totals = f"{right.sum()} / {count.sum()}"
-        table.add_row("all limbs", *map(_cell, [*self.pcp, self.pcp_pooled]), totals, style="bold")
-        table.caption = (
-            f"Avg {_cell(self.pcp_average)} %   MPJPE {_cell(self.mpjpe_mm)} mm\nrecall at 0.2 m "
-            f"{100 * self.recall:.2f} %   people found {self.people_found} / {self.people}"
-        )
-        return table
-
 
 def evaluate_shelf(
     people: People, ground_truth: PlainPeople, frames: Iterable[int] | None = None
@@ -169,7 +126,7 @@ def evaluate_shelf(
     )
 
 
-def _distances(truth: Array, frame: NDArray[np.int64], people: People) -> Array:
+def _distances(truth: Array, frame: Whole, people: People) -> Array:
     """(G, 15) distances of the joints of the predictions of annotated people (G, 15, 3), metres;
     NaN if the joint or the prediction is missing.
     """
@@ -235,7 +192,7 @@ def _frames_run(people: People) -> Iterable[int] | None:
     return None if spans is None else [frame for span in spans for frame in span]
 
 
-def _spans(frames: NDArray[np.int64]) -> str:
+def _spans(frames: Whole) -> str:
     """Frames in words: "0-100, 216-230"."""
     spans = spans_of(frames.tolist())
     return (
@@ -248,11 +205,3 @@ def _percent(part: Any, whole: Any) -> Array:
     """100 part / whole, NaN if `whole` is 0."""
     whole = np.asarray(whole, dtype=np.float64)
     return 100 * np.asarray(part) / np.where(whole > 0, whole, np.nan)
-
-
-def _plain(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
-
-
-def _cell(value: float) -> str:
-    return f"{value:.2f}" if np.isfinite(value) else "-"

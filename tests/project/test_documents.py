@@ -32,6 +32,22 @@ def blocks(page: Path, language: str) -> list[str]:
     )
 
 
+def commands_in(block: str) -> list[str]:
+    """The program's commands in a shell block, without comments and redirections."""
+    lines = re.sub(r"\\\n\s*", " ", block).splitlines()
+    found = [re.sub(r"\s+(#|[<>|&;]).*", "", line) for line in lines]
+    return [line for line in found if line.startswith("shapepose-fg")]
+
+
+def simulating(page: Path) -> list[str]:
+    """The shell blocks of a page that need no files, as they begin with a simulated recording."""
+    return [
+        block
+        for block in blocks(page, "bash")
+        if "".join(commands_in(block)[:1]).startswith("shapepose-fg simulate")
+    ]
+
+
 def run(*pages: Path) -> dict:
     """Run all Python of the pages, one block after the other; returns the names that it leaves."""
     names: dict = {}
@@ -129,6 +145,30 @@ def test_readme_in_the_shell(recording, tmp_path, capsys):
     assert kinds == {".npz", ".trc", ".c3d", ".bvh", ".glb", ".csv", ".parquet"}
 
 
+GUIDES = [page for page in PAGES if page.parent.name == "guides"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", GUIDES, ids=lambda page: page.name)
+def test_the_python_of_a_guide_runs(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run(page)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES if simulating(page)], ids=lambda page: page.name
+)
+def test_blocks_that_simulate_their_recording_run(page, tmp_path, monkeypatch, capsys):
+    """Typed one after the other into an empty folder, each command ends well."""
+    monkeypatch.chdir(tmp_path)
+    for block in simulating(page):
+        for command in commands_in(block):
+            with pytest.raises(SystemExit) as end:
+                main(shlex.split(command)[1:])
+            assert end.value.code in (0, None), f"{command}: {capsys.readouterr()}"
+
+
 def steps(result: Reconstruction, feet: np.ndarray) -> np.ndarray:
     """How far each joint of a foot moves from frame to frame, metres."""
     places = [result.joints[result.person == who][:, feet] for who in np.unique(result.person)]
@@ -183,19 +223,16 @@ def test_extending(tmp_path, monkeypatch):
 def test_every_command_on_a_page_is_one_that_the_program_takes(page):
     """Names of commands and options, required ones too, and values of the right kind."""
     group = typer.main.get_command(app)
-    for command in commands_on(page):
+    for command in (
+        each
+        for kind in ("bash", "sh")
+        for block in blocks(page, kind)
+        for each in commands_in(block)
+    ):
         words = shlex.split(command)[1:]
         assert words[0] in group.commands, f"{command}: there is no such command"
         if "..." not in words:
             parse(group, words, command)
-
-
-def commands_on(page: Path) -> list[str]:
-    """The program's commands in the shell blocks of a page, without comments and redirections."""
-    text = "\n".join(block for kind in ("bash", "sh") for block in blocks(page, kind))
-    lines = re.sub(r"\\\n\s*", " ", text).splitlines()
-    found = [re.sub(r"\s+(#|[<>|&;]).*", "", line) for line in lines]
-    return [line for line in found if line.startswith("shapepose-fg")]
 
 
 def parse(command, words: list[str], whole: str) -> None:

@@ -1,5 +1,9 @@
 """What a package index, a citation manager and a newcomer read: one version, one address."""
 
+import os
+import re
+import shutil
+import subprocess
 import tomllib
 from importlib.metadata import version
 from pathlib import Path
@@ -33,6 +37,25 @@ def test_the_citation_has_what_the_format_requires():
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     assert paper["title"] in readme
     assert all(f"{who['family-names']}, {who['given-names']}" in readme for who in paper["authors"])
+
+
+def test_links_of_the_published_readme_need_no_other_file(tmp_path):
+    shutil.copy(ROOT / "README.md", tmp_path)
+    where = PROJECT["urls"]["Repository"].removeprefix("https://github.com/")
+    names = {"GITHUB_SERVER_URL": "https://github.com", "GITHUB_REPOSITORY": where}
+    for step in WORKFLOW["jobs"]["build"]["steps"]:
+        if "sed -i" in step.get("run", ""):
+            environment = {**os.environ, **names, "GITHUB_REF_NAME": "v0.1.0"}
+            subprocess.run(["bash", "-ec", step["run"]], cwd=tmp_path, env=environment, check=True)
+    text = (tmp_path / "README.md").read_text(encoding="utf-8")
+    before = (ROOT / "README.md").read_text(encoding="utf-8")
+    links, old = (re.findall(r"(!?)\[[^]]*\]\(([^)]*)\)", each) for each in (text, before))
+    assert len(links) == len(old) > 20
+    for (picture, link), (_, as_it_was) in zip(links, old, strict=True):
+        kind = "raw" if picture else "blob"
+        external = as_it_was.startswith(("#", "https://"))
+        there = f"https://github.com/{where}/{kind}/v0.1.0/{as_it_was}"
+        assert link == (as_it_was if external else there)
 
 
 def test_a_release_is_tested_before_it_is_published_without_a_token():
