@@ -415,8 +415,11 @@ class _Spectrum:
         known = np.isfinite(grid[..., 0])
         centre = grid[known].mean(axis=0)
         points = np.where(known[..., None], grid - centre, 0.0)
-        each = (known.astype(float), points, (points**2).sum(axis=-1))
-        return cls(*(np.fft.rfft(value, axis=0) for value in each), centre)
+        mask, moved, square = (
+            np.fft.rfft(each, axis=0)
+            for each in (known.astype(float), points, (points**2).sum(axis=-1))
+        )
+        return cls(mask, moved, square, centre)
 
     def over(self, other: "_Spectrum") -> tuple[Index, Array, Array]:
         """Registrations of `other` at all lags (L,), in moments: (L, 4, 4) this frame from the
