@@ -10,7 +10,7 @@ export PYTHONDONTWRITEBYTECODE :=
 # One thread each, too. A file's tests share what they have made: one process runs them.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) --dist loadfile
 
-.PHONY: demo test test-all lint check format benchmark install clean
+.PHONY: demo test test-all lint check format docs benchmark install clean
 .DEFAULT_GOAL := demo
 
 ## Reconstruct the built-in scene: prints a table against the truth, leaves a picture in demo/.
@@ -36,6 +36,11 @@ format: $(VENV)/installed
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
+## Build the site into build/site, without a warning; no network once the extra is installed.
+docs: $(VENV)/installed-docs
+	$(BIN)/python -m sphinx -q -W --keep-going -b html -c docs . build/site
+	@echo "open build/site/index.html"
+
 ## Seconds of whole commands and their stages (see scripts/benchmark.py --help).
 benchmark: $(VENV)/installed
 	$(BIN)/python scripts/benchmark.py
@@ -52,6 +57,10 @@ $(VENV)/installed: pyproject.toml constraints.txt
 	# Done at the first start otherwise, or at every one where nothing can be written.
 	$(BIN)/python -m compileall -q -j $(JOBS) shapepose_fg factors
 	-$(BIN)/shapepose-fg compile
+	touch $@
+
+$(VENV)/installed-docs: $(VENV)/installed
+	$(MAKE) --no-print-directory EXTRA=docs install
 	touch $@
 
 # By pip: PyTorch comes from where its settings say, as a small build for processors.

@@ -10,6 +10,7 @@ os.environ.setdefault("MKL_CBWR", "AUTO")
 
 
 if TYPE_CHECKING:
+    __version__: str
     from shapepose_fg.core.errors import InputError as InputError
     from shapepose_fg.core.reconstruction import Reconstruction as Reconstruction
     from shapepose_fg.io.calibration import read_rig as read_rig
@@ -43,6 +44,8 @@ torch."""
 
 def __getattr__(name: str) -> Any:
     """Import a public name on first use (PEP 562)."""
+    if name == "__version__":  # the one of pyproject.toml, from the installed package
+        return import_module("shapepose_fg.core.provenance").versions()["shapepose-fg"]
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(import_module(_HOMES[name]), name)
@@ -51,4 +54,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *_HOMES])
+    return sorted([*globals(), *_HOMES, "__version__"])

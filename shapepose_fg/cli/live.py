@@ -1,7 +1,7 @@
 """The command `live`: online reconstruction from detections as they arrive."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from shapepose_fg.cli.options import (
     INPUT,
@@ -37,6 +37,9 @@ def live(
         "File of JSON lines, tcp://:PORT, .mcap, .rrd, or rerun for the viewer; by default standard"
         " output; may be repeated.",
     ),
+    covariances: Literal["none", "joints", "all"] = option(
+        RESULT, "Covariances in lines and .mcap: none, of joints, or also of velocities.", "joints"
+    ),
     workers: int = option(RUN, "Number of processes, with this one.", 2),
 ) -> None:
     """Reconstruct people while a detector runs: reads a line per camera and picture, writes lines
@@ -62,7 +65,7 @@ def live(
         SparingNotes(note) as of_readers,
         SparingNotes(note) as of_cameras,
         naming("--lag, --calibration", "change them"),
-        published(output or (), rig, of_readers) as publish,
+        published(output or (), rig, of_readers, covariances) as publish,
         OnlineReconstructor(rig, skeleton=joints, lag_s=lag, workers=workers) as people,
     ):
         frames, jumps, said = 0, 0, None

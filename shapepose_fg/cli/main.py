@@ -1,6 +1,5 @@
 """The command line: registers all commands, and reports errors."""
 
-import json
 import os
 import sys
 from collections.abc import Sequence
@@ -13,17 +12,14 @@ from shapepose_fg.cli.batch.command import batch
 from shapepose_fg.cli.calibrate import calibrate
 from shapepose_fg.cli.compile import compile_kernels
 from shapepose_fg.cli.detect import detect
+from shapepose_fg.cli.evaluate import evaluate
 from shapepose_fg.cli.explain import explain
 from shapepose_fg.cli.export import export
 from shapepose_fg.cli.live import live
 from shapepose_fg.cli.options import (
-    INPUT,
-    REQUIRED,
     RESULT,
     Preset,
-    argument,
     grouped,
-    json_option,
     option,
     preset_option,
 )
@@ -52,7 +48,6 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-evaluate = typer.Typer(help="Score a reconstruction against an annotation.")
 _RECORDING, _RESULT, _TRY = "Reconstruct a recording", "Use a result", "Try and evaluate"
 for _panel, _commands in {
     _RECORDING: (
@@ -66,18 +61,13 @@ for _panel, _commands in {
         batch,
     ),
     _RESULT: (report, overlay, view, explain, export),
-    _TRY: (train_fitter,),
+    _TRY: (evaluate, train_fitter),
 }.items():
     for _command in _commands:
         app.command(rich_help_panel=_panel)(_command)
 app.command("compile", rich_help_panel=_TRY)(compile_kernels)
 app.add_typer(tracks, name="tracks", rich_help_panel=_RESULT)
-app.add_typer(evaluate, name="evaluate", rich_help_panel=_TRY)
 
-_MOVED = {
-    "--people": "give the result first: shapepose-fg evaluate shelf RESULTS --ground-truth FILE"
-}
-"""Removed options, and their replacements."""
 _UsageProblem = cast("type[Exception]", typer.BadParameter.__mro__[2])
 """typer's exception for an invalid command line; its place differs between versions."""
 
@@ -87,13 +77,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     use_any_streams()
     note_log()
     arguments = list(sys.argv[1:] if arguments is None else arguments)
+    if arguments == ["--version"]:
+        arguments = ["version"]
     try:
         with stoppable():
             code = app(arguments or ["--help"], standalone_mode=False)
             sys.stdout.flush()
     except _UsageProblem as error:
-        cure = _MOVED.get(getattr(error, "option_name", ""), "see shapepose-fg --help")
-        code = _fail(f"{cast(Any, error).format_message().rstrip('.')}; {cure}")
+        message = cast(Any, error).format_message().rstrip(".")
+        code = _fail(f"{message}; see shapepose-fg --help")
     except InputError as error:
         code = _fail(str(error))
     except BrokenPipeError:  # the reader of our output, such as `head`, has ended
@@ -114,25 +106,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except (typer.Abort, KeyboardInterrupt):
         code = 130
     sys.exit(code if isinstance(code, int) else 0)
-
-
-@evaluate.command("shelf")
-@grouped
-def evaluate_shelf_command(
-    results: Path = argument("RESULTS", "Folder of a reconstruction."),
-    ground_truth: Path = option(INPUT, "Annotation of the Shelf recording, a text file.", REQUIRED),
-    as_json: bool = json_option(),
-) -> None:
-    """Compute PCP per limb and actor, MPJPE and recall on the Shelf recording."""
-    from shapepose_fg.core.reconstruction import Reconstruction
-    from shapepose_fg.evaluation.shelf import evaluate_shelf
-    from shapepose_fg.evaluation.shelf_annotation import read_shelf_ground_truth
-
-    score = evaluate_shelf(Reconstruction.load(results), read_shelf_ground_truth(ground_truth))
-    if as_json:
-        print(json.dumps(score.as_dict(), indent=2, allow_nan=False))
-    else:
-        show(score.table())
 
 
 DEMO = """\

@@ -20,6 +20,8 @@ from shapepose_fg.estimation.body_step import joint_targets
 from shapepose_fg.estimation.body_window import BodyWindow, Marginals
 from shapepose_fg.estimation.body_window_graph import BodyGraph
 from shapepose_fg.estimation.camera_pose_uncertainty import carried_covariance
+from shapepose_fg.estimation.condensed_graph import gtsam_step
+from shapepose_fg.estimation.contact import feet_of
 from shapepose_fg.estimation.draft import first_places
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.factor_solution import solve_with_factors
@@ -81,6 +83,7 @@ def solve_bodies(
     # Bodies and joints together. Rows without a body keep what their views determine.
     found = _Found.of_views(evidence, config.refine.max_sigma_m, start.status)
     people, spread = list[BodyGraph](), list[Marginals]()
+    feet = feet_of(config.joints if config.motion.contact else ())
     for rows in window_rows(observations):
         if not start.ok[rows].any():
             continue
@@ -89,6 +92,9 @@ def solve_bodies(
         free = window.energy.parameters(start.rows(rows), np.zeros((len(rows), 3)))
         try:
             state = window.solve(_filled(free, start.ok[rows], window.times_s))
+            if len(rows) > 2 and len(feet) > 0:
+                state = window.hold(state, feet)
+            state = window.take(state, *gtsam_step(window, state))
             marginals = window.covariances(state)
         except np.linalg.LinAlgError:
             continue
@@ -151,7 +157,7 @@ class _Found:
         rows, window, state, fit = person.rows, person.window, person.state, self.fit
         self.joints[rows] = joints = window.joints(state)
         self.velocity[rows] = velocities(joints, window.times_s)
-        self.velocity_covariance[rows] = LASTS * marginals.velocities()
+        self.velocity_covariance[rows] = marginals.velocities()
         self.evidence.put(rows, window.last.evidence)
         fit.put_bodies(rows, window.parameters(state), np.zeros((len(rows), 3)))
         fit.joints[rows] = joints - state.deviation

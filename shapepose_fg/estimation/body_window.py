@@ -18,6 +18,7 @@ from scipy.linalg import solve_triangular
 from factors import DEFAULT_WIDTH_SIGMA, Motion
 from shapepose_fg.body.fitting.chains import Links
 from shapepose_fg.body.fitting.energy import BodyEnergy, EnergyTargets, Held, nothing
+from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.body.fitting.priors import MotionPrior, PosePrior
 from shapepose_fg.body.kernels.solving import eliminated, put_back
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
@@ -26,7 +27,13 @@ from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.asynchronous_views import carried_to_frames, leads, velocities_of
-from shapepose_fg.estimation.in_time import motion_of
+from shapepose_fg.estimation.contact import (
+    FREE_M2_S,
+    UNSEEN_S,
+    held_in_place,
+    standing_density,
+)
+from shapepose_fg.estimation.in_time import moments, motion_of, near_in_time, velocities
 from shapepose_fg.estimation.linearisation import (
     ObservationConfig,
     ViewEvidence,
@@ -48,7 +55,7 @@ _STRAYS_M = 0.07
 errors of poses that nothing shows are larger than their Gaussian when they are large."""
 _STEPS, _SETTLED_M = 8, 5e-4
 """Most steps of the solver; it ends when joints move by less on average, metres."""
-_HELD = 1e-6
+HELD = 1e-6
 """Information on every unknown, so that what nothing determines stays where it is."""
 _DAMPING = 1e-3
 
@@ -138,6 +145,10 @@ class BodyWindow:
         self._held = self.energy.held_by_priors(len(self.times_s))
         # The betas have their prior once, not in every row.
         self._held = Held(self._held.betas, np.zeros(len(self.times_s)), self._held.angles)
+        self.standing = JointTargets(
+            np.zeros(shape := (*self.variance.shape, 3)), np.zeros((*shape, 3))
+        )
+        """Constraint on the joints of standing feet by other frames, metres in the world."""
         self.links: Links | None = None
         self._asynchronous = bool(leads(observations, views).any())
 
@@ -159,23 +170,23 @@ class BodyWindow:
         bodies = self._bodies(state)
         if self.links is None and len(self) > 1:
             self.links = self._linked(bodies)
-        here, damping, done = self.around(state, bodies), _DAMPING, False
+        self.last = self.around(state, bodies)
+        return self._descended(state)
+
+    def _descended(self, state: BodyState) -> BodyState:
+        """The state of least cost, from one with `last` around it."""
+        here, damping, done = self.last, _DAMPING, False
         for _ in range(_STEPS):
             if done:
                 break
-            shape, pose = self._step(state, here, damping)
-            there = state.moved(shape, pose)
-            bodies = self._bodies(there)
-            there = replace(there, deviation=self._deviation(here, bodies))
-            new = self.around(there, bodies)
+            there, new = self._after(state, here, *self._step(state, here, damping))
             if not new.cost <= here.cost + 1e-3 * abs(here.cost):
                 damping = max(10 * damping, 1e-2)
                 if damping > 1e3:
                     break
                 continue
-            moved = np.linalg.norm(
-                bodies + there.deviation - here.bodies - state.deviation, axis=-1
-            ).mean()
+            off = new.bodies + there.deviation - here.bodies - state.deviation
+            moved = np.linalg.norm(off, axis=-1).mean()
             state, here, damping, done = (
                 there,
                 new,
@@ -184,6 +195,47 @@ class BodyWindow:
             )
         self.last = here
         return state
+
+    def hold(self, state: BodyState, feet: Index) -> BodyState:
+        """The solution in which the joints `feet` (F,) stay in place between frames where they
+        stand; the state itself if none does.
+        """
+        velocity = velocities(self.joints(state), self.times_s)[:, feet]
+        covariance = self.covariances(state).velocities()[:, feet]
+        seen = near_in_time(self.last.evidence.inlier[:, feet].any(axis=-1), self.times_s, UNSEEN_S)
+        velocity = np.where(seen[..., None], velocity, np.nan)
+        density = standing_density(velocity, covariance, self.times_s)
+        density = np.where(density > FREE_M2_S, np.inf, density)
+        if not np.isfinite(density).any():
+            return state
+        evidence = self.last.evidence
+        told = JointTargets(evidence.target[:, feet], evidence.information[:, feet])
+        information, pull = held_in_place(told, density, self.times_s)
+        scale = np.trace(information, axis1=-2, axis2=-1)[..., None, None]
+        known = np.where(scale > 0, information + 1e-9 * scale * np.eye(3), np.eye(3))
+        self.standing.information[:, feet] = information
+        self.standing.xyz[:, feet] = (inverses(known) @ pull[..., None])[..., 0]
+        self.last = self.around(state, self.last.bodies)
+        return self._descended(state)
+
+    def take(self, state: BodyState, shape: Array, pose: Array) -> BodyState:
+        """The state after another step of betas (10,) and poses (T, N) from the solution; the
+        solution itself if the step makes it worse.
+        """
+        there, new = self._after(state, self.last, shape, pose)
+        if not new.cost <= self.last.cost + 1e-3 * abs(self.last.cost):
+            return state
+        self.last = new
+        return there
+
+    def _after(
+        self, state: BodyState, here: _Around, shape: Array, pose: Array
+    ) -> tuple[BodyState, _Around]:
+        """State after a step, with the best deviations, and the model around it."""
+        there = state.moved(shape, pose)
+        bodies = self._bodies(there)
+        there = replace(there, deviation=self._deviation(here, bodies))
+        return there, self.around(there, bodies)
 
     def joints(self, state: BodyState) -> Array:
         """(T, J, 3) X, metres in the world."""
@@ -228,7 +280,11 @@ class BodyWindow:
         X = bodies + state.deviation + self.origin
         observed = self.carried(X)
         evidence = linearise(observed, self.sigmas_px, X, self.views, self.config)
-        information, target = evidence.information, evidence.target - self.origin
+        held = self.standing
+        information = evidence.information + held.information
+        pull = evidence.gradient + (held.information @ (X - held.xyz)[..., None])[..., 0]
+        both = replace(evidence, information=information, gradient=pull)
+        target = both.target - self.origin
         variance = self.variance[..., None, None]
         share = inverses(np.eye(3) + variance * information)
         weighed = information @ share  # (L^-1 + s²)^-1, of information that may be singular
@@ -236,6 +292,8 @@ class BodyWindow:
         targets = EnergyTargets(target, weighed)
         linear = self.energy.linearise(state.free, targets, 1e9, self._held, nothing(len(self)))
         cost = self._seen_cost(evidence)
+        off = (X - held.xyz)[..., None]
+        cost += (off.mT @ held.information @ off).sum(axis=(1, 2, 3))
         cost += (np.square(state.deviation).sum(axis=-1) / self.variance).sum(axis=-1)
         angles = state.others[:, :-3] - self._held.angles
         cost += np.einsum(
@@ -325,7 +383,7 @@ class BodyWindow:
             )
         M = (beyond.shape[-1] + 1) * N + 11
         kept, front = np.zeros((T, M, -(-N // 16) * 16)), np.zeros((M, M))
-        eliminated(here.system, root, diagonal + _HELD, beyond, here.pull, damping, kept, front)
+        eliminated(here.system, root, diagonal + HELD, beyond, here.pull, damping, kept, front)
         return kept, front
 
     def _step(self, state: BodyState, here: _Around, damping: float) -> tuple[Array, Array]:
@@ -414,17 +472,25 @@ class Marginals:
         return (flat @ whole).reshape(slope.shape) @ slope.mT
 
     def velocities(self) -> Array:
-        """(T, J, 3, 3) covariances of (X' - X) / dt, X' of the next frame, m²/s²; the last as the
-        one before.
+        """(T, J, 3, 3) covariances of velocities as in `in_time.velocities`, m²/s²; NaN for a
+        single frame.
+
+        Errors between distant frames are a Markov chain of those of consecutive ones, joint by
+        joint, which is less correlated than they are.
         """
         slope = self.slopes[..., 10:]
         T, J = slope.shape[:2]
         flat = slope.reshape(T, 3 * J, -1)
         own = (flat @ self.poses).reshape(slope.shape) @ slope.mT
         both = (flat[1:] @ self.steps[:-1]).reshape(slope[1:].shape) @ slope[:-1].mT
-        dt = np.diff(self.window.times_s)[:, None, None, None]
-        found = (own[1:] + own[:-1] - both - both.mT) / dt**2
-        return np.concatenate((found, found[-1:]))
+        goes = both @ inverses(own[:-1] + HELD * np.eye(3))
+        first, last, lasts = moments(self.window.times_s)
+        across = own[first]
+        for k in range(int((last - first).max(initial=0))):
+            there = np.minimum(first + k, T - 2)
+            across = np.where((first + k < last)[:, None, None, None], goes[there] @ across, across)
+        found = own[first] + own[last] - across - across.mT
+        return found / lasts[:, None, None, None] ** 2
 
 
 def nearest_keypoint(energy: BodyEnergy) -> Index:

@@ -23,6 +23,7 @@ from factors.body_shape import pose_factors
 from factors.keys import MAX_FRAME
 from shapepose_fg.body.model.rotation import exp_so3, log_so3, right_jacobian_inverse
 from shapepose_fg.core.arrays import Array, Index, Mask
+from shapepose_fg.core.decompositions import symmetric_root
 from shapepose_fg.estimation.body_window import BodyState, BodyWindow, Marginals
 from shapepose_fg.estimation.graph_covariances import graph_covariances
 from shapepose_fg.estimation.in_time import moments
@@ -93,7 +94,7 @@ class BodyGraph(PersonWindow):
         )  # fmt: skip
         factors += pose_factors([self.shape_key], [np.eye(10)[None] / scale], np.zeros((1, 10)), 10)
         factors += self._poses(scale, bodies, turns)
-        factors += self._velocities()
+        factors += [*self._velocities(), *self._standing(scale)]
         deque(map(graph.push_back, factors), maxlen=0)
         return self
 
@@ -187,6 +188,15 @@ class BodyGraph(PersonWindow):
                     parts = [1.0, -1.0 / lasts, 1.0 / lasts]
                     found.append(linear_factor(names, parts, sigma=_DEFINED_M_S))
         return found
+
+    def _standing(self, scale: float) -> list[gtsam.NonlinearFactor]:
+        """What other frames of a stance say of joints of feet."""
+        held = self.window.standing
+        frame, joint = np.nonzero(held.information.any(axis=(-1, -2)))
+        roots = symmetric_root(held.information[frame, joint]) / scale
+        right = (roots @ held.xyz[frame, joint][..., None])[..., 0]
+        names = self.keys[frame, joint].tolist()
+        return [linear_factor([key], [A], b) for key, A, b in zip(names, roots, right, strict=True)]
 
     def _seen(self, scale: float, joints: Array) -> list[gtsam.NoiseModelFactor]:
         window, evidence = self.window, self.window.last.evidence

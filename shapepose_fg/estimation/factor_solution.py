@@ -57,7 +57,7 @@ def _solved(
         for _ in range(_ROUNDS):
             graph, values = _joined(people, ties)
             if len(ties.active) == 0:
-                break
+                return []
             order = ordering(people, values)
             values = descend(graph, values, order, config, over_time=people[0].temporal)
             moved = [each.take(values) for each in people]

@@ -6,7 +6,7 @@ import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index, Mask
 
-SPEED_S = 0.1
+SPEED_S = 0.05
 """Time before and after a frame for estimating a velocity, s."""
 _AROUND_S = 0.3
 """Time before and after a step over which motion is a median, s; errors for a quarter of it have no

@@ -137,10 +137,11 @@ class NoiseLaw:
 def core_sigma_m(scores: Array | float, config: ObservationConfig | None = None) -> Array:
     """(...) standard deviation that Eq. 1 assumes for detections with these `scores` (...), m.
 
-    It is that of the mean joint.
+    It is that of the mean joint, and infinite where a score has no weight.
     """
     config = ObservationConfig() if config is None else config
-    return config.sigma_m / np.sqrt(config.weight(np.asarray(scores, dtype=np.float64)))
+    with np.errstate(divide="ignore"):
+        return config.sigma_m / np.sqrt(config.weight(np.asarray(scores, dtype=np.float64)))
 
 
 @dataclass(frozen=True)

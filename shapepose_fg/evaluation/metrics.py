@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.special import gammaincinv
 
@@ -36,14 +35,22 @@ class People(Protocol):
 class PlainPeople:
     """N rows, one per person and frame, with joints only; implements `People`."""
 
-    frame: NDArray[np.int64]
+    frame: Whole
     """(N,) frame of each row."""
     joints: Array
     """(N, J, 3) joints of each row, metres in the world, NaN where unknown."""
-    person: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    person: Whole = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     """(N,) identity, or the number within the frame; empty if there are no identities."""
     joint_names: tuple[str, ...] = BODY_25.joints
     """(J,) names."""
+    covariance: Array | None = None
+    """(N, J, 3, 3) covariances of the joints, m²; None if unknown."""
+    covered: Sequence[range] | None = None
+    """Frames that were reconstructed or annotated, also those without people; None if unknown."""
+    identified: bool = True
+    """Whether `person` is an identity over time."""
+    complete: bool = True
+    """Whether everybody in view is annotated."""
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ _MAX_PEOPLE, _MAX_FRAMES = 1000, 10**7
 
 def read_shelf_ground_truth(path: Path | str) -> PlainPeople:
     """Annotated people in `SHELF_JOINTS`: `person` 0, 1, 2 are the actors 1, 2, 3; others are not
-    scored.
+    scored, because not everybody is annotated.
 
     The file has the numbers of joints and of frames, then per frame the number of people, and per
     person an id and the rows x, y, z and confidence of all joints. InputError that names file and
@@ -58,7 +58,7 @@ def read_shelf_ground_truth(path: Path | str) -> PlainPeople:
         lines.refuse(f"goes on after the {frames} frames that line 1 promises")
     frame, person = np.array(who, dtype=np.int64).reshape(-1, 2).T
     xyz = np.stack(rows)[..., :3] if rows else np.zeros((0, joints, 3))
-    return PlainPeople(frame, xyz, person, SHELF_JOINTS)
+    return PlainPeople(frame, xyz, person, SHELF_JOINTS, complete=False)
 
 
 class _Lines:

@@ -22,6 +22,7 @@ import numpy as np
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.reconstruction import BODY, Reconstruction
 from shapepose_fg.io.ros.mcap_files import McapWriter
+from shapepose_fg.io.ros.messages import COVARIANCES
 from shapepose_fg.io.solved_setup import body_of
 from shapepose_fg.live.sockets import MOST_CLIENTS, accept, listen
 
@@ -36,12 +37,16 @@ _LAST_S = 2.0
 
 
 @contextmanager
-def published(where: Sequence[str], rig: Rig, note: Callable[[str], None]) -> Iterator[Publish]:
+def published(
+    where: Sequence[str], rig: Rig, note: Callable[[str], None], covariances: str = "joints"
+) -> Iterator[Publish]:
     """Yield a function that writes people, frame by frame, to all of `where`; by default to
-    standard output.
+    standard output. `covariances` is a level of `COVARIANCES`.
     """
     with ExitStack() as files:
-        targets = [files.enter_context(_target(each, rig, note)) for each in where or ["-"]]
+        targets = [
+            files.enter_context(_target(each, rig, note, covariances)) for each in where or ["-"]
+        ]
 
         def publish(kind: str, people: Reconstruction) -> None:
             for target in targets:
@@ -51,11 +56,13 @@ def published(where: Sequence[str], rig: Rig, note: Callable[[str], None]) -> It
 
 
 @contextmanager
-def _target(where: str, rig: Rig, note: Callable[[str], None]) -> Iterator[Publish]:
+def _target(
+    where: str, rig: Rig, note: Callable[[str], None], covariances: str
+) -> Iterator[Publish]:
     with ExitStack() as files:
         if where.endswith(".mcap"):
             written = files.enter_context(
-                McapWriter(files.enter_context(Path(where).open("wb")), rig)
+                McapWriter(files.enter_context(Path(where).open("wb")), rig, covariances)
             )
             yield lambda kind, people: _by_time(
                 people, lambda rows, time_s: written.frame(rows, time_s, kind)
@@ -93,25 +100,27 @@ def _target(where: str, rig: Rig, note: Callable[[str], None]) -> Iterator[Publi
                 sink.flush()
 
         yield lambda kind, people: _by_time(
-            people, lambda rows, time_s: send(line_of(kind, rows, time_s))
+            people, lambda rows, time_s: send(line_of(kind, rows, time_s, covariances))
         )
 
 
-def line_of(kind: str, people: Reconstruction, time_s: float) -> str:
-    """The people of a frame as a line of JSON: metres, m², m/s; null where unknown."""
+def line_of(kind: str, people: Reconstruction, time_s: float, covariances: str = "joints") -> str:
+    """The people of a frame as a line of JSON: metres, m², m/s; null where unknown. Covariances
+    that a level of `COVARIANCES` leaves out are missing.
+    """
+    columns = ("joints", "velocity", *COVARIANCES[covariances])
     rows = [
         {
             "person": int(people.person[n]),
-            "joints": _plain(people.joints[n]),
-            "covariance": _plain(people.covariance[n]),
-            "velocity": _plain(people.velocity[n]),
             "known": people.known[n].tolist(),
             "status": str(people.status[n]),
             "body": {name: _plain(getattr(people, name)[n]) for name in BODY},
         }
+        | {name: _plain(getattr(people, name)[n], "covariance" in name) for name in columns}
         for n in range(len(people))
     ]
-    return json.dumps({"kind": kind, "time_s": time_s, "people": rows}, allow_nan=False) + "\n"
+    line = {"kind": kind, "time_s": time_s, "people": rows}
+    return json.dumps(line, allow_nan=False, separators=(",", ":")) + "\n"
 
 
 def _by_time(people: Reconstruction, take: Callable[[Reconstruction, float], None]) -> None:
@@ -119,11 +128,15 @@ def _by_time(people: Reconstruction, take: Callable[[Reconstruction, float], Non
         take(people.rows(people.time_s == time_s), time_s)
 
 
-def _plain(values: np.ndarray) -> Any:
-    """Nested lists of numbers with 6 digits; null for an innermost list with an unknown number."""
+def _plain(values: np.ndarray, is_covariance: bool = False) -> Any:
+    """Nested lists of numbers; null for an innermost list with an unknown number. Covariances have
+    6 digits, so that they stay positive definite; others are rounded to 1e-4.
+    """
     if values.ndim > 1:
-        return [_plain(each) for each in values]
-    return [float(f"{value:.6g}") for value in values] if np.isfinite(values).all() else None
+        return [_plain(each, is_covariance) for each in values]
+    if not np.isfinite(values).all():
+        return None
+    return [float(f"{x:.6g}") if is_covariance else round(x, 4) for x in values.tolist()]
 
 
 class _Listeners:

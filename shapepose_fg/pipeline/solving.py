@@ -142,8 +142,9 @@ def solved_around(
         people = people.rows(
             people.person == person if solver.config.temporal else people.frame == frame
         )
-    solved = _solved(people, solver, extra_factors, frame, again=True)
-    found = [solution for _, _, solution in solved]
+    found = [
+        solution for _, _, solution in _solved(people, solver, extra_factors, frame, again=True)
+    ]
     return next(
         (each for solution in found for each in solution.people if each.person == person), None
     )

@@ -416,11 +416,11 @@ def test_errors_are_one_sentence_and_exit_code_2(recording, pipeline, capsys, op
             "--calibration, --detections and --output: missing; give them, or --project",
         ),
         (["rebuild"], "No such command 'rebuild'"),
-        (["evaluate", "shelf", "--people", "x"], "No such option: --people; give the result"),
         (
-            ["evaluate", "shelf", "/nothing", "--ground-truth", "/gt.txt"],
-            "/nothing: there is no such file",
+            ["evaluate", "x", "--ground-truth", "y"],
+            "No such option: --ground-truth",
         ),
+        (["evaluate", "/nothing", "--truth", "/gt.txt"], "/gt.txt: there is no such file"),
     ],
 )
 def test_wrong_command_lines(capsys, arguments, sentence):
@@ -484,35 +484,6 @@ def test_help_groups_the_options(capsys):
         words in printed
         for words in ("Reconstruct a recording", "Use a result", "Try and evaluate")
     )
-
-
-def test_evaluate_shelf(shared_data, tmp_path, capsys):
-    """Frame 0 of the annotation, one person of whom is found where nobody is: PCP 0 of 30 limbs or
-    fewer.
-    """
-    N = 1
-    Reconstruction(
-        frame=np.zeros(N, dtype=int),
-        person=np.zeros(N, dtype=int),
-        joint_names=np.array(BODY_25.joints),
-        joints=np.full((N, 25, 3), 100.0),
-        covariance=np.zeros((N, 25, 3, 3)),
-        confidence=np.ones((N, 25)),
-        betas=np.zeros((N, 10)),
-        global_orient=np.zeros((N, 3)),
-        body_pose=np.zeros((N, 23, 3)),
-        transl=np.zeros((N, 3)),
-        status=np.array(["ok"]),
-        run={"frames": [0, 1]},
-    ).save(tmp_path)
-    arguments = ["evaluate", "shelf", str(tmp_path)]
-    arguments += ["--ground-truth", str(shared_data / "shelf" / "gt_dev.txt")]
-    assert run(*arguments, "--json") == 0
-    score = json.loads(capsys.readouterr().out)
-    assert score["pcp_average"] == 0
-    assert score["frames"] == 1
-    assert run(*arguments) == 0
-    assert "left lower arm" in capsys.readouterr().out
 
 
 @pytest.fixture
@@ -594,6 +565,14 @@ def test_train_fitter_without_torch_names_the_command(tmp_path, monkeypatch, cap
     assert run("train-fitter", "--body", tmp_path / "SMPL_NEUTRAL.pkl") == 2
     said = capsys.readouterr().err
     assert said == 'error: torch is not installed; pip install "shapepose-fg[train]"\n'
+
+
+def test_version_is_a_command_and_an_option(capsys):
+    said = []
+    for word in ("version", "--version"):
+        assert run(word) == 0
+        said.append(capsys.readouterr().out)
+    assert said[0] == said[1] and "shapepose-fg " in said[0]
 
 
 @pytest.mark.slow

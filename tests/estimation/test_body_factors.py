@@ -99,7 +99,7 @@ def test_people_whom_a_factor_ties_are_one_graph_and_both_give_way() -> None:
     start.insert(board, one.first[5, WRIST])
     one.add(start)
     apart = one.first[5, WRIST] - other.first[5, WRIST]
-    for each, to_board in ((one, np.zeros(3)), (other, apart + [0.04, 0.0, 0.0])):
+    for each, to_board in ((one, np.zeros(3)), (other, apart + np.array([0.04, 0.0, 0.0]))):
         end = int(each.keys[5, WRIST])
         one.add(gtsam.BetweenFactorPoint3(end, board, to_board, isotropic(3, 0.005)), "board")
     found = solve_with_factors([one, other, third], CONFIG)

@@ -14,6 +14,7 @@ from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.body_window import BodyWindow
 from shapepose_fg.estimation.body_window_graph import BodyGraph, ordering
+from shapepose_fg.estimation.condensed_graph import gtsam_step
 from shapepose_fg.estimation.graph_covariances import graph_covariances
 from shapepose_fg.estimation.linearisation import ObservationConfig, observation_sigmas
 from shapepose_fg.estimation.motion_model import MotionModel
@@ -132,6 +133,21 @@ def test_a_frame_by_itself_is_a_window_of_one() -> None:
     state = alone.solve(start[4:5])
     assert np.linalg.norm(alone.joints(state) - truth[4:5], axis=-1).mean() < 0.03
     assert np.isfinite(alone.covariances(state).joints()).all()
+
+
+def test_gtsam_takes_the_step_of_the_compiled_solver() -> None:
+    window, _, start = _person(3)
+    state = window.solve(start)
+    shape, pose = gtsam_step(window, state)
+    theirs = window._step(state, window.last, 0.0)
+    # The compiled solver neglects how the root turns between frames in the couplings of rotations.
+    for step, compiled in zip((shape, pose), theirs, strict=True):
+        assert np.abs(step - compiled).max() < 0.1 * np.abs(compiled).max()
+    before = window.last.cost
+    window.take(state, shape, pose)
+    assert window.last.cost <= before
+    beyond = window.take(state, shape, np.full_like(pose, 1.0))
+    assert beyond is state, "a step that makes it worse is not taken"
 
 
 def test_a_body_s_values_are_those_of_the_model_wherever_it_was_linearised() -> None:

@@ -211,3 +211,8 @@ def test_regions_hold_for_a_detector_with_twice_the_errors(noisy, of_few_frames,
     two = reconstruct(recording, scene.rig, times=times, execution=Execution(workers=2))
     np.testing.assert_array_equal(two.covariance, people.covariance)
     assert two.run["noise_law"] == people.run["noise_law"]
+
+
+def test_a_score_without_weight_has_an_infinite_sigma_and_no_warning():
+    sigma = core_sigma_m(np.array([0.0, 0.25, 1.0]), ObservationConfig.paper())
+    assert np.isinf(sigma[0]) and np.isfinite(sigma[1:]).all() and sigma[1] > sigma[2]

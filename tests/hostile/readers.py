@@ -25,6 +25,7 @@ from shapepose_fg.core.skeleton import BODY_25, COCO_17
 from shapepose_fg.detection2d.opening import read_form
 from shapepose_fg.estimation.motion_model import MotionConfig, MotionModel
 from shapepose_fg.evaluation.shelf_annotation import read_shelf_ground_truth
+from shapepose_fg.evaluation.truth import read_people
 from shapepose_fg.io.calibration import read_rig, write_rig
 from shapepose_fg.io.config import read_config, toml_text
 from shapepose_fg.io.corrections import correct, read_corrections, take_back
@@ -373,6 +374,41 @@ def _annotation(folder: Path, seed: int) -> Read:
     return lambda: read_shelf_ground_truth(path)
 
 
+def _actors(folder: Path, seed: int) -> Read:
+    from scipy.io import savemat
+
+    actors, rng = np.empty((1, 2), dtype=object), np.random.default_rng(seed)
+    for n in range(2):
+        actors[0, n] = np.empty((2, 1), dtype=object)
+        for frame in range(2):
+            actors[0, n][frame, 0] = rng.normal(0, 1, (14, 3))
+    savemat(folder / "actorsGT.mat", {"actor3D": actors}, do_compression=seed % 2 == 0)
+    return lambda: read_people(folder / "actorsGT.mat")
+
+
+def _panoptic(folder: Path, seed: int) -> Read:
+    rng = np.random.default_rng(seed)
+    for frame in range(2):
+        bodies = [{"id": n, "joints19": rng.normal(0, 100, 76).tolist()} for n in range(2)]
+        text = json.dumps({"version": 0.7, "bodies": bodies})
+        (folder / f"body3DScene_{frame:08d}.json").write_text(text)
+    return lambda: read_people(folder)
+
+
+def _joints(folder: Path, seed: int) -> Read:
+    joints = np.random.default_rng(seed).normal(0, 1, (3, 2, 17, 3))
+    np.savez(folder / "truth.npz", joints=joints, layout="H36M_17", frames=np.arange(3))
+    return lambda: read_people(folder / "truth.npz")
+
+
+def _amass(folder: Path, seed: int) -> Read:
+    rng, path = np.random.default_rng(seed), folder / "person_1.npz"
+    more = {"betas": rng.normal(0, 1, 16), "mocap_framerate": np.array(50.0)}
+    poses, trans = rng.normal(0, 0.3, (4, 156)), rng.normal(0, 1, (4, 3))
+    np.savez(path, poses=poses, trans=trans, body=np.array("shapepose-fg open body"), **more)
+    return lambda: read_people(path, up="z", fps=25.0)
+
+
 PARTS: dict[str, tuple[int, dict[str, Any]]] = {
     "parts on the way": (2, {}),
     "parts in chunks": (2, {"chunk_frames": 6}),
@@ -436,5 +472,9 @@ READERS: dict[str, Prepare] = {
     "pickled body": _body(True),
     "weights": _weights,
     "Shelf's annotation": _annotation,
+    "actors of Shelf and Campus": _actors,
+    "people of Panoptic": _panoptic,
+    "joints of a data set": _joints,
+    "motion of AMASS": _amass,
 }
 """Every reader, by what it reads."""

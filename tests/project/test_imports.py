@@ -47,6 +47,8 @@ LEVELS = (
     "pipeline.trajectories",
     "pipeline.pipeline",
     "io",
+    "io.export.take",
+    "biomechanics",
     "pipeline.solving",
     "pipeline.explanation",
     "pipeline.explaining",
@@ -63,7 +65,7 @@ LEVELS = (
     "cli.batch",
     "cli.demo cli.tracks cli.detect cli.overlay cli.export cli.report cli.view cli.setup "
     "cli.simulate cli.train_fitter cli.batch.command cli.refine cli.synchronise cli.live "
-    "cli.calibrate cli.explain",
+    "cli.calibrate cli.explain cli.evaluate",
     "cli.compile",
     "cli.main",
     "__main__",
@@ -193,6 +195,7 @@ WITHOUT_CHOICE = {
     "shapepose_fg.core.decompositions": "removes it",
     "factors.camera_of": "gives signs: depth and focal lengths are positive",
     "factors.lasting": "makes symmetric roots and projectors",
+    "shapepose_fg.evaluation.score": "gives rotations, which have no sign",
 }
 
 

@@ -1,16 +1,17 @@
-"""Definitions of the ROS 2 messages that are written and read: those of ROS, and three of this
-project.
+"""Definitions of the ROS 2 messages that are written and read: those of ROS and ROS4HRI, and four
+of this project.
 
-Those of ROS are as in the distributions from Humble on, without constants and comments.
+Those of others are as in the distributions from Humble on, without constants and comments.
 nav_msgs/Odometry and two related messages have only the fields that are read.
 """
 
 import re
 
-_FIELDS = {
+FIELDS = {
     "builtin_interfaces/Time": "int32 sec; uint32 nanosec",
     "builtin_interfaces/Duration": "int32 sec; uint32 nanosec",
     "std_msgs/Header": "builtin_interfaces/Time stamp; string frame_id",
+    "std_msgs/String": "string data",
     "std_msgs/ColorRGBA": "float32 r; float32 g; float32 b; float32 a",
     "geometry_msgs/Vector3": "float64 x; float64 y; float64 z",
     "geometry_msgs/Point": "float64 x; float64 y; float64 z",
@@ -39,6 +40,10 @@ _FIELDS = {
         "d; float64[9] k; float64[9] r; float64[12] p; uint32 binning_x; uint32 binning_y; "
         "sensor_msgs/RegionOfInterest roi"
     ),
+    "sensor_msgs/JointState": (
+        "std_msgs/Header header; string[] name; float64[] position; float64[] velocity; float64[] "
+        "effort"
+    ),
     "sensor_msgs/CompressedImage": "std_msgs/Header header; string format; uint8[] data",
     "visualization_msgs/UVCoordinate": "float32 u; float32 v",
     "visualization_msgs/MeshFile": "string filename; uint8[] data",
@@ -51,6 +56,14 @@ _FIELDS = {
         "mesh_resource; visualization_msgs/MeshFile mesh_file; bool mesh_use_embedded_materials"
     ),
     "visualization_msgs/MarkerArray": "visualization_msgs/Marker[] markers",
+    "hri_msgs/IdsList": "std_msgs/Header header; string[] ids",
+    "hri_msgs/NormalizedPointOfInterest2D": "float32 x; float32 y; float32 c",
+    "hri_msgs/Skeleton2D": (
+        "std_msgs/Header header; hri_msgs/NormalizedPointOfInterest2D[18] skeleton"
+    ),
+    "hri_msgs/NormalizedRegionOfInterest2D": (
+        "std_msgs/Header header; float32 xmin; float32 ymin; float32 xmax; float32 ymax; float32 c"
+    ),
     "shapepose_msgs/Person": (
         "int64 person; string status; float64[] joints; float64[] covariance; float64[] velocity;"
         " float64[] velocity_covariance; uint8[] known; float64[] betas; float64[] global_orient;"
@@ -72,11 +85,9 @@ def definition(name: str) -> str:
     """
     order = [name]
     for each in order:
-        inner = (field.split()[0].partition("[")[0] for field in _FIELDS[each].split(";"))
-        order += [other for other in inner if other in _FIELDS and other not in order]
-    texts = [
-        "\n".join(field.strip() for field in _FIELDS[each].split(";")) + "\n" for each in order
-    ]
+        inner = (field.split()[0].partition("[")[0] for field in FIELDS[each].split(";"))
+        order += [other for other in inner if other in FIELDS and other not in order]
+    texts = ["\n".join(field.strip() for field in FIELDS[each].split(";")) + "\n" for each in order]
     apart = "=" * 80 + "\n"
     return texts[0] + "".join(
         f"{apart}MSG: {each}\n{text}" for each, text in zip(order[1:], texts[1:], strict=True)
@@ -115,13 +126,13 @@ def check_definition(name: str, text: str) -> None:
         if other not in _TIME and other not in theirs:
             raise ValueError(f"{other} is not defined")
         found = theirs.get(other, _TIME.get(other, {}))
-        for kind, field in (each.split() for each in _FIELDS[mine].split(";")):
+        for kind, field in (each.split() for each in FIELDS[mine].split(";")):
             inner, _, array = kind.partition("[")
             has, _, has_array = found.get(field, "").partition("[")
             alike = _FAMILY.get(inner, "message") == _FAMILY.get(has, "message") and has != ""
             if not alike or array != has_array:
                 raise ValueError(f"{other} has no {field} of {kind}")
-            if inner in _FIELDS:
+            if inner in FIELDS:
                 waiting.append((inner, has))
 
 

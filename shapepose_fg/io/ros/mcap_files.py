@@ -5,6 +5,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any
@@ -22,25 +23,11 @@ from shapepose_fg.core.trajectory import LONGEST_GAP_S, Trajectory
 from shapepose_fg.io.camera_names import listing
 from shapepose_fg.io.detections.lines import view_of
 from shapepose_fg.io.ros.definitions import check_definition, definition, type_name
-from shapepose_fg.io.ros.messages import (
-    NS,
-    Message,
-    body_transforms,
-    camera_info,
-    carrier_transforms,
-    fixed_transforms,
-    header,
-    markers,
-    nanoseconds,
-    optical,
-    people_message,
-    ros_name,
-)
+from shapepose_fg.io.ros.messages import NS, Message, header, nanoseconds, optical, ros_name
 from shapepose_fg.io.ros.poses import KINDS, Frames, frame_of, stamp_ns
+from shapepose_fg.io.ros.topics import PeopleTopics
 
 _DETECTIONS = "shapepose_msgs/Detections"
-_LASTS_S = 0.2
-"""Lifetime of the markers of a person who is no longer seen, s."""
 _CHUNK = 2**26
 """Maximum size of a decompressed chunk, bytes; ROS 2 writes chunks of one million bytes."""
 _WINDOW, _MOST_RECORDS = 2**27, 2**19
@@ -60,10 +47,10 @@ View = tuple[str, Detections, float, Array | None, Array | None]
 class McapWriter(AbstractContextManager["McapWriter"]):
     """Writes people frame by frame. A context manager; the file's index is written at its end."""
 
-    def __init__(self, stream: IO[bytes], rig: Rig | None) -> None:
+    def __init__(self, stream: IO[bytes], rig: Rig | None, covariances: str = "all") -> None:
         self._file = optional("mcap_ros2.writer", "ros").Writer(stream)
         self._schemas: dict[str, Any] = {}
-        self._rig, self._begun = rig, False
+        self._topics, self._begun = PeopleTopics(rig, covariances), False
 
     def __exit__(
         self,
@@ -74,27 +61,14 @@ class McapWriter(AbstractContextManager["McapWriter"]):
         self._file.finish()
 
     def frame(self, rows: Reconstruction, time_s: float, kind: str = "settled") -> None:
-        """Write the people of one frame: /people, /people/markers, /tf; before the first frame also
-        cameras and /tf_static.
-        """
-        if not self._begun and self._rig is not None:
-            self._message(
-                "/tf_static", "tf2_msgs/TFMessage", fixed_transforms(self._rig, time_s), time_s
-            )
-            for camera in self._rig.cameras:
-                topic = f"/{ros_name(camera.name)}/camera_info"
-                self._message(topic, "sensor_msgs/CameraInfo", camera_info(camera, time_s), time_s)
-        self._begun = True
-        here = f"/people/{kind}"
-        self._message(here, "shapepose_msgs/People", people_message(rows, kind, time_s), time_s)
-        shown = markers(rows, time_s, _LASTS_S)
-        self._message(f"{here}/markers", "visualization_msgs/MarkerArray", shown, time_s)
-        moved = body_transforms(rows, time_s)["transforms"]
-        if self._rig is not None:
-            moved += carrier_transforms(self._rig, time_s)["transforms"]
+        """Write the people of one frame; before the first frame also cameras and /tf_static."""
         # A body frame has one pose at a time: the refined one, if both are written.
-        if moved and kind != "now":
-            self._message("/tf", "tf2_msgs/TFMessage", {"transforms": moved}, time_s)
+        published = self._topics.frame(rows, time_s, kind, kind != "now")
+        if not self._begun:
+            published = chain(self._topics.fixed(time_s), published)
+        self._begun = True
+        for topic, name, message in published:
+            self._message(topic, name, message, time_s)
 
     def detections(self, camera: str, seen: list[list[float]], time_s: float, rig: Rig) -> None:
         """Write one camera's detections: for each person, x, y and score of each keypoint, pixels
@@ -109,6 +83,17 @@ class McapWriter(AbstractContextManager["McapWriter"]):
         if kind not in self._schemas:
             self._schemas[kind] = self._file.register_msgdef(type_name(kind), definition(kind))
         self._file.write_message(topic, self._schemas[kind], message, log_time=nanoseconds(time_s))
+
+
+def view_of_message(
+    message: Any, place: str, rig: Rig, skeleton: Skeleton
+) -> tuple[str, Detections, float]:
+    """Camera, detections and time in seconds of a shapepose_msgs/Detections. InputError naming
+    `place` if it is invalid.
+    """
+    people = [list(map(float, each.pose_keypoints_2d)) for each in message.people]
+    time_s = stamp_ns(message.header) / NS
+    return view_of(message.camera, time_s, people, place, rig, skeleton)
 
 
 def read_views(
@@ -159,11 +144,7 @@ def read_views(
                 with _whole(file, _CURE):
                     if message.camera in rig.unwanted:
                         continue
-                    people = [list(map(float, each.pose_keypoints_2d)) for each in message.people]
-                    time_s = stamp_ns(message.header) / NS
-                    view = view_of(
-                        message.camera, time_s, people, f"{file}, message {number}", rig, skeleton
-                    )
+                    view = view_of_message(message, f"{file}, message {number}", rig, skeleton)
                     goes = carrier[message.camera]
                     waiting.append(
                         (view, frame_of(goes) if goes else message.header.frame_id.lstrip("/"))

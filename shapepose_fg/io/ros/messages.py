@@ -1,24 +1,25 @@
 """Converts rows of a result, and cameras, to the contents of ROS 2 messages.
 
 Coordinate frames follow REP 103 and 105: `map` has z up and is the parent of `world`, the frame of
-the calibration; `<camera>_optical` is a camera, z forward; `body_<identity>` is a person, at the
+the calibration; `<camera>_optical` is a camera, z forward; `body_p<identity>` is a person, at the
 midpoint of the hips, x to the front and z to the head. Time stamps are on the clock of the
 pictures.
 """
 
-import math
 import re
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
+from shapepose_fg.body.model.rotation import quaternion
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.decompositions import rigid
 from shapepose_fg.core.drawing import bones_of, colour_of
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.reconstruction import BODY, Reconstruction
+from shapepose_fg.io.ros.humans import Human
 
 Message = dict[str, Any]
 MAP, WORLD = "map", "world"
@@ -29,8 +30,12 @@ _LAST_S = 2**31
 _SPHERES, _LINES = 7, 5
 """`SPHERE_LIST` and `LINE_LIST` of visualization_msgs/Marker."""
 _JOINT_M, _BONE_M = 0.05, 0.03
-_BODY_FROM_FRONT = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
-"""Rotation to SMPL's axes (x left, y up, z front) from a frame with x front, y left and z up."""
+COVARIANCES: dict[str, tuple[str, ...]] = {
+    "none": (),
+    "joints": ("covariance",),
+    "all": ("covariance", "velocity_covariance"),
+}
+"""Columns of a result with covariances, by level of detail."""
 _LENSES = {4: "equidistant", 5: "plumb_bob"}
 """Names of lens models by the number of coefficients; those with more are `rational_polynomial`."""
 
@@ -50,18 +55,24 @@ def header(frame_id: str, time_s: float) -> Message:
     return {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": frame_id}
 
 
-def people_message(rows: Reconstruction, kind: str, time_s: float) -> Message:
-    """shapepose_msgs/People: one frame's rows, the arrays of people.npz, flat, NaN if unknown."""
-    names = (
-        "joints covariance velocity velocity_covariance betas global_orient body_pose transl"
-    ).split()
+def people_message(
+    rows: Reconstruction, kind: str, time_s: float, covariances: str = "all"
+) -> Message:
+    """shapepose_msgs/People: one frame's rows, the arrays of people.npz, flat, NaN if unknown.
+    Covariances that a level of `COVARIANCES` leaves out are empty.
+    """
+    columns = ("joints", "velocity", *BODY)
+    kept = (*columns, *COVARIANCES[covariances])
     people = [
         {
             "person": int(rows.person[n]),
             "status": str(rows.status[n]),
             "known": rows.known[n].tolist(),
         }
-        | {name: getattr(rows, name)[n].ravel().tolist() for name in names}
+        | {
+            name: getattr(rows, name)[n].ravel().tolist() if name in kept else []
+            for name in (*columns, *COVARIANCES["all"])
+        }
         for n in range(len(rows))
     ]
     return {
@@ -72,45 +83,69 @@ def people_message(rows: Reconstruction, kind: str, time_s: float) -> Message:
     }
 
 
-def body_transforms(rows: Reconstruction, time_s: float) -> Message:
-    """tf2_msgs/TFMessage: `body_<identity>` of all people with known hips and a body."""
-    from scipy.spatial.transform import Rotation
+def body_transforms(people: Sequence[Human], time_s: float) -> list[Message]:
+    """geometry_msgs/TransformStamped: `body_p<identity>` in the world, and the links of people in
+    their bodies.
+    """
+    made = [
+        (parent, f"{name}_{each.body_id}", pose)
+        for each in people
+        for parent, name, pose in (
+            (WORLD, "body", each.world_from_body),
+            *((f"body_{each.body_id}", name, link) for name, link in each.links.items()),
+        )
+    ]
+    return _transforms(made, time_s)
 
-    made = []
-    for n in range(len(rows)):
-        hips, turn = _hips(rows, n), rows.global_orient[n]
-        if np.isfinite(hips).all() and np.isfinite(turn).all():
-            R = Rotation.from_rotvec(turn).as_matrix() @ _BODY_FROM_FRONT
-            made.append(_transform(WORLD, f"body_{rows.person[n]}", rigid(R, hips), time_s))
-    return {"transforms": made}
+
+def joint_state(human: Human, time_s: float) -> Message:
+    """sensor_msgs/JointState of one person."""
+    return {
+        "header": header(f"body_{human.body_id}", time_s),
+        "name": [f"{name}_{human.body_id}" for name in human.angles],
+        "position": list(human.angles.values()),
+        "velocity": [],
+        "effort": [],
+    }
 
 
-def fixed_transforms(rig: Rig, time_s: float) -> Message:
+def skeleton_and_region(
+    points: Sequence[tuple[float, float, float]], camera: Camera, time_s: float
+) -> tuple[Message, Message]:
+    """hri_msgs/Skeleton2D and hri_msgs/NormalizedRegionOfInterest2D of the points of one person in
+    the picture of a camera.
+    """
+    stamped = {"header": header(optical(camera), time_s)}
+    inside = np.array([each for each in points if each[2] > 0]).reshape(-1, 3)
+    box = np.stack([inside.min(axis=0), inside.max(axis=0)]) if len(inside) else np.zeros((2, 3))
+    (xmin, ymin, _), (xmax, ymax, c) = box.tolist()
+    skeleton = [dict(zip("xyc", each, strict=True)) for each in points]
+    region = {"xmin": xmin, "ymin": ymin, "xmax": xmax, "ymax": ymax, "c": c}
+    return stamped | {"skeleton": skeleton}, stamped | region
+
+
+def fixed_transforms(rig: Rig, time_s: float, moving: Collection[str] = ()) -> Message:
     """tf2_msgs/TFMessage of static frames: from `map` to `world`, and from `world`, or from their
-    carriers, to the cameras.
+    carriers, to the cameras. Cameras that are `moving` without a carrier are left out.
     """
     from scipy.spatial.transform import Rotation
 
     up, z = rig.up_vector, np.array([0.0, 0, 1])
     R = np.diag([1.0, -1, -1]) if up @ z < 0 else Rotation.align_vectors(z, up)[0].as_matrix()
-    made = [_transform(MAP, WORLD, rigid(R, np.zeros(3)), time_s)]
+    made = [(MAP, WORLD, rigid(R, np.zeros(3)))]
     for camera in rig.cameras:
-        parent, pose = (
-            (ros_name(camera.carrier), camera.bTc) if camera.carrier else (WORLD, camera.wTc)
-        )
-        made.append(_transform(parent, optical(camera), pose, time_s))
-    return {"transforms": made}
+        if camera.carrier:
+            made.append((ros_name(camera.carrier), optical(camera), camera.bTc))
+        elif camera.name not in moving:
+            made.append((WORLD, optical(camera), camera.wTc))
+    return {"transforms": _transforms(made, time_s)}
 
 
-def carrier_transforms(rig: Rig, time_s: float) -> Message:
-    """tf2_msgs/TFMessage: transforms from the world to each camera carrier (such as a robot)."""
+def carrier_transforms(rig: Rig, time_s: float) -> list[Message]:
+    """geometry_msgs/TransformStamped from the world to each camera carrier (such as a robot)."""
     at = np.full(1, time_s)
-    return {
-        "transforms": [
-            _transform(WORLD, ros_name(each.name), each.at(at)[0], time_s)
-            for each in rig.trajectories
-        ]
-    }
+    made = [(WORLD, ros_name(each.name), each.at(at)[0]) for each in rig.trajectories]
+    return _transforms(made, time_s)
 
 
 def camera_info(camera: Camera, time_s: float) -> Message:
@@ -153,7 +188,7 @@ def _markers(rows: Reconstruction, time_s: float, lasts_s: float) -> Iterator[Me
             yield {
                 "header": header(WORLD, time_s), "ns": ns, "id": int(rows.person[n]) % _LAST_S,
                 "type": kind, "action": 0,
-                "pose": {"position": _xyz(np.zeros(3)), "orientation": _quaternion(np.eye(3))},
+                "pose": {"position": _xyz(np.zeros(3)), "orientation": _wxyz(np.eye(4)[0])},
                 "scale": _xyz(np.array(size)), "color": color,
                 "lifetime": {"sec": sec, "nanosec": nanosec}, "frame_locked": False,
                 "points": list(map(_xyz, points)), "colors": [], "texture_resource": "",
@@ -176,27 +211,24 @@ def optical(camera: Camera) -> str:
     return f"{ros_name(camera.name)}_optical"
 
 
-def _hips(rows: Reconstruction, n: int) -> Array:
-    """(3,) midpoint of the hips, metres; NaN if unknown."""
-    names = rows.joint_names.tolist()
-    at = [
-        names.index(each)
-        for each in (["MidHip"] if "MidHip" in names else ["RHip", "LHip"])
-        if each in names
+def _transforms(made: Sequence[tuple[str, str, Array]], time_s: float) -> list[Message]:
+    """geometry_msgs/TransformStamped of parents, children and poses (4, 4)."""
+    poses = np.array([pose for *_, pose in made]).reshape(-1, 4, 4)
+    return [
+        {
+            "header": header(parent, time_s),
+            "child_frame_id": child,
+            "transform": {"translation": _xyz(place), "rotation": _wxyz(turn)},
+        }
+        for (parent, child, _), place, turn in zip(
+            made, poses[:, :3, 3], quaternion(poses[:, :3, :3]), strict=True
+        )
     ]
-    return rows.joints[n, at].mean(axis=0) if at else np.full(3, math.nan)
-
-
-def _transform(parent: str, child: str, pose: Array, time_s: float) -> Message:
-    turn = {"translation": _xyz(pose[:3, 3]), "rotation": _quaternion(pose[:3, :3])}
-    return {"header": header(parent, time_s), "child_frame_id": child, "transform": turn}
 
 
 def _xyz(point: Array) -> Message:
     return dict(zip("xyz", point.tolist(), strict=True))
 
 
-def _quaternion(R: Array) -> Message:
-    from scipy.spatial.transform import Rotation
-
-    return dict(zip("xyzw", Rotation.from_matrix(R).as_quat().tolist(), strict=True))
+def _wxyz(turn: Array) -> Message:
+    return dict(zip("wxyz", turn.tolist(), strict=True))
