@@ -295,7 +295,8 @@ def _rotations(
     """
     points, jacobian = model.keypoints_with_jacobian(posed)
     count, columns = len(points), jacobian.shape[-1]
-    seen = Known.observed(people.known) & np.isfinite(people.covariance).all(axis=(2, 3))
+    volume = np.linalg.det(np.nan_to_num(people.covariance))  # 0 if it is unknown or singular
+    seen = Known.observed(people.known) & (volume > 0)
     known = seen[..., None, None]
     weight = np.where(known, np.linalg.inv(np.where(known, people.covariance, np.eye(3))), 0)
     flat = jacobian.reshape(count, -1, columns)

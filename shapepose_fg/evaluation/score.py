@@ -267,9 +267,12 @@ def _matched(
     """Joints (M, J, 3) of matched predictions and of the truth, and covariances (M, J, 3, 3), NaN
     where unknown.
     """
-    persons, who = np.unique(truth.person, return_inverse=True)
-    table = np.full((len(scored), len(persons), *truth.joints.shape[1:]), np.nan)
-    table[np.searchsorted(scored, truth.frame), who] = truth.joints
+    at = np.searchsorted(scored, truth.frame)
+    order = np.argsort(at, kind="stable")
+    place = np.empty(len(at), dtype=np.intp)  # number of each person within the frame
+    place[order] = np.arange(len(at)) - np.searchsorted(at[order], at[order])
+    table = np.full((len(scored), place.max(initial=0) + 1, *truth.joints.shape[1:]), np.nan)
+    table[at, place] = truth.joints
     matches = match_people(people.frame, people.joints, table, scored.tolist())
     joints = people.joints[matches.row]
     covariance = np.full((*joints.shape, 3), np.nan)
