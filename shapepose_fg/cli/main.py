@@ -77,6 +77,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     use_any_streams()
     note_log()
     arguments = list(sys.argv[1:] if arguments is None else arguments)
+    if arguments == ["--version"]:
+        arguments = ["version"]
     try:
         with stoppable():
             code = app(arguments or ["--help"], standalone_mode=False)

@@ -560,6 +560,14 @@ def test_train_fitter_without_torch_names_the_command(tmp_path, monkeypatch, cap
     assert said == 'error: torch is not installed; pip install "shapepose-fg[train]"\n'
 
 
+def test_version_is_a_command_and_an_option(capsys):
+    said = []
+    for word in ("version", "--version"):
+        assert run(word) == 0
+        said.append(capsys.readouterr().out)
+    assert said[0] == said[1] and "shapepose-fg " in said[0]
+
+
 @pytest.mark.slow
 def test_a_reader_that_stops_reading_is_no_error():
     """`shapepose-fg version | head -n 0`: no traceback, no sentence."""
