@@ -106,11 +106,24 @@ def scripts() -> str:
 
 
 def settings() -> str:
-    """All settings with their defaults and meanings, as `shapepose-fg config` prints them."""
+    """All settings with their defaults and meanings, from what `shapepose-fg config` prints."""
     from shapepose_fg.io.config import toml_text
     from shapepose_fg.pipeline.config import PipelineConfig
 
-    return f"```toml\n{toml_text(PipelineConfig())}```\n"
+    text, meaning, table = "", [], False
+    for line in ["[]", *toml_text(PipelineConfig()).splitlines()]:
+        if line.startswith("#"):
+            meaning.append(line.removeprefix("#").strip().replace("|", "\\|"))
+        elif line.startswith("["):
+            title = f"`{line}`" if line != "[]" else "Top level"
+            text += f"\n## {title}\n\n{' '.join(meaning)}\n\n"
+            meaning, table = [], False
+        elif " = " in line:
+            name, _, value = line.partition(" = ")
+            text += "" if table else "| setting | default | meaning |\n|---|---|---|\n"
+            text += f"| `{name}` | `{value}` | {' '.join(meaning)} |\n"
+            meaning, table = [], True
+    return text
 
 
 def commands() -> str:
@@ -133,7 +146,7 @@ def _command(name: str, command: Any, heading: str) -> Iterator[str]:
     words = [each.metavar or each.name.upper() for each in arguments]
     required = [each for each in command.params if each.required and each not in arguments]
     words += [f"{each.opts[0]} {each.metavar or each.name.upper()}" for each in required]
-    yield f"```text\n{' '.join([name, *words, '[OPTIONS]'])}\n```\n\n"
+    yield f"```bash\n{' '.join([name, *words, '[OPTIONS]'])}\n```\n\n"
     rows = [_row(each) for each in command.params if not getattr(each, "hidden", False)]
     if rows:
         yield "| option | meaning |\n|---|---|\n" + "".join(rows) + "\n"

@@ -51,7 +51,8 @@ _MOST_SIGMA_DEG, _MOST_APART_DEG = 1.0, 2.0
 degrees."""
 _UNUSUAL = 3.0
 """Maximum deviation of stature, in standard deviations, for people assumed to be adults."""
-_FREE = Freedom(turn_deg=20.0, move_m=1.0)
+KNOWN_LENS = Freedom()
+"""Lenses that are not adjusted."""
 _FILM = (
     "film two or more people for a minute who walk through all views, near and far, not on one line"
 )
@@ -142,7 +143,7 @@ def calibrate(
     rig: Rig,
     times: FrameTimes,
     frames: range,
-    focal: float = 0.0,
+    lens: Freedom = KNOWN_LENS,
     measured: Measured | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
     start: Rig | None = None,
@@ -150,7 +151,7 @@ def calibrate(
     """Estimate the poses of the cameras of `rig`, ignoring its own poses, from the people in
     `detections`.
 
-    `focal` is the prior standard deviation of focal lengths, as a share; 0 keeps them. The scale
+    `lens` has the prior standard deviations of the lenses; that of the poses is ignored. The scale
     comes from `measured` distances, or from the stature of adults. `start` are approximate cameras,
     which replace the search. Raises Undetermined if cameras share too few people, or motion does
     not determine them; InputError if measured distances contradict each other.
@@ -164,7 +165,10 @@ def calibrate(
         done += more
         progress(done, total)
 
-    footage, freedom = Footage.of(detections, rig, times, frames), replace(_FREE, focal=focal)
+    footage, freedom = (
+        Footage.of(detections, rig, times, frames),
+        replace(lens, turn_deg=20.0, move_m=1.0),
+    )
     taken = np.unique(footage.sightings.frame)
     how = _How(rig, times, freedom, detections.skeleton, measured.stature_m, told)
     if start is None:

@@ -10,6 +10,7 @@ from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.rows import Rows
+from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.linearisation import ObservationConfig
 from shapepose_fg.setup_check.evidence import observed, triangulate
 from shapepose_fg.setup_check.matching import GATE, Pairs, Sightings, size_of
@@ -72,11 +73,15 @@ class Footage:
         sightings = seen_at(detections, chosen.tolist())
         thin = -(-len(sightings) // _MOST_SIGHTINGS)
         sightings = sightings.rows(np.isin(sightings.frame, chosen[::thin]))
+        return cls.taken(sightings, rig, detections.skeleton)
+
+    @classmethod
+    def taken(cls, sightings: Sightings, rig: Rig, skeleton: Skeleton) -> "Footage":
+        """Sightings that were undistorted by the lenses of `rig`."""
         xy = sightings.xy.copy()
         for view, camera in enumerate(rig.cameras):
             here = sightings.view == view
             xy[here] = camera.distort(xy[here].reshape(-1, 2)).reshape(xy[here].shape)
-        skeleton = detections.skeleton
         return cls(
             replace(sightings, xy=xy), tuple(skeleton.joints[joint] for joint in skeleton.core)
         )

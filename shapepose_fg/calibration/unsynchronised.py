@@ -6,7 +6,14 @@ from collections.abc import Callable
 
 import numpy as np
 
-from shapepose_fg.calibration.from_people import Calibrated, Undetermined, calibrate, own_tracks
+from shapepose_fg.calibration.adjustment import Freedom
+from shapepose_fg.calibration.from_people import (
+    KNOWN_LENS,
+    Calibrated,
+    Undetermined,
+    calibrate,
+    own_tracks,
+)
 from shapepose_fg.calibration.levelling import Measured
 from shapepose_fg.calibration.offsets_from_heights import offsets_without_poses
 from shapepose_fg.calibration.synchronisation import WHOLE_S, Synchronised, offsets
@@ -27,7 +34,7 @@ def calibrate_unsynchronised(
     fps: float,
     frames: range,
     most_s: float = 60.0,
-    focal: float = 0.0,
+    lens: Freedom = KNOWN_LENS,
     measured: Measured | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[Calibrated, Synchronised]:
@@ -59,7 +66,7 @@ def calibrate_unsynchronised(
 
         try:
             found, problems = (
-                calibrate(seen, rig, times, seen.frames, focal, measured, part, start),
+                calibrate(seen, rig, times, seen.frames, lens, measured, part, start),
                 (),
             )
         except Undetermined as refused:

@@ -3,9 +3,9 @@
 import json
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import typer
@@ -29,12 +29,14 @@ from shapepose_fg.core.errors import InputError, naming
 
 if TYPE_CHECKING:
     from shapepose_fg.calibration.from_people import Calibrated
+    from shapepose_fg.core.arrays import Array
     from shapepose_fg.core.camera import Rig
+    from shapepose_fg.io.detection_table import DetectionTable
 
 _CAMERAS = "Prior knowledge"
-_FILE_OFF, _GUESS_OFF = 0.02, 0.2
-"""Relative prior standard deviations of focal lengths from a calibration, and from a field of
-view."""
+_FILE_OFF, _GUESS_OFF, _CENTRE_OFF = 0.02, 0.2, 0.006
+"""Relative prior standard deviations of focal lengths from a calibration, and from a field of view;
+and of the principal point of a lens without calibration, as a share of the longer side."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,8 +54,8 @@ class LensOptions:
     )
     field_of_view: list[str] | None = option(
         INPUT,
-        "Instead of a calibration: horizontal field of view in degrees, or a photo with EXIF; of "
-        "one camera: CAMERA=...",
+        "Instead of a calibration: field of view along the longer side of a picture in degrees, "
+        "or a photo with EXIF; of one camera: CAMERA=...",
         metavar="DEG",
     )
     image_size: str | None = option(INPUT, "Picture size, if no file contains it.", metavar="WxH")
@@ -100,7 +102,15 @@ def calibrate(
         "Distance between two cameras in metres; it determines the scale.",
         metavar="CAM,CAM=M",
     ),
-    output: Path = option(RESULT, "Rig file (JSON) for the cameras.", REQUIRED),
+    trajectory: list[str] | None = option(
+        INPUT,
+        "Log of a camera that moves (TUM, CSV, ARKit, ARCore); its start is found from the people.",
+        metavar="CAMERA=FILE",
+    ),
+    output: Path = option(RESULT, "File for the cameras.", REQUIRED),
+    form: Literal["rig", "pose2sim"] = option(
+        RESULT, "Format of the file: rig (JSON), or Pose2Sim's TOML.", "rig", "--format"
+    ),
     times: Path | None = option(
         TIME,
         (
@@ -114,15 +124,16 @@ def calibrate(
 ) -> None:
     """Estimate camera poses from the people in the recording; lenses must be known or guessed.
 
-    Film for a minute with fixed cameras whose views overlap. Two or more people walk through all
+    Film for a minute with fixed cameras whose views overlap. One person or more walk through all
     views, near and far, not along one line, and move their arms. Exit code 1 if this does not
     determine the cameras; then nothing is written.
     """
+    from shapepose_fg.calibration.adjustment import Freedom
     from shapepose_fg.calibration.from_people import Undetermined, calibrate
     from shapepose_fg.calibration.levelling import Measured
     from shapepose_fg.calibration.unsynchronised import calibrate_unsynchronised
     from shapepose_fg.core.frame_times import rate_of
-    from shapepose_fg.io.calibration import write_rig
+    from shapepose_fg.io.calibration import with_trajectories, write_pose2sim, write_rig
     from shapepose_fg.io.recording import own_times
     from shapepose_fg.io.timestamps import write_timestamps
 
@@ -133,8 +144,16 @@ def calibrate(
         raise InputError(
             "--times and --timestamps: times are either estimated or given; give one of them"
         )
-    off = 0.0 if not focal else _FILE_OFF if seen.calibration is not None else _GUESS_OFF
-    rig = seen.rig()
+    whole, guessed = with_trajectories(seen.rig(), trajectory or []), seen.calibration is None
+    if form == "pose2sim" and whole.moves:
+        raise InputError("--format pose2sim: cannot hold --trajectory; write a rig file")
+    lens = Freedom(
+        focal=0.0 if not focal else _GUESS_OFF if guessed else _FILE_OFF,
+        centre_px=_CENTRE_OFF * whole.image_sizes.max() if guessed else 0.0,
+    )
+    rig = whole.without([camera.name for camera in whole.cameras if camera.carrier])
+    if len(rig) < 2:
+        raise InputError(f"--trajectory: at least 2 cameras must stand still, got {len(rig)}")
     measured = Measured(stature, _distances(distance or [], rig.names))
     with tempfile.TemporaryDirectory(prefix="shapepose-fg-") as folder:
         part = rate.part(
@@ -145,18 +164,30 @@ def calibrate(
         try:
             with progress("calibrating", "steps") as done:
                 if times is None:
-                    found = calibrate(recording, rig, known, span, off, measured, done)
+                    found = calibrate(recording, rig, known, span, lens, measured, done)
                 else:
                     found, clocks = calibrate_unsynchronised(
-                        recording, rig, fps, span, most, off, measured, done
+                        recording, rig, fps, span, most, lens, measured, done
                     )
+            time_s = own_times(recording, known, len(rig))
+            time_s = time_s if clocks is None else clocks.of_views(time_s)
+            whole, time_s = _with_moving(
+                whole,
+                found.rig,
+                recording,
+                time_s,
+                seen,
+                rate,
+                0.0 if times is None else most,
+                focal,
+            )
         except Undetermined as error:
             note(*error.problems)
             raise typer.Exit(1) from None
     note(*found.notes)
-    write_rig(found.rig, output)
+    (write_pose2sim if form == "pose2sim" else write_rig)(whole, output)
     if times is not None and clocks is not None:
-        write_timestamps(times, rig.names, clocks.of_views(own_times(recording, known, len(rig))))
+        write_timestamps(times, whole.names, time_s)
     heads, rows = _figures(found, focal)
     lines = [_CAPTION, *_world(found, stature, distance or [])]
     if report is not None:
@@ -193,13 +224,58 @@ def calibrate(
             show_clocks(clocks, rig)
             print(f"{times}: times of {len(recording)} frames")
             given = {"--timestamps": times}
-        print(f"{output}: rig file")
+        print(f"{output}: {'rig file' if form == 'rig' else 'Pose2Sim'}")
         options = {
             "--calibration": output,
             "--detections": seen.detections,
             "--skeleton": seen.skeleton,
         }
         print(next_reconstruct(options | given | {"--output": "results"}))
+
+
+def _with_moving(
+    whole: "Rig",
+    rig: "Rig",
+    recording: "DetectionTable",
+    time_s: "Array",
+    seen: LensOptions,
+    rate: RateOptions,
+    most: float,
+    focal: bool,
+) -> tuple["Rig", "Array"]:
+    """The rig `whole` with the fixed cameras as calibrated in `rig`, and with moving ones, whose
+    start is found; and the times (T, V) of frames, from 0 on.
+
+    `time_s` (T, W) are the times of the fixed cameras' frames.
+    """
+    from shapepose_fg.calibration.moving_camera import Filmed, Placed
+    from shapepose_fg.core.camera import Rig
+    from shapepose_fg.io.calibration import carried
+    from shapepose_fg.io.recording import own_times
+
+    cameras = dict(zip(rig.names, rig.cameras, strict=True))
+    columns = dict(zip(rig.names, time_s.T, strict=True))
+    trajectories = {each.name: each for each in whole.trajectories}
+    placed = None
+    for name in trajectories:
+        given = whole.only([name])
+        placed = placed or Placed.by_cameras(recording, whole.only(rig.names), rig, time_s)
+        with tempfile.TemporaryDirectory(prefix="shapepose-fg-") as folder:
+            own, known, _ = rate.part(seen.detections, seen.skeleton, given, Path(folder), True)
+            own_s = own_times(own, known, 1)[:, 0]
+            odometry = trajectories[name].from_start(own_s)
+            start = Filmed.of(own, given.cameras[0], odometry, own_s).started(placed, most, focal)
+        cameras[name], trajectories[name] = start.of(given.cameras[0], odometry)
+        columns[name] = own_s + start.offset_s
+        note(start.words(name))
+    length = max(map(len, columns.values()))
+    time_s = np.column_stack(
+        [np.r_[columns[name], np.full(length - len(columns[name]), np.nan)] for name in whole.names]
+    )
+    begin = np.nanmin(time_s) if most > 0 else 0.0
+    moving = tuple(replace(each, time_s=each.time_s - begin) for each in trajectories.values())
+    found = Rig(tuple(cameras[name] for name in whole.names), "z", trajectories=moving)
+    return carried(found), time_s - begin
 
 
 _CAPTION = (
@@ -229,7 +305,9 @@ def _figures(found: "Calibrated", focal: bool) -> tuple[list[str], list[tuple[st
 
 
 def _world(found: "Calibrated", stature: float | None, distances: list[str]) -> list[str]:
-    """Scale, up axis and fit, one line each."""
+    """Scale, up axis, fit, and how far to trust them, one line each."""
+    from shapepose_fg.calibration.adjustment import MOVE, TURN
+
     world = found.world
     if distances:
         whose = (
@@ -242,20 +320,26 @@ def _world(found: "Calibrated", stature: float | None, distances: list[str]) -> 
             else "assumed median stature 1.70 m"
         )
         whose += f", {world.persons} people at once"
-    better = "" if distances else "; give --distance for a better one"
     level = (
         "from feet on the floor"
         if world.floor is not None
-        else "from bodies, because no level floor was"
+        else "from bodies, because no level floor was found"
     )
-    " found"
+    turn, move = (float(found.adjusted.sigma(part).max()) for part in (TURN, MOVE))
+    trust = (
+        f"trust: rotations to {np.degrees(2 * turn):.1f} degrees, positions to "
+        f"{2e3 * move:.0f} mm and all lengths to {200 * world.sigma_scale:.1f} % (two sigma, worst "
+        "camera)"
+    )
+    better = "; a distance measured between two cameras, --distance, gives lengths to 1 %"
     return [
-        f"scale: {whose}: ± {100 * world.sigma_scale:.1f} %, one sigma{better}",
+        f"scale: {whose}: ± {100 * world.sigma_scale:.1f} %, one sigma",
         f"up: z, {level}; the floor is at 0",
         (
             "error of a joint against the other cameras, on frames that were not used: "
             f"{found.held_out_px:.2f} px"
         ),
+        trust + ("" if distances else better),
     ]
 
 

@@ -210,19 +210,9 @@ def _next_command(
     """The next command, as a line that can be copied into any shell."""
     output = run.output
     if cameras.calibration is None:
-        folder, sizes = (
-            output.resolve(),
-            {each.camera.name: each.footage.size for each in run.cameras},
-        )
-        # A phone has a field of view of 65 degrees along the longer side of a video.
-        wide = {name: "65" if width >= height else "40" for name, (width, height) in sizes.items()}
-        fields = (
-            list(wide.values())[:1]
-            if len(set(wide.values())) == 1
-            else [f"{n}={d}" for n, d in wide.items()]
-        )
+        folder = output.resolve()
         words = ["shapepose-fg", "calibrate", "--detections", folder, "--focal"]
-        words += [word for field in fields for word in ("--field-of-view", field)]
+        words += ["--field-of-view", "65"]  # of a phone, along the longer side of a video
         words += [
             "--times",
             folder.parent / "times.csv",

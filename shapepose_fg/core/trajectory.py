@@ -3,7 +3,7 @@ or SLAM.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -101,6 +101,15 @@ class Trajectory:
 
     def __len__(self) -> int:
         return len(self.time_s)
+
+    def from_start(self, time_s: Array) -> "Trajectory":
+        """The trajectory if it has times in common with pictures at `time_s` (T,), NaN for missing
+        ones; otherwise shifted in time to begin with them, as logs with a clock of their own do.
+        """
+        first, last = np.nanmin(time_s), np.nanmax(time_s)
+        if self.time_s[0] < last and first < self.time_s[-1]:
+            return self
+        return replace(self, time_s=self.time_s - self.time_s[0] + first)
 
     def covers(self, time_s: Array) -> Mask:
         """(...,) mask of the times between two poses that are at most `LONGEST_GAP_S` apart."""

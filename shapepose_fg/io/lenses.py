@@ -16,8 +16,8 @@ from shapepose_fg.io.footage.placement import read_used_footage
 from shapepose_fg.io.footage.places import per_camera
 
 _NARROWEST, _WIDEST = 5.0, 150.0
-"""Smallest and largest horizontal field of view that is accepted for a lens without distortion,
-degrees."""
+"""Smallest and largest field of view along the longer side that is accepted for a lens without
+distortion, degrees."""
 _PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 _FORMATS = ("JPEG", "PNG", "TIFF")
 """Pillow's names of the supported formats: other readers of Pillow are disabled, because some start
@@ -26,17 +26,17 @@ _EXIF, _FOCAL_35MM = 0x8769, 0xA405
 """EXIF tags: the Exif directory in a photo, and FocalLengthIn35mmFilm in it."""
 _FILM_MM = (36.0, 24.0)
 _USUAL = 65.0
-"""Typical horizontal field of view of a phone, degrees."""
+"""Typical field of view of a phone along the longer side of a video, degrees."""
 
 
 def lenses_of(detections: Path, fields: Sequence[str], size: tuple[int, int] | None) -> Rig:
     """Cameras without poses, one for each file or folder of `detections`, in the order of their
     names.
 
-    `fields` are horizontal fields of view in degrees, or photos of the same lens with the focal
-    length in EXIF; `CAMERA=` before a value restricts it to one camera. `size` is (width, height)
-    of the pictures, pixels; by default it is read from footage.json, which `detect` writes.
-    InputError names what is missing.
+    `fields` are fields of view along the longer side of a picture in degrees, upright or not, or
+    photos of the same lens with the focal length in EXIF; `CAMERA=` before a value restricts it to
+    one camera. `size` is (width, height) of the pictures, pixels; by default it is read from
+    footage.json, which `detect` writes. InputError names what is missing.
     """
     names = camera_names(detections)
     given = dict(
@@ -59,7 +59,7 @@ def lenses_of(detections: Path, fields: Sequence[str], size: tuple[int, int] | N
                 "WIDTHxHEIGHT"
             )
         with naming(detections):
-            cameras.append(_camera(name, picture, _degrees(field, picture)))
+            cameras.append(_camera(name, picture, _degrees(field)))
     with naming(detections):
         return Rig(tuple(cameras), "z")
 
@@ -72,18 +72,17 @@ def pictures_only(names: Sequence[str], sizes: Sequence[tuple[int, int]]) -> Rig
 
 
 def _camera(name: str, size: tuple[int, int], degrees: float) -> Camera:
-    """A camera without a pose, with a horizontal field of view of `degrees`."""
+    """A camera without a pose, with a field of view of `degrees` along the longer side."""
     width, height = size
-    f = width / 2 / np.tan(np.radians(degrees) / 2)
+    f = max(size) / 2 / np.tan(np.radians(degrees) / 2)
     K = np.array([[f, 0.0, (width - 1) / 2], [0.0, f, (height - 1) / 2], [0.0, 0.0, 1.0]])
     return Camera(name, K, np.eye(4), size)
 
 
-def _degrees(given: str, size: tuple[int, int]) -> float:
-    """Horizontal field of view of pictures of a size (width, height), degrees."""
+def _degrees(given: str) -> float:
+    """Field of view along the longer side of a picture, degrees."""
     if Path(given).suffix.lower() in _PHOTOS:
-        longer = _focal_of_photo(Path(given)) * max(size)
-        return float(np.degrees(2 * np.arctan(size[0] / 2 / longer)))
+        return float(np.degrees(2 * np.arctan(0.5 / _focal_of_photo(Path(given)))))
     try:
         degrees = float(given)
     except ValueError:

@@ -4,13 +4,21 @@ from pathlib import Path
 
 import numpy as np
 
-from shapepose_fg.core.decompositions import rigid
+from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.core.decompositions import is_rotation, nearest_rotation, rigid
 from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.frame_times import MOST_FPS
 from shapepose_fg.core.rig_file import COVARIANCE, POSE
 from shapepose_fg.core.trajectory import MOST_METRES, UNIT_LENGTH, Trajectory
 from shapepose_fg.io.number_table import read_number_table
 from shapepose_fg.io.validation import is_number
+
+_STRAY = {"timestamp", "frame", *POSE[1:]}
+"""Columns of Stray Scanner's odometry.csv; it may have further ones."""
+_MATRIX = ("time_s", *(f"r{row}{column}" for row in "123" for column in "123t"))
+"""Columns of ARKit Data Logger's ARKit_camera_pose.txt."""
+_LONGEST_STEP_S = 1e3
+"""Time between two poses above which times are nanoseconds, s."""
 
 
 def read_trajectory(path: str | Path, name: str = "") -> Trajectory:
@@ -20,8 +28,9 @@ def read_trajectory(path: str | Path, name: str = "") -> Trajectory:
     The file has eight numbers per line (TUM: time x y z qx qy qz qw), separated by blanks or
     commas; or a header with the columns `POSE` in any order and optionally those of `COVARIANCE`,
     at least its diagonal. `#` begins a comment. Or it is an MCAP file of ROS 2 messages;
-    `FILE.mcap#FRAME` if more than one frame moves in it. InputError, one sentence that names file,
-    line and cure.
+    `FILE.mcap#FRAME` if more than one frame moves in it. Logs of phones are recognised (ARKit,
+    ARCore: docs/moving_cameras.md), and are then poses of the camera: x right, y down, z forward in
+    the picture as the sensor has it. InputError, one sentence that names file, line and cure.
     """
     from scipy.spatial.transform import Rotation
 
@@ -34,8 +43,10 @@ def read_trajectory(path: str | Path, name: str = "") -> Trajectory:
 
     def heads(line: int, words: list[str]) -> tuple[list[str], bool]:
         header = not is_number(words[0])
-        names = words if header else [*map(str, POSE)]
-        _check_columns(path, line, names)
+        matrix = not header and len(words) == len(_MATRIX)
+        names = words if header else list(_MATRIX if matrix else POSE)
+        if not matrix and not set(names) >= _STRAY:
+            _check_columns(path, line, names)
         return names, header
 
     names, numbers, lines = read_number_table(path, heads, "write seconds and metres")
@@ -43,6 +54,7 @@ def read_trajectory(path: str | Path, name: str = "") -> Trajectory:
         raise InputError(
             f"{path}: a trajectory needs 2 poses or more, got {len(numbers)}; write a line for each"
         )
+    names, numbers, lines, bTc = _of_phone(path, names, numbers, lines)
     columns = {each: numbers[:, place] for place, each in enumerate(names)}
     pose = np.column_stack([columns[each] for each in POSE])
     far = np.abs(pose[:, 1:4]).max(axis=1) > MOST_METRES
@@ -63,7 +75,7 @@ def read_trajectory(path: str | Path, name: str = "") -> Trajectory:
         raise InputError(
             f"{path}: line {lines[late[0] + 1]} must be later than the pose before; sort by time"
         )
-    wTb = rigid(Rotation.from_quat(pose[:, 4:]).as_matrix(), pose[:, 1:4])
+    wTb = rigid(Rotation.from_quat(pose[:, 4:]).as_matrix(), pose[:, 1:4]) @ bTc
     covariance = None
     if any(each in columns for each in COVARIANCE):
         zero = np.zeros(len(pose))
@@ -79,6 +91,44 @@ def read_trajectory(path: str | Path, name: str = "") -> Trajectory:
             )
     with naming(path, "correct it in the file"):
         return Trajectory(name or path.stem, pose[:, 0], wTb, covariance)
+
+
+def _of_phone(
+    path: Path, names: list[str], numbers: Array, lines: Index
+) -> tuple[list[str], Array, Index, Array]:
+    """The columns `POSE` of a phone's log, and the camera on what it logs (4, 4); tables of other
+    kinds as they are.
+
+    Stray Scanner (ARKit) has a header with `timestamp` and `frame`, and OpenCV's axes. ARKit Data
+    Logger has a time and a 3 x 4 matrix, ARCore Data Logger time qx qy qz qw x y z; the camera
+    looks along -z, y up. Times may be nanoseconds, and pictures logged twice.
+    """
+    from scipy.spatial.transform import Rotation
+
+    bTc = np.diag([1.0, -1, -1, 1])
+    if set(names) >= _STRAY:
+        numbers, bTc = (
+            numbers[:, [names.index(each) for each in ("timestamp", *POSE[1:])]],
+            np.eye(4),
+        )
+    elif names == list(_MATRIX):
+        matrix = numbers[:, 1:].reshape(-1, 3, 4)
+        if not is_rotation(matrix[..., :3]):
+            raise InputError(f"{path}: rows must hold a time and a rotation beside a translation")
+        turn = Rotation.from_matrix(nearest_rotation(matrix[..., :3])).as_quat()
+        numbers = np.column_stack([numbers[:, 0], matrix[..., 3], turn])
+    elif names == list(POSE) and _is_unit(numbers[:, 1:5]) and not _is_unit(numbers[:, 4:]):
+        numbers = numbers[:, [0, 5, 6, 7, 1, 2, 3, 4]]
+    else:
+        return names, numbers, lines, np.eye(4)
+    if np.median(np.diff(numbers[:, 0])) > _LONGEST_STEP_S:
+        numbers = numbers * np.r_[1e-9, np.ones(7)]
+    later = np.append(True, np.diff(np.maximum.accumulate(numbers[:, 0])) > 0)
+    return list(POSE), numbers[later], lines[later], bTc
+
+
+def _is_unit(quaternions: Array) -> bool:
+    return bool((np.abs(np.linalg.norm(quaternions, axis=1) - 1) < UNIT_LENGTH).all())
 
 
 def _check_columns(path: Path, line: int, names: list[str]) -> None:

@@ -220,6 +220,8 @@ def test_lenses_by_their_field_of_view(tmp_path):
     rig = lenses_of(tmp_path, ["90", "right=60"], (1920, 1080))
     assert rig.names == ("left", "right") and rig.cameras[0].image_size == (1920, 1080)
     np.testing.assert_allclose(rig.focal_px, [960.0, 960 * np.sqrt(3)])
+    upright = lenses_of(tmp_path, ["90", "right=60"], (1080, 1920))
+    np.testing.assert_allclose(upright.focal_px, rig.focal_px)
     for fields, size, said in (
         (["90"], None, "camera left: the size of its pictures is unknown; pass --image-size"),
         (["3"], (640, 480), "--field-of-view 3: must be 5 to 150 degrees"),

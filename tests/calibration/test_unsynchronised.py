@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from shapepose_fg.calibration import unsynchronised
 from shapepose_fg.calibration.from_people import Undetermined, own_tracks
@@ -15,7 +16,10 @@ from shapepose_fg.calibration.offsets_from_heights import offsets_without_poses
 from shapepose_fg.calibration.tracks import next_of, on_one_clock
 from shapepose_fg.calibration.unsynchronised import calibrate_unsynchronised
 from shapepose_fg.cli.main import main
+from shapepose_fg.core.decompositions import rigid
+from shapepose_fg.core.rig_file import write_trajectory
 from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.core.trajectory import Trajectory
 from shapepose_fg.io.calibration import read_rig, write_rig
 from shapepose_fg.io.write_detections import write_association
 from shapepose_fg.setup_check.matching import Sightings
@@ -97,3 +101,40 @@ def test_the_command_finds_poses_and_times_from_people_alone(
     scene = re.search(r'id="scene-data">(.*?)</script>', page, re.S)
     assert scene is not None and len(json.loads(scene[1])["cameras"]) == 4
     assert page.count('px<span class="range"') == 4 and "before" not in json.loads(scene[1])
+
+
+@pytest.mark.slow
+def test_the_command_finds_the_start_of_a_camera_with_a_log(
+    rig, late, tmp_path, capsys, monkeypatch
+):
+    """The log has its own clock, world and quarter turn; the rig and the times come back."""
+    monkeypatch.chdir(tmp_path)
+    write_rig(rig, Path("lenses.json"))
+    write_association(late, rig, tmp_path)
+    turn = Rotation.from_rotvec([[0.4, 0.2, 1.0], [0, 0, np.pi / 2]]).as_matrix()
+    oTc = rigid(turn[0], np.array([5.0, 6, 7])) @ rig.cameras[2].wTc @ rigid(turn[1], np.zeros(3))
+    time_s = 4000 + np.arange(300) / FPS
+    log = Trajectory("cam2", time_s, np.tile(oTc, (300, 1, 1)))
+    write_trajectory(log, Path("log.tum"))
+    base = ["calibrate", "--calibration", "lenses.json", "--detections", "detection", "--fps", "25"]
+    base += ["--times", "times.csv", "--most", "8", "--trajectory", "cam2=log.tum"]
+
+    def run(*more: str) -> tuple[int, str]:
+        with pytest.raises(SystemExit) as ended:
+            main([*base, *more])
+        said = capsys.readouterr()
+        return int(str(ended.value.code)), " ".join((said.out + said.err).split())
+
+    code, said = run("--output", "new.json", "--format", "pose2sim")
+    assert code == 2 and "--format pose2sim: cannot hold --trajectory" in said
+    code, said = run("--output", "new.json")
+    assert code == 0, said
+    assert "camera cam2: its trajectory starts" in said
+    assert "trust: rotations to" in said and "--distance" in said
+    found = read_rig("new.json")
+    assert [bool(each.carrier) for each in found.cameras] == [False, False, True, False]
+    turned, moved, _ = off_after_growing(found, rig)
+    assert turned.max() < 1.0 and moved.max() < 0.1
+    rows = np.genfromtxt("times.csv", delimiter=",", skip_header=1)[:, 1:]
+    assert np.abs(rows[7] - rows[7, 0] - LATE_S).max() < 0.03
+    assert found.trajectories[0].time_s[0] == pytest.approx(rows[0, 2], abs=1e-5)

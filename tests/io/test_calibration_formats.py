@@ -13,7 +13,7 @@ import pytest
 
 from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.io.calibration import read_rig, write_rig
+from shapepose_fg.io.calibration import read_rig, write_pose2sim, write_rig
 
 DATA = Path(__file__).parent / "data"
 NAMES = ("alpha", "beta", "gamma")
@@ -801,3 +801,10 @@ def test_huge_numbers_are_refused_in_one_sentence(tmp_path):
     )
     with pytest.raises(InputError, match=r"the rotation of R is not orthonormal"):
         read_rig(file)
+
+
+def test_pose2sim_s_toml_is_written(tmp_path):
+    write_pose2sim(PINHOLE, tmp_path / "Calib.toml")
+    assert_same(read_rig(tmp_path / "Calib.toml"), PINHOLE)
+    with pytest.raises(InputError, match="cannot hold the lens of alpha"):
+        write_pose2sim(TRUTH, tmp_path / "Calib.toml")

@@ -34,6 +34,32 @@ def test_tum(tmp_path):
     np.testing.assert_allclose(found.wTb[1, :3, 0], [0, 1, 0], atol=1e-8)
 
 
+STRAY = (
+    "timestamp, frame, x, y, z, qx, qy, qz, qw, fx\n"
+    "812.5, 000000, 1, 2, 3, 0, 0, 0, 1, 1400\n"
+    "812.6, 000001, 1, 2, 4, 0, 0, 0, 1, 1400\n"
+)
+"""What Stray Scanner writes on an iPhone: OpenCV's axes."""
+ARKIT = "812500000000 1 0 0 1 0 1 0 2 0 0 1 3 \n812600000000 1 0 0 1 0 1 0 2 0 0 1 4 \n"
+"""What ARKit Data Logger writes: rows of the 3 x 4 matrix; the camera looks along -z."""
+ARCORE = "812500000000 0 0 0 1 1 2 3\n812500000000 0 0 0 1 1 2 3\n812600000000 0 0 0 1 1 2 4\n"
+"""What ARCore Data Logger writes: qx qy qz qw tx ty tz; a picture may be logged twice."""
+
+
+@pytest.mark.parametrize(("text", "ahead"), [(STRAY, 1), (ARKIT, -1), (ARCORE, -1)])
+def test_logs_of_phones_with_their_axes(tmp_path, text, ahead):
+    found = read(tmp_path, text)
+    np.testing.assert_allclose(found.time_s, [812.5, 812.6])
+    np.testing.assert_allclose(found.wTb[:, :3, 3], [[1, 2, 3], [1, 2, 4]])
+    np.testing.assert_allclose(found.wTb[1, :3, :3], np.diag([1, ahead, ahead]), atol=1e-12)
+
+
+def test_a_log_with_a_clock_of_its_own_begins_with_the_pictures(tmp_path):
+    found = read(tmp_path, STRAY)
+    np.testing.assert_allclose(found.from_start(np.array([np.nan, 2.0, 2.1])).time_s, [2.0, 2.1])
+    assert found.from_start(np.array([812.0, 813.0])) is found
+
+
 def test_columns_in_any_order_with_covariances(tmp_path):
     head = "qw,qx,qy,qz,x,y,z,time_s,rx_rx,ry_ry,rz_rz,x_x,y_y,z_z,rx_z"
     row = "1,0,0,0,5,6,7,{},1e-4,1e-4,4e-4,0.01,0.02,0.03,1e-3"
@@ -57,6 +83,7 @@ def test_columns_in_any_order_with_covariances(tmp_path):
         (TUM + "11 1 2 3 1 0 0 1\n",
          "line 4: the quaternion qx qy qz qw must have length 1, got 1.414; write"),
         (TUM + "11 1e9 2 3 0 0 0 1\n", "line 4 is more than 1e+06 m away; write metres"),
+        ("0 1 0 0 1 0 1 0 2 0 0 9 3\n" * 2, "rows must hold a time and a rotation beside a trans"),
         ("time_s x y z qx qy qz\n", "line 1: column qw is missing; name the columns time_s"),
         ("time_s x y z qx qy qz qw speed\n",
          "line 1: column 'speed' is unknown or occurs twice; name"),

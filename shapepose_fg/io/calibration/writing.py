@@ -8,6 +8,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -69,6 +70,24 @@ def write_like(source: Path, rig: Rig, target: Path, unit: Unit | None = None) -
             _write(files, target, several=several)
             return form.name, target
     return _own(rig, target)
+
+
+def write_pose2sim(rig: Rig, target: Path) -> None:
+    """Write a rig with z up as Pose2Sim's TOML: camera from world, metres, distortions k1 k2 p1 p2.
+
+    InputError if a lens has other coefficients.
+    """
+    tables = list[str]()
+    for number, camera in enumerate(rig.cameras):
+        if camera.lens != "perspective" or camera.distortion[4:].any():
+            raise InputError(f"{target}: Pose2Sim's TOML cannot hold the lens of {camera.name}")
+        turn, size = cv2.Rodrigues(camera.cTw[:, :3])[0].ravel(), map(float, camera.image_size)
+        values = {"name": camera.name, "size": list(size), "matrix": camera.K.tolist()}
+        values |= {"distortions": np.r_[camera.distortion, np.zeros(4)][:4].tolist()}
+        values |= {"rotation": turn.tolist(), "translation": camera.cTw[:, 3].tolist()}
+        lines = [f"{key} = {json.dumps(value)}" for key, value in values.items()]
+        tables += [f"[cam_{number + 1:02d}]", *lines, "fisheye = false", ""]
+    write_content(target, "\n".join([*tables, "[metadata]", "adjusted = false", "error = 0.0", ""]))
 
 
 def check_target(source: Path, target: Path) -> None:

@@ -1,0 +1,89 @@
+"""The start of a carried phone's odometry: found from the people, wherever and whenever it was, or
+refused.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from shapepose_fg.calibration.from_people import Undetermined
+from shapepose_fg.calibration.moving_camera import Filmed, Placed
+from shapepose_fg.core.camera import Camera
+from shapepose_fg.core.decompositions import rigid
+from shapepose_fg.core.trajectory import Trajectory
+from shapepose_fg.simulation.scene import UP, look_at
+from tests.calibration.conftest import moving
+
+K = np.array([[1000.0, 0, 639.5], [0, 1000, 359.5], [0, 0, 1]])
+LATE_S = 7.31
+OWN_S = np.arange(0, 30, 1 / 30)
+
+
+def path(time: np.ndarray) -> np.ndarray:
+    """(F, 4, 4) poses of a phone that is carried around people."""
+    angle = 1.2 * np.sin(0.25 * time)
+    eyes = np.stack([4 * np.cos(angle), 4 * np.sin(angle), 1.5 + 0.1 * np.sin(2 * time)], axis=-1)
+    return np.stack([look_at(eye, np.array([0, 0, 0.9]), UP) for eye in eyes])
+
+
+@pytest.fixture(scope="module")
+def walk(two_people) -> Placed:
+    """Three people who walk and wave for 45 s, as fixed cameras place them."""
+    rng, time = np.random.default_rng(0), np.arange(0, 45, 0.2)
+    points = np.stack([moving(two_people[0], t) for t in time])[:, :, :15]
+    points = points + rng.normal(0, 0.01, points.shape)
+    moment = np.repeat(np.arange(len(time)), 3)
+    return Placed.of(time[moment], moment, points.reshape(-1, 15, 3))
+
+
+@pytest.fixture(scope="module")
+def filmed(two_people) -> Filmed:
+    """The same people in a phone whose log is turned by a quarter, and starts anywhere."""
+    rng, wTc = np.random.default_rng(1), path(OWN_S)
+    people = np.stack([moving(two_people[0], t) for t in OWN_S + LATE_S])[:, :, :15]
+    at = np.einsum(
+        "fij,fpkj->fpki", np.linalg.inv(wTc)[:, :3, :3], people - wTc[:, None, None, :3, 3]
+    )
+    rays = at / at[..., 2:]
+    rays[..., :2] += rng.normal(0, 2 / 1000, rays[..., :2].shape)
+    oTw = rigid(Rotation.random(rng=rng).as_matrix(), rng.normal(0, 10, 3))
+    mount = rigid(Rotation.from_euler("z", 90, degrees=True).as_matrix(), np.zeros(3))
+    log = Trajectory("phone", OWN_S, oTw @ wTc @ mount)
+    return Filmed(Camera("phone", K, np.eye(4), (1280, 720)), log, OWN_S, rays)
+
+
+def test_the_start_is_found_anywhere(walk, filmed):
+    start = filmed.started(walk, 60.0, False)
+    found = start.wTo @ filmed.trajectory.wTb @ start.bTc
+    away = np.linalg.norm(found[:, :3, 3] - path(OWN_S)[:, :3, 3], axis=1)
+    turn = Rotation.from_matrix(found[:, :3, :3].mT @ path(OWN_S)[:, :3, :3]).magnitude()
+    assert abs(start.offset_s - LATE_S) < 0.02 and away.max() < 0.05
+    assert np.degrees(turn).max() < 0.6 and start.share > 0.9
+    assert start.sigma_turn_deg < 1.0 and start.sigma_move_m < 0.05
+    camera, odometry = start.of(filmed.camera, filmed.trajectory)
+    np.testing.assert_allclose(camera.K, K)
+    np.testing.assert_allclose(odometry.wTb @ camera.bTc, found)
+    assert odometry.time_s[0] == pytest.approx(start.offset_s)
+
+
+def test_an_unknown_focal_length_is_found_too(walk, filmed):
+    wrong = replace(filmed, rays=filmed.rays * [1.06, 1.06, 1.0])
+    assert wrong.started(walk, 60.0, True).focal == pytest.approx(1.06, abs=0.015)
+
+
+def test_a_log_of_another_walk_and_people_who_stand_are_refused(walk, filmed):
+    still = path(np.zeros(len(OWN_S)))
+    rng = np.random.default_rng(2)
+    still[:, :3, 3] += np.cumsum(rng.normal(0, 0.05, (len(OWN_S), 3)), axis=0)
+    other = replace(filmed, trajectory=replace(filmed.trajectory, wTb=still))
+    with pytest.raises(Undetermined, match="camera phone: ") as refused:
+        other.started(walk, 60.0, False)
+    assert "; film the people" in str(refused.value)
+    standing = Placed.of(walk.time_s, walk.moment, walk.points[walk.moment * 0])
+    with pytest.raises(Undetermined, match="camera phone: "):
+        filmed.started(standing, 60.0, False)
+    nobody = replace(filmed, own_s=filmed.own_s[:3], rays=filmed.rays[:3])
+    with pytest.raises(Undetermined, match="camera phone: too few people are seen"):
+        nobody.started(walk, 60.0, False)
