@@ -273,8 +273,8 @@ def _log_bodies(
             alike = (bends[n] * shapes.get(bone, 0.0)).sum(axis=(1, 2))  # 1 + 2 cos of the bend
             if appears[n] or alike.min() < 1 + 2 * math.cos(_BEND_RAD):
                 shapes[bone] = bends[n]
-                now = (each[n : n + 1] for each in (motion.rotations, motion.pelvis))
-                vertices = skin(arrays, motion.rest.betas[None], *now, kept)[0]
+                turn, way = motion.rotations[n, None], motion.pelvis[n, None]
+                vertices = skin(arrays, motion.rest.betas[None], turn, way, kept)[0]
                 vertices = (vertices - joints[n, bone]) @ turns[n, bone]
                 normals = vertex_normals(vertices, faces)
                 _set_time(stream, take, at)

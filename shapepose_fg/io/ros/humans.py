@@ -180,7 +180,7 @@ def humans(rows: Reconstruction) -> Iterator[Human]:
     hips = place(*_present(names, "MidHip", "RHip", "LHip"))
     turns = np.concatenate([rows.global_orient[:, None], rows.body_pose], axis=1)
     known = np.isfinite(np.concatenate([hips[:, None], turns], axis=1)).all(axis=(1, 2))
-    smpl = exp_so3(np.where(known[:, None, None], turns, 0.0))
+    smpl = exp_so3(np.where(np.isfinite(turns), turns, 0.0))
     world_from_body = rigid(smpl[:, 0] @ _FRONT_LEFT_UP, hips)
     xyz = (xyz - hips[:, None]) @ world_from_body[:, :3, :3]
 
