@@ -303,14 +303,12 @@ class Filmed:
         depth = median_of(at[..., 2], 5)
         with np.errstate(divide="ignore", invalid="ignore"):
             xy = at[..., :2] / at[..., 2:] * start.focal
-        away = np.linalg.norm(self.rays[frame][..., :2] - xy[:, None], axis=-1)
-        away = median_of(away, 5) * depth[:, None] / start.focal
+            away = np.linalg.norm(self.rays[frame][..., :2] - xy[:, None], axis=-1)
+            away = median_of(away, 5) * depth[:, None] / start.focal
+            middle = np.stack([median_of(each, 5) for each in np.moveaxis(xy, 2, 0)], axis=-1)
+            middle = middle @ self.camera.K[:2, :2].T + self.camera.K[:2, 2]
         person = away.argmin(axis=1)
         away = away[np.arange(len(rows)), person]
-        middle = (
-            np.stack([median_of(xy[..., n], 5) for n in (0, 1)], axis=-1) @ self.camera.K[:2, :2].T
-            + self.camera.K[:2, 2]
-        )
         inside = (middle > 0).all(axis=1) & (middle < self.camera.image_size).all(axis=1)
         inside &= depth > _LEAST_DEPTH_M
         return rows, frame, person, np.where(depth > _LEAST_DEPTH_M, away, np.inf), inside
