@@ -13,7 +13,7 @@ from shapepose_fg.core.storage.files import inside
 def export(
     take: TakeOptions,
     formats: list[str] = argument(
-        "FORMAT...", "Formats: amass trc c3d bvh glb csv parquet mcap rrd, or all."
+        "FORMAT...", "Formats: amass trc c3d bvh glb angles opensim csv parquet mcap rrd, or all."
     ),
     output: Path | None = option(RESULT, "Folder for the files; by default RESULTS/export."),
     markers: str = option(
@@ -26,7 +26,7 @@ def export(
     ),
 ) -> None:
     """Write a result in formats of other programs: shapepose-fg export RESULTS amass trc c3d bvh
-    glb csv parquet mcap rrd.
+    glb angles opensim csv parquet mcap rrd.
     """
     from shapepose_fg.io.export.markers import MarkerSet
     from shapepose_fg.io.export.registry import FORMATS, chosen, export_result

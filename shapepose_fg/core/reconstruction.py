@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from shapepose_fg.core.arrays import Array, Mask, Whole
 from shapepose_fg.core.camera import Rig
-from shapepose_fg.core.errors import InputError, naming
+from shapepose_fg.core.errors import InputError, naming, optional
 from shapepose_fg.core.observation_table import ObservationTable
 from shapepose_fg.core.result_files import (
     OBSERVATIONS,
@@ -29,7 +29,7 @@ from shapepose_fg.core.run_summary import check_run, merged_run
 from shapepose_fg.core.shapes import SubjectShapes
 from shapepose_fg.core.skeleton import BODY_25, check_joint_names
 from shapepose_fg.core.storage.files import read_json
-from shapepose_fg.core.storage.schema import Column, Table
+from shapepose_fg.core.storage.schema import Column, Table, code_names
 
 
 class Status(StrEnum):
@@ -212,6 +212,34 @@ class Reconstruction(Table):
         """Return these rows with other identities `person` (N,), also in `observations`."""
         table = None if self.observations is None else replace(self.observations, person=person)
         return replace(self, person=person, observations=table)
+
+    def by_joint(self) -> dict[str, NDArray[Any]]:
+        """A row for each joint with a position, sorted by frame, person and joint: frame, time_s,
+        person, joint, x_m, y_m, z_m, sigma_m (root mean square), sigma_x_m ..., vx_m_s ..., known,
+        confidence.
+        """
+        row, joint = np.nonzero(np.isfinite(self.joints).all(axis=2))
+        order = np.lexsort((joint, self.person[row], self.frame[row]))
+        row, joint = row[order], joint[order]
+        covariance = self.covariance[row, joint]
+        variance = np.diagonal(covariance, axis1=1, axis2=2)
+        with np.errstate(invalid="ignore"):
+            axes = np.sqrt(np.where(variance >= 0, variance, np.nan))
+        columns: dict[str, NDArray[Any]] = {
+            name: getattr(self, name)[row] for name in ("frame", "time_s", "person")
+        }
+        columns |= {"joint": self.joint_names[joint]}
+        columns |= dict(zip(("x_m", "y_m", "z_m"), self.joints[row, joint].T, strict=True))
+        columns |= {"sigma_m": sigma_m(covariance)}
+        columns |= dict(zip(("sigma_x_m", "sigma_y_m", "sigma_z_m"), axes.T, strict=True))
+        moving = self.velocity[row, joint]
+        columns |= dict(zip(("vx_m_s", "vy_m_s", "vz_m_s"), moving.T, strict=True))
+        columns |= {"known": code_names(Known)[self.known[row, joint]]}
+        return columns | {"confidence": self.confidence[row, joint]}
+
+    def to_frame(self, library: str = "pandas") -> Any:
+        """`by_joint` as a DataFrame of pandas or Polars. InputError if that is not installed."""
+        return optional(library, "frames").DataFrame(self.by_joint())
 
     def counts(self) -> dict[str, Any]:
         """The entry of run.json about the rows: their number, and counts of statuses and of how

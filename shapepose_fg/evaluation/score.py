@@ -15,6 +15,7 @@ from shapepose_fg.core.frame_times import spans_of
 from shapepose_fg.core.joint_names import body_points
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation.metrics import (
+    CORRECT_M,
     MAX_DISTANCE_M,
     PlainPeople,
     covariance_calibration,
@@ -29,6 +30,7 @@ FIGURES = {
     "pcp": "PCP, %",
     "mpjpe_mm": "MPJPE, mm",
     "pa_mpjpe_mm": "PA-MPJPE, mm",
+    "recall": "recall, %",
     "mota": "MOTA, %",
     "idf1": "IDF1, %",
     "hota": "HOTA, %",
@@ -56,6 +58,8 @@ class Score:
     """The compared joints: those that both have, by name."""
     frames: int
     """Number of scored frames."""
+    found: int
+    """Number of true people, over all frames, who are matched with a prediction."""
     notes: tuple[str, ...]
     """What was not scored, and why, one sentence each."""
 
@@ -69,7 +73,12 @@ class Score:
 
         tracks = {} if self.tracks is None else plain(vars(self.tracks))
         parts = {"pcp_limb": plain(self.limbs), "pcp_person": plain(self.people), "tracks": tracks}
-        about = {"joints": list(self.joints), "frames": self.frames, "notes": list(self.notes)}
+        about = {
+            "joints": list(self.joints),
+            "frames": self.frames,
+            "found": self.found,
+            "notes": list(self.notes),
+        }
         return plain(self.figures) | parts | about
 
 
@@ -86,6 +95,8 @@ def score(people: PlainPeople, truth: PlainPeople, frames: Iterable[int] | None 
       error of its ends is at most half its true length. The figure is the mean over people.
     - MPJPE and PA-MPJPE: over people who are matched one to one (Hungarian, d under 0.5 m). PA
       aligns each person by the best similarity transform (Procrustes).
+    - Recall: share of the true joints that are within 0.2 m of those of the prediction with the
+      smallest d.
     - MOTA, IDF1, HOTA: `track_metrics` with the similarity max(0, 1 - d / 1 m), so that a match in
       MOTA and IDF1 has d of at most 0.5 m.
     - Coverage: share of the matched joints inside the 50 % and 95 % ellipsoids.
@@ -110,12 +121,14 @@ def score(people: PlainPeople, truth: PlainPeople, frames: Iterable[int] | None 
         tracked.append(TrackFrame(truth.person[at], people.person[rows[near]], similarity))
     limbs, persons, correct, count = _limbs(nearest, truth)
     matched, true, covariance = _matched(people, truth, scored)
+    near_joints = np.linalg.norm(nearest - truth.joints, axis=2) <= CORRECT_M
     inside = covariance_calibration(matched - true, covariance).coverage
     tracks = track_metrics(tracked) if people.identified else None
     figures = dict.fromkeys(FIGURES, float("nan")) | {
         "pcp": _mean(_percent(correct.sum(axis=1), count.sum(axis=1))),
         "mpjpe_mm": 1e3 * _mean(np.linalg.norm(matched - true, axis=2)),
         "pa_mpjpe_mm": 1e3 * _mean(np.linalg.norm(aligned(matched, true) - true, axis=2)),
+        "recall": float(_percent(np.sum(near_joints), _known(truth.joints).sum())),
         "inside_50": 100 * inside[0.5],
         "inside_95": 100 * inside[0.95],
     }
@@ -130,6 +143,7 @@ def score(people: PlainPeople, truth: PlainPeople, frames: Iterable[int] | None 
         tracks,
         people.joint_names,
         len(scored),
+        len(matched),
         notes,
     )
 
@@ -253,9 +267,12 @@ def _matched(
     """Joints (M, J, 3) of matched predictions and of the truth, and covariances (M, J, 3, 3), NaN
     where unknown.
     """
-    persons, who = np.unique(truth.person, return_inverse=True)
-    table = np.full((len(scored), len(persons), *truth.joints.shape[1:]), np.nan)
-    table[np.searchsorted(scored, truth.frame), who] = truth.joints
+    at = np.searchsorted(scored, truth.frame)
+    order = np.argsort(at, kind="stable")
+    place = np.empty(len(at), dtype=np.intp)  # number of each person within the frame
+    place[order] = np.arange(len(at)) - np.searchsorted(at[order], at[order])
+    table = np.full((len(scored), place.max(initial=0) + 1, *truth.joints.shape[1:]), np.nan)
+    table[at, place] = truth.joints
     matches = match_people(people.frame, people.joints, table, scored.tolist())
     joints = people.joints[matches.row]
     covariance = np.full((*joints.shape, 3), np.nan)
@@ -271,7 +288,7 @@ def _known(joints: Array) -> Mask:
     return np.asarray(np.isfinite(joints).all(axis=-1))
 
 
-def _percent(part: NDArray[np.int64], whole: NDArray[np.int64]) -> Array:
+def _percent(part: Any, whole: Any) -> Array:
     """100 part / whole; NaN where `whole` is 0."""
     return 100 * part / np.where(whole > 0, whole, np.nan)
 

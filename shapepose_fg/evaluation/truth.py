@@ -82,15 +82,8 @@ def read_people(
         files = [path / PEOPLE if path.is_dir() else path]
     kinds = [_kind(file) for file in files if file.suffix == ".npz"]
     if kinds == ["result"]:
-        people = Reconstruction.load(files[0])
         with naming(path, "restore the file"):
-            covered = covered_frames(people.run)
-        identified = bool(people.run.get("configuration", {}).get("temporal", True))
-        names = tuple(people.joint_names.tolist())
-        return PlainPeople(
-            people.frame, people.joints, people.person, names, people.covariance, covered,
-            identified=identified,
-        )  # fmt: skip
+            return people_of(Reconstruction.load(files[0]))
     if kinds == ["arrays"]:
         return _arrays(files[0])
     if kinds and set(kinds) == {"amass"}:
@@ -100,6 +93,19 @@ def read_people(
     raise InputError(
         f"{path}: must be a folder with people.npz, body3DScene_*.json or AMASS files, or "
         "actorsGT.mat, a .txt annotation, or .npz with joints; give one of these"
+    )
+
+
+def people_of(result: Reconstruction) -> PlainPeople:
+    """The joints of a result, for `score`; ValueError if its `run` is invalid."""
+    return PlainPeople(
+        result.frame,
+        result.joints,
+        result.person,
+        tuple(result.joint_names.tolist()),
+        result.covariance,
+        covered_frames(result.run),
+        identified=bool(result.run.get("configuration", {}).get("temporal", True)),
     )
 
 

@@ -16,8 +16,9 @@ from shapepose_fg.core.reconstruction import Known, Reconstruction, Status
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.detector_offsets import OffsetConfig
 from shapepose_fg.evaluation.metrics import joint_metrics
-from shapepose_fg.evaluation.shelf import evaluate_shelf
+from shapepose_fg.evaluation.score import score as score_of
 from shapepose_fg.evaluation.shelf_annotation import read_shelf_ground_truth
+from shapepose_fg.evaluation.truth import people_of
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.pipeline.config import PeopleConfig, SolvingConfig
@@ -298,9 +299,9 @@ def test_shelf_is_as_good_as_promised(shared_data):
     detections = read_detections(shelf, rig)
     truth = read_shelf_ground_truth(shelf / "gt_dev.txt")
     times = FrameTimes.from_fps(25.0, len(detections))
-    score = evaluate_shelf(reconstruct(detections, rig, times=times), truth)
-    assert score.people_found == score.people
-    assert score.pcp_average >= 96.4 and (score.pcp >= 92.5).all()
+    score = score_of(people_of(reconstruct(detections, rig, times=times)), truth)
+    assert score.found == 243
+    assert score.figures["pcp"] >= 96.4 and min(score.people.values()) >= 92.5
 
 
 def test_the_observations_are_what_the_joints_were_solved_from(dance, scene, people):

@@ -2,8 +2,10 @@
 lead on.
 """
 
+import pickle
 import re
 import shlex
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,15 +13,22 @@ import pytest
 import typer
 
 from factors import MOTIONS
+from shapepose_fg import reconstruct
+from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.cli.main import app, main
+from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections, Recording
+from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.core.trajectory import Trajectory
 from shapepose_fg.evaluation.metrics import joint_metrics
 from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.config import toml_text
+from shapepose_fg.io.export.registry import chosen, export_result
 from shapepose_fg.pipeline.pipeline import PipelineConfig
 from shapepose_fg.simulation import Scene, built_in_scene, simulate
+from shapepose_fg.simulation.files import truth_of
 
 ROOT = Path(__file__).parents[2]
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
@@ -48,9 +57,11 @@ def simulating(page: Path) -> list[str]:
     ]
 
 
-def run(*pages: Path) -> dict:
-    """Run all Python of the pages, one block after the other; returns the names that it leaves."""
-    names: dict = {}
+def run(*pages: Path, names: dict | None = None) -> dict:
+    """Run all Python of the pages, one block after the other; returns the names that it leaves,
+    beside the given ones.
+    """
+    names = {} if names is None else names
     for page in pages:
         for block in blocks(page, "python"):
             exec(compile(block, str(page), "exec"), names)
@@ -145,12 +156,99 @@ def test_readme_in_the_shell(recording, tmp_path, capsys):
     assert kinds == {".npz", ".trc", ".c3d", ".bvh", ".glb", ".csv", ".parquet"}
 
 
+def moving(scene: Scene) -> dict:
+    """The names of docs/moving_cameras.md: the first camera is on a carrier, which stands still."""
+    first, *others = scene.rig.cameras
+    time_s = np.arange(-0.5, 1.0, 0.1)
+    poses = Trajectory("robot", time_s, np.tile(first.wTc, (len(time_s), 1, 1)))
+    rig = Rig((replace(first, carrier="robot"), *others), scene.rig.up, trajectories=(poses,))
+    times = FrameTimes.from_fps(scene.fps, len(scene))
+    return {"detections": simulate(scene), "rig": rig, "times": times}
+
+
+def measured(scene: Scene) -> dict:
+    """The names of docs/body_fitting.md: four people in six frames, whose ears are hidden."""
+    rows = {
+        "xyz": scene.keypoints.reshape(-1, 25, 3),
+        "person": np.tile(np.arange(4), len(scene)),
+        "time_s": np.repeat(np.arange(len(scene)) / scene.fps, 4),
+    }
+    hidden = np.zeros(rows["xyz"].shape[:2], dtype=bool)
+    hidden[:, 17:19] = True
+    targets = JointTargets(rows["xyz"], np.tile(np.eye(3) / 0.02**2, (*hidden.shape, 1, 1)))
+    again = {"targets": targets, "others": targets, "person_2": rows["person"]}
+    return {**rows, "hidden": hidden, **again, "time_2_s": rows["time_s"]}
+
+
+def two_pickled_cameras(scene: Scene) -> dict:
+    """What docs/conventions.md reads: a result, and the pickles of two cameras."""
+    reconstruct(simulate(scene), scene.rig).save("results")
+    for camera in scene.rig.cameras[:2]:
+        cTw = np.linalg.inv(camera.wTc)
+        values = {
+            "rotation": cTw[:3, :3],
+            "translation": 1000 * cTw[:3, 3:],
+            "intrinsicMat": camera.K,
+        }
+        values |= {"imageSize": np.array([[720], [1280]]), "distortion": np.zeros((1, 5))}
+        folder = Path("Videos", f"Cam{camera.name}")
+        folder.mkdir(parents=True)
+        (folder / "cameraIntrinsicsExtrinsics.pickle").write_bytes(pickle.dumps(values))
+    return {}
+
+
+def exported(scene: Scene) -> dict:
+    """What docs/export.md reads: a Parquet table."""
+    people = reconstruct(simulate(scene), scene.rig)
+    people.save("results")
+    export_result(Path("results"), chosen(["parquet"]), Path("results/export"))
+    return {}
+
+
+def known_truth(scene: Scene) -> dict:
+    """What docs/evaluation.md reads: a result, and its truth."""
+    reconstruct(simulate(scene), scene.rig).save("results")
+    truth_of(scene).save("truth")
+    return {}
+
+
+PREPARED = {
+    "body_fitting": measured,
+    "body_model": lambda scene: {"detections": simulate(scene), "rig": scene.rig},
+    "conventions": two_pickled_cameras,
+    "evaluation": known_truth,
+    "export": exported,
+    "live": lambda scene: {},
+    "moving_cameras": moving,
+    "simulation": lambda scene: {},
+}
+"""Functions that prepare what the code of a page expects, and return names that it does not make,
+by page."""
+ELSEWHERE = {"README", "using", "extending", "factors", "ros", "research", "robots"}
+"""Pages whose code other tests run; that of ros.md needs an installation of ROS."""
+
+
+def test_the_code_of_every_page_is_run():
+    with_code = {page.stem for page in PAGES if blocks(page, "python")}
+    assert with_code <= PREPARED.keys() | ELSEWHERE | {page.stem for page in GUIDES}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", PREPARED)
+def test_the_python_of_a_page_runs(page, recording):
+    if page == "export":
+        pytest.importorskip("pyarrow", reason="needs the extra archive")
+    run(ROOT / "docs" / f"{page}.md", names=PREPARED[page](recording))
+
+
 GUIDES = [page for page in PAGES if page.parent.name == "guides"]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", GUIDES, ids=lambda page: page.name)
 def test_the_python_of_a_guide_runs(page, tmp_path, monkeypatch):
+    if "to_frame(" in page.read_text(encoding="utf-8"):
+        pytest.importorskip("pandas", reason="tables of results are pandas's")
     monkeypatch.chdir(tmp_path)
     run(page)
 

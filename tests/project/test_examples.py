@@ -9,7 +9,7 @@ import pytest
 
 FOLDER = Path(__file__).parents[2] / "docs" / "examples"
 SCRIPTS = sorted(FOLDER.glob("[0-9][0-9]_*.py"))
-SLOW = ("03", "05", "06", "08", "11")
+SLOW = ("02", "03", "05", "06", "08", "11", "12")
 """Those that take seconds, and use little that the others do not."""
 
 pytest.importorskip("matplotlib", reason="examples draw with Matplotlib, of the extra dev")

@@ -47,6 +47,8 @@ LEVELS = (
     "pipeline.trajectories",
     "pipeline.pipeline",
     "io",
+    "io.export.take",
+    "biomechanics",
     "pipeline.solving",
     "pipeline.explanation",
     "pipeline.explaining",

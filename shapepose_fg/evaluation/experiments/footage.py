@@ -11,10 +11,11 @@ from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.evaluation.experiments.experiment import Case, Experiment, Figures, columns
 from shapepose_fg.evaluation.experiments.scenes import MODES, OVER_TIME, Scale
 from shapepose_fg.evaluation.held_out_view import held_out
-from shapepose_fg.evaluation.metrics import People
-from shapepose_fg.evaluation.shelf import ACTORS, ShelfScore, evaluate_shelf
+from shapepose_fg.evaluation.score import score
+from shapepose_fg.evaluation.shelf import ACTORS
 from shapepose_fg.evaluation.shelf_annotation import read_shelf_ground_truth
 from shapepose_fg.evaluation.tracking import body_joints
+from shapepose_fg.evaluation.truth import people_of
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detection_table import DetectionTable
 from shapepose_fg.io.detections import read_detections
@@ -25,8 +26,7 @@ QUICK = range(20)
 SHELF_FPS = 25.0
 SHELF_COLUMNS = columns(
     *((f"actor {actor + 1}", f"actor_{actor + 1}", 2) for actor in ACTORS), ("Avg", "average", 2),
-    ("all limbs", "pooled", 2), ("MPJPE, mm", "mpjpe_mm"), ("recall at 0.2 m, %", "recall", 2),
-    ("people found", "found", 0),
+    ("MPJPE, mm", "mpjpe_mm"), ("recall at 0.2 m, %", "recall", 2), ("people found", "found", 0),
 )  # fmt: skip
 ZHANG = {
     "Zhang et al. 2020, with time": (99.47, 99.47, 96.45, 98.46),
@@ -88,13 +88,13 @@ def _ours(folder: Path, mode: str) -> Reconstruction:
     return _reconstructed(folder, MODES[mode])
 
 
-def _bodies(folder: Path) -> People:
+def _bodies(folder: Path) -> Reconstruction:
     """The result with the joints of the fitted bodies instead of those of the graphs."""
     people = _ours(folder, "frame by frame")
     return replace(people, joints=body_joints(people))
 
 
-_SHELF: dict[str, Callable[[Path], People]] = {
+_SHELF: dict[str, Callable[[Path], Reconstruction]] = {
     "**shapepose-fg, with time**": partial(_ours, mode="over time"),
     "**shapepose-fg, without time**": partial(_ours, mode="frame by frame"),
     "(ours) bodies' joints": _bodies,
@@ -102,20 +102,11 @@ _SHELF: dict[str, Callable[[Path], People]] = {
 """Measurements on Shelf."""
 
 
-@cache
-def _score(folder: Path, name: str) -> ShelfScore:
-    return evaluate_shelf(_SHELF[name](folder), read_shelf_ground_truth(folder / "gt_dev.txt"))
-
-
 def _scores(folder: Path, name: str) -> Figures:
-    score = _score(folder, name)
-    shares = {
-        "average": score.pcp_average,
-        "pooled": score.pcp_pooled,
-        "recall": 100 * score.recall,
-    }
-    actors = {f"actor_{actor + 1}": float(score.pcp[actor]) for actor in ACTORS}
-    return actors | shares | {"mpjpe_mm": score.mpjpe_mm, "found": score.people_found}
+    made = score(people_of(_SHELF[name](folder)), read_shelf_ground_truth(folder / "gt_dev.txt"))
+    actors = {f"actor_{actor + 1}": value for actor, value in made.people.items()}
+    kept = {name: made.figures[name] for name in ("mpjpe_mm", "recall")}
+    return actors | kept | {"average": made.figures["pcp"], "found": made.found}
 
 
 def _view(folder: Path, quick: bool, view: int) -> Figures:

@@ -144,6 +144,8 @@ FORMATS = {
         Format("c3d", "markers, for biomechanics", "markers:write_c3d"),
         Format("bvh", "a moving skeleton, for animation", "motion_files:write_bvh"),
         Format("glb", "moving bodies with their skin, for Blender and the web", "glb:write_glb"),
+        Format("angles", "joint angles as a table", "tables:write_angles", **_ANYBODY),
+        Format("opensim", "scaling and inverse kinematics in OpenSim", "opensim:write_opensim"),
         Format("csv", "joints as a table", "tables:write_csv", **_ANYBODY),
         Format("parquet", "all columns, for archives", "tables:write_parquet", **_ANYBODY,
                rows=True),

@@ -7,25 +7,22 @@ Axes are those of the recording; metres.
 import csv
 import io
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.biomechanics.joint_angles import joint_angles
+from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.core.arrays import Index
 from shapepose_fg.core.errors import optional
-from shapepose_fg.core.reconstruction import Known, OpenedReconstruction, sigma_m
+from shapepose_fg.core.reconstruction import OpenedReconstruction
 from shapepose_fg.core.storage.files import write_atomically
-from shapepose_fg.core.storage.schema import code_names
 from shapepose_fg.io.export.registry import Job, Written
 from shapepose_fg.io.export.take import Take
 
-COLUMNS = (
-    "frame time_s person joint x_m y_m z_m sigma_m sigma_x_m sigma_y_m sigma_z_m vx_m_s vy_m_s "
-    "vz_m_s known confidence"
-).split()
-"""Header of the CSV file."""
 _GROUP_ROWS = 4096
 """Number of rows in a group of Parquet: about 20 MB, which readers load separately."""
 _OBSERVED = "observations."
@@ -41,34 +38,37 @@ def write_csv(job: Job) -> Written:
 
 def csv_text(take: Take) -> str:
     """A line for each joint with a position; unknown values are empty."""
-
-    def words(values: Array, digits: str = "%.6f") -> list[str]:
-        return np.where(np.isfinite(values), np.char.mod(digits, values), "").tolist()
-
     people = take.people
-    row, joint = np.nonzero(np.isfinite(people.joints).all(axis=2))
-    order = np.lexsort((joint, people.person[row], people.frame[row]))
-    row, joint = row[order], joint[order]
-    covariance = people.covariance[row, joint]
-    variance = np.diagonal(covariance, axis1=1, axis2=2)
-    with np.errstate(invalid="ignore"):
-        axes = np.sqrt(np.where(variance >= 0, variance, np.nan))
-    columns = [
-        people.frame[row].tolist(),
-        words(take.times_s[np.searchsorted(take.frames, people.frame[row])]),
-        people.person[row].tolist(),
-        people.joint_names[joint].tolist(),
-        *map(words, people.joints[row, joint].T),
-        words(sigma_m(covariance)),
-        *map(words, axes.T),
-        *map(words, people.velocity[row, joint].T),
-        code_names(Known)[people.known[row, joint]].tolist(),
-        words(people.confidence[row, joint], "%.4f"),
-    ]
+    times = take.times_s[np.searchsorted(take.frames, people.frame)]
+    return columns_text(replace(people, time_s=times).by_joint())
+
+
+def write_angles(job: Job) -> Written:
+    """Write `angles.csv`: a line for each person and frame with a body."""
+    take, written = job.take, Written()
+    angles = joint_angles(take.people, take.up, BodyModel(job.arrays))
+    times = take.times_s[np.searchsorted(take.frames, take.people.frame)]
+    columns = angles.columns() | {"time_s": times}
+    order = np.lexsort((take.people.person, take.people.frame))
+    order = order[np.isfinite(angles.degrees[order, 0])]
+    chosen = {name: values[order] for name, values in columns.items()}
+    written.add(job.folder / "angles.csv", columns_text(chosen, "%.3f"))
+    return written
+
+
+def columns_text(columns: dict[str, NDArray[Any]], digits: str = "%.6f") -> str:
+    """CSV of columns of equal length; unknown numbers are empty."""
+
+    def words(name: str, values: NDArray[Any]) -> list[Any]:
+        if values.dtype.kind != "f":
+            return values.tolist()
+        form = {"confidence": "%.4f", "time_s": "%.6f"}.get(name, digits)
+        return np.where(np.isfinite(values), np.char.mod(form, values), "").tolist()
+
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(COLUMNS)
-    writer.writerows(zip(*columns, strict=True))
+    writer.writerow(columns)
+    writer.writerows(zip(*(words(*each) for each in columns.items()), strict=True))
     return stream.getvalue()
 
 

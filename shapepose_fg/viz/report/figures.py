@@ -9,7 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.core.arrays import Index, Mask, Real, Whole
+from shapepose_fg.biomechanics.joint_angles import NAMES, JointAngles, joint_angles
+from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.core.arrays import Array, Index, Mask, Real, Whole
+from shapepose_fg.core.camera import Axis
 from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.reconstruction import Known, Reconstruction, sigma_m
 from shapepose_fg.core.run_summary import covered_frames
@@ -35,6 +38,42 @@ class Residual:
         """Compute median and 90th percentile of the finite distances `px`."""
         px = px[np.isfinite(px)]
         return cls(*np.quantile(px, [0.5, 0.9]).tolist()) if len(px) > 0 else cls(None, None)
+
+
+@dataclass(frozen=True)
+class Curve:
+    """An angle of both sides over time, as SVG paths in a box of 200 x 60."""
+
+    name: str
+    """Name of the angle."""
+    low: float
+    """Angle at the bottom of the box, degrees."""
+    high: float
+    """Angle at the top of the box, degrees."""
+    lines: tuple[str, ...]
+    """Path of the right side, and of the left one."""
+    bands: tuple[str, ...]
+    """Two standard deviations around each."""
+
+    @classmethod
+    def of(cls, name: str, angles: JointAngles, frame: Whole) -> "Curve":
+        """Draw `name` of rows in the increasing frames `frame` (N,)."""
+        places = [NAMES.index(f"{side}_{name}") for side in ("right", "left")]
+        middle, spread = angles.degrees[:, places], 2 * np.nan_to_num(angles.sigma[:, places])
+        low, high = np.floor(np.nanmin(middle)) - 5, np.ceil(np.nanmax(middle)) + 5
+        x = 200 * (frame - frame[0]) / max(float(np.ptp(frame)), 1)
+
+        def path(values: Array, x: Array) -> str:
+            y = (60 * (high - values) / (high - low)).clip(0, 60)
+            pairs = zip(x.tolist(), y.tolist(), strict=True)
+            return "M" + "L".join(f"{a:.1f} {b:.1f}" for a, b in pairs if b == b)
+
+        lines = tuple(path(each, x) for each in middle.T)
+        bands = tuple(
+            path(np.concatenate([each + two, (each - two)[::-1]]), np.concatenate([x, x[::-1]]))
+            for each, two in zip(middle.T, spread.T, strict=True)
+        )
+        return cls(name.replace("_", " "), low, high, lines, bands)
 
 
 @dataclass(frozen=True)
@@ -127,6 +166,33 @@ def overall(people: Reconstruction) -> dict[str, Any]:
             f"{count} {name}" for name, count in Counter(people.status.tolist()).items()
         ),
     }
+
+
+CURVES = (
+    "hip_flexion", "hip_adduction", "knee_flexion", "ankle_flexion", "shoulder_elevation",
+    "elbow_flexion",
+)  # fmt: skip
+"""Angles that the report draws, of both sides."""
+_DRAWN_PEOPLE, _DRAWN_FRAMES = 8, 80
+"""Maximum numbers of people with curves, and of frames of each, so that the page stays small and
+quick to make: 2 ms per row."""
+
+
+def angle_curves(people: Reconstruction, up: Axis, model: BodyModel) -> dict[int, list[Curve]]:
+    """The curves of the people with the most rows, by number of the person."""
+    numbers, counts = np.unique(people.person, return_counts=True)
+    drawn = dict[int, list[Curve]]()
+    for who in np.sort(numbers[np.argsort(-counts, kind="stable")[:_DRAWN_PEOPLE]]).tolist():
+        rows = np.flatnonzero(people.person == who)
+        rows = rows[np.argsort(people.frame[rows], kind="stable")]
+        rows = rows[:: -(-len(rows) // _DRAWN_FRAMES)]
+        angles = joint_angles(people.rows(rows), up, model)
+        drawn[who] = [
+            Curve.of(name, angles, people.frame[rows])
+            for name in CURVES
+            if np.isfinite(angles.degrees).any()
+        ]
+    return {who: curves for who, curves in drawn.items() if curves}
 
 
 def known_counts(people: Reconstruction, by: Whole | None = None) -> NDArray[np.int64]:

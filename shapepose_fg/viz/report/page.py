@@ -2,7 +2,7 @@
 
 import base64
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.resources import files
 
 import numpy as np
@@ -12,7 +12,7 @@ from shapepose_fg.core.observation_table import Gate
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.tracking.listing import TrackSummary
 from shapepose_fg.viz.report.facts import told_by
-from shapepose_fg.viz.report.figures import KINDS, camera_figures, known_counts, overall
+from shapepose_fg.viz.report.figures import KINDS, Curve, camera_figures, known_counts, overall
 from shapepose_fg.viz.report.scene import Scene
 
 _SCRIPTS = ("geometry.js", "skin.js", "drawing.js", "page.js")
@@ -25,11 +25,12 @@ def page_text(
     tracks: Sequence[TrackSummary],
     scene: Scene | None,
     remarks: Sequence[str],
+    curves: Mapping[int, Sequence[Curve]],
 ) -> str:
     """The page of a result as self-contained HTML, without references to other addresses.
 
-    `tracks` are the identities, `scene` is drawn if given, and `remarks` state what is missing on
-    the page.
+    `tracks` are the identities, `scene` is drawn if given, `remarks` state what is missing on the
+    page, and `curves` are joint angles by person.
     """
     by_person = known_counts(
         people, np.searchsorted([each.person for each in tracks], people.person)
@@ -44,6 +45,7 @@ def page_text(
         run=told_by(people.run),
         overall=overall(people),
         cameras=camera_figures(people),
+        curves=curves,
         tracks=[
             (each, dict(zip(kinds, counts, strict=True)), PALETTE[each.person % len(PALETTE)])
             for each, counts in zip(tracks, by_person.tolist(), strict=True)

@@ -5,6 +5,7 @@ from typing import get_args
 
 import numpy as np
 
+from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.smpl_file import SmplArrays
 from shapepose_fg.core.camera import Axis, Rig
 from shapepose_fg.core.errors import InputError
@@ -16,6 +17,8 @@ from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.export.take import Take
 from shapepose_fg.io.solved_setup import CAMERAS, body_of
 from shapepose_fg.tracking.listing import list_tracks
+from shapepose_fg.viz.report.facts import objects
+from shapepose_fg.viz.report.figures import Curve, angle_curves
 from shapepose_fg.viz.report.page import page_text
 from shapepose_fg.viz.report.scene import Scene, scene_of
 
@@ -68,7 +71,13 @@ def write_report(
         except ValueError as error:
             remarks.append(f"the scene is not drawn: {error}")
     title = str(people.run.get("project") or folder.resolve().name or folder)
-    text = page_text(title, people, list_tracks(people, arrays, every), scene, remarks)
+    curves = dict[int, list[Curve]]()
+    if arrays is not None and objects(people.run.get("configuration")).get("temporal", True):
+        try:
+            curves = angle_curves(people, up, BodyModel(arrays))
+        except InputError as error:
+            remarks.append(f"joint angles are not drawn: {error}")
+    text = page_text(title, people, list_tracks(people, arrays, every), scene, remarks, curves)
     file = folder / REPORT
     # A name may contain half of a surrogate pair, which cannot be written to a file.
     write_atomically(file, lambda stream: stream.write(text.encode("utf-8", "replace")))

@@ -57,7 +57,10 @@ def test_options(copied, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["fbx"], "format fbx: must be one of amass trc c3d bvh glb csv parquet mcap rrd"),
+        (
+            ["fbx"],
+            "format fbx: must be one of amass trc c3d bvh glb angles opensim csv parquet mcap rrd",
+        ),
         (["trc", "--markers", "skin"], "--markers skin: must be one of opensim joints body"),
         (["trc", "--frames", "9:3"], "--frames 9:3: must be A:B"),
         (

@@ -1,0 +1,1 @@
+"""Biomechanics: joint angles of bodies, with covariances."""
