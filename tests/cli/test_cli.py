@@ -420,7 +420,7 @@ def test_errors_are_one_sentence_and_exit_code_2(recording, pipeline, capsys, op
             ["evaluate", "x", "--ground-truth", "y"],
             "No such option: --ground-truth",
         ),
-        (["evaluate", "/nothing", "--truth", "/gt.txt"], "/gt.txt: there is no such file or folder"),
+        (["evaluate", "/nothing", "--truth", "/gt.txt"], "/gt.txt: there is no such file"),
     ],
 )
 def test_wrong_command_lines(capsys, arguments, sentence):
