@@ -83,7 +83,7 @@ def write_opensim(job: Job) -> Written:
             ElementTree.indent(root)
             text = ElementTree.tostring(root, encoding="unicode", xml_declaration=True)
             written.add(job.folder / f"{name}_{part}.xml", text + "\n")
-        motion = mot_text(take, place, BodyModel(job.arrays), f"{name}_angles")
+        motion = mot_text(take, place, job.model, f"{name}_angles")
         if motion is not None:
             written.add(job.folder / f"{name}_angles.mot", motion)
     needed = f"{MODEL} and {marker_file or 'a marker set, as markers.xml,'}"
