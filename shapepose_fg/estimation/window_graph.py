@@ -12,6 +12,7 @@ import numpy as np
 
 from factors import (
     DEFAULT_WIDTH_SIGMA,
+    KernelName,
     body_prior_factors,
     make_camera,
     projection_factors,
@@ -57,7 +58,8 @@ class WindowGraph(PersonWindow):
         super().__init__(track, frames, observations.time_s.mean(axis=1), keys, rows, first)
         self.config = config.graph
         self._observations, self._sigmas_px, self._views = observations, sigmas_px, views
-        self._names, self._kernel = config.joints, config.observations.robust_kernel
+        self._names = config.joints
+        self._kernel: KernelName | None = config.observations.robust_kernel
         self.present: Mask = np.zeros((T, J), dtype=bool)
         """(1, J) joints in the last problem."""
         self.positions = np.full((T, J, 3), np.nan)
