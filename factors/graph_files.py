@@ -169,8 +169,8 @@ _KINDS = {
     )
 }
 _LINEAR = "linear"
-"""Kind of a `LinearContainerFactor` on points and vectors. `data` are A and b of |A x - b|², for any
-number of keys and rows; `sizes` are those of the variables where they are not all points."""
+"""Kind of a `LinearContainerFactor` on points and vectors. `data` are A and b of |A x - b|², for
+any number of keys and rows; `sizes` are those of the variables where they are not all points."""
 _LARGEST_VECTOR = 1000
 _VALUES: dict[str, tuple[tuple[int, ...], Callable[[gtsam.Values, int, Array], None]]] = {
     "point": ((3,), lambda values, key, x: values.insert(key, x)),

@@ -18,10 +18,11 @@ def linear_factor(
 
     `keys` (K,) are distinct keys of `Point3` variables, such as positions and velocities of joints,
     or of vectors, such as bodies. `matrices` are the K matrices A_k, (M, 3) each, or as wide as the
-    vector; a number stands for that number times the identity of a point. `measured` (M,) is z, or one number for all rows; `sigma` (M,), or one number, is in
-    the residual's unit. GTSAM's own JacobianFactor takes at most three variables from Python. In a
-    nonlinear graph, the error of a linear factor without a linearisation point is always 0; this
-    function sets one. ValueError if shapes do not fit or a value is not finite.
+    vector; a number stands for that number times the identity of a point. `measured` (M,) is z, or
+    one number for all rows; `sigma` (M,), or one number, is in the residual's unit. GTSAM's own
+    JacobianFactor takes at most three variables from Python. In a nonlinear graph, the error of a
+    linear factor without a linearisation point is always 0; this function sets one. ValueError if
+    shapes do not fit or a value is not finite.
     """
     names = np.atleast_1d(np.asarray(keys)).tolist()
     if len(names) == 0 or len(set(names)) < len(names):

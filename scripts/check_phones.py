@@ -31,7 +31,7 @@ from shapepose_fg.pipeline.pipeline import refine_trajectories
 from shapepose_fg.simulation.mocap import Mocap
 from tests.calibration.filmed_by_phones import errors, film, odometry, similarity
 
-REFINED = 400
+REFINED = 250
 """Number of frames in which the carried phone is refined."""
 
 
@@ -49,7 +49,7 @@ def measure(room: int, mocap: Mocap, folder: Path) -> dict[str, object]:
     words += ["--image-size", "{}x{}".format(*fixed[0].camera.image_size)]
     words += ["--distance", f"phone1,phone2={far:.2f}", "--times", folder / "times.csv"]
     words += ["--trajectory", f"{names[-1]}={folder / 'log.tum'}"]
-    said, rig_file = io.StringIO(), folder / "calibration.json"
+    said, rig_file = io.StringIO(), folder / "found.json"
     with contextlib.redirect_stdout(said), contextlib.suppress(SystemExit):
         command(["calibrate", *map(str, words), "--output", str(rig_file)])
     found: dict[str, object] = {"room": room, "people": 1 + room % 2}

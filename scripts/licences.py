@@ -14,7 +14,18 @@ from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "licences.md"
-EXTRAS = ("detect", "export", "view", "archive", "photos", "cluster", "ros", "hdf5", "train")
+EXTRAS = (
+    "detect",
+    "export",
+    "view",
+    "archive",
+    "photos",
+    "cluster",
+    "ros",
+    "hdf5",
+    "frames",
+    "train",
+)
 HEAD = """# Licences of what is installed with it
 
 With this page you can check the licences of all packages that are installed. `pip install

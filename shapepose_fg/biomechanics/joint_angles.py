@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.priors import NUM_ANGLES, PosePrior
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
-from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model.rotation import exp_so3, right_jacobian_inverse
 from shapepose_fg.body.model.smpl_file import NUM_BETAS
 from shapepose_fg.core.arrays import Array
@@ -26,7 +25,7 @@ from shapepose_fg.core.errors import InputError, optional
 from shapepose_fg.core.reconstruction import BODY, Known, Reconstruction, with_body
 from shapepose_fg.core.skeleton import SMPL_24
 from shapepose_fg.io.export.take import opensim_axes
-from shapepose_fg.io.solved_setup import body_of
+from shapepose_fg.io.solved_setup import model_of
 
 _ISB = np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]])
 """Axes forward, up and right (columns) in the frame of the body model."""
@@ -129,7 +128,7 @@ class JointAngles:
     @property
     def sigma(self) -> Array:
         """(N, A) standard deviations, degrees."""
-        return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
+        return np.sqrt(np.maximum(np.diagonal(self.covariance, axis1=1, axis2=2), 0.0))
 
     def columns(self) -> dict[str, NDArray[Any]]:
         """Frame, time and person of each row, then `right_knee_flexion_deg`,
@@ -165,17 +164,11 @@ def joint_angles(
     if axis not in get_args(Axis):
         raise InputError(f"up={axis}: must be the axis of the world that points up, such as 'z'")
     world = opensim_axes(axis)
-    model = BodyModel(body_of(people.run)) if model is None else model
+    model = model_of(people.run) if model is None else model
     there = np.flatnonzero(with_body(*(getattr(people, name) for name in BODY)))
     names = _names(definitions)
     degrees = np.full((len(people), len(names)), np.nan)
     covariance = np.full((*degrees.shape, len(names)), np.nan)
-    if (offsets := people.run.get("keypoint_offsets")) is not None:
-        try:
-            model = model.with_keypoint_offsets(KeypointOffsets.from_dict(offsets))
-        except (KeyError, TypeError, ValueError):
-            cure = "restore the file or remove the entry"
-            raise InputError(f"run.json: keypoint_offsets is not valid; {cure}") from None
     model = model.with_keypoints(tuple(people.joint_names.tolist()))
     for start in range(0, len(there), _BLOCK):
         rows = there[start : start + _BLOCK]
@@ -295,7 +288,8 @@ def _rotations(
     """
     points, jacobian = model.keypoints_with_jacobian(posed)
     count, columns = len(points), jacobian.shape[-1]
-    seen = Known.observed(people.known) & np.isfinite(people.covariance).all(axis=(2, 3))
+    volume = np.linalg.det(np.nan_to_num(people.covariance))  # 0 if it is unknown or singular
+    seen = Known.observed(people.known) & (volume > 0)
     known = seen[..., None, None]
     weight = np.where(known, np.linalg.inv(np.where(known, people.covariance, np.eye(3))), 0)
     flat = jacobian.reshape(count, -1, columns)

@@ -11,6 +11,7 @@ from functools import cached_property
 from itertools import product
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -34,7 +35,7 @@ _LEAST_S, _LEAST_WAY_M = 4.0, 0.4
 m."""
 _SAME_M = 0.7
 """Maximum motion of a person between moments, m."""
-_AGREE_M, _NEAR_M = 0.5, (0.6, 0.3, 0.2, 0.2)
+_AGREE_M, _NEAR_M = 0.5, (0.6, 0.3, 0.2)
 """Distance, m, between positions from a person's size and those of the other cameras that agree;
 and maximum median distance of a person's joints from their detections, m, by round."""
 _PEAKS, _TRIED = 3, 60
@@ -44,8 +45,16 @@ _OTHER_S, _OTHER_DEG = 1.0, 10.0
 _LEAST_SHARE, _LEAST_LEAD, _LEAST_PEOPLE = 0.5, 1.25, 25
 """Minimum share of the people in view that agree with the start, minimum ratio of their number to
 that of any other start, and minimum number."""
+_KNOTS, _DRIFT_M = 6, 0.01
+"""Number of times between which an odometry drifts linearly, and minimum drift between them, m."""
+_LEVEL_RAD, _TILT_RAD = np.radians(6.0), np.radians(0.5)
+"""Maximum deviation from the vertical of a log's axis that is along gravity, and the standard
+deviation of that of the world's vertical axis."""
 _STEPS = 12
 """Maximum number of evaluations in each round of adjustment."""
+_MOST_TURN_DEG, _MOST_MOVE_M = 2.0, 0.15
+"""Maximum standard deviations of a start; the refinement of trajectories uses detections within 50
+cm."""
 _RIGID, _LONG_M, _FEWEST = 0.1, 0.25, 3
 """Maximum relative variation of the distance of two joints of a bone, its minimum, m, and minimum
 number of bones that give the distance of a person."""
@@ -225,11 +234,7 @@ class Filmed:
         others = [each.agreeing for each in best[1:] if self._differ(each, first)]
         if first.agreeing < _LEAST_LEAD * max(others, default=0.0):
             raise refuse("two starts of its trajectory agree with the people about equally well")
-        # The refinement of trajectories assumes that the start of an odometry is known so well.
-        assumed = np.diag(replace(self.trajectory, covariance=None).start_covariance())
-        if np.radians(first.sigma_turn_deg) > np.sqrt(
-            assumed[:3].sum()
-        ) or first.sigma_move_m > np.sqrt(assumed[3:].sum()):
+        if first.sigma_turn_deg > _MOST_TURN_DEG or first.sigma_move_m > _MOST_MOVE_M:
             raise refuse(
                 f"the people determine the start of its trajectory to {first.sigma_turn_deg:.1f} "
                 f"degrees and {100 * first.sigma_move_m:.0f} cm only"
@@ -303,14 +308,12 @@ class Filmed:
         depth = median_of(at[..., 2], 5)
         with np.errstate(divide="ignore", invalid="ignore"):
             xy = at[..., :2] / at[..., 2:] * start.focal
-        away = np.linalg.norm(self.rays[frame][..., :2] - xy[:, None], axis=-1)
-        away = median_of(away, 5) * depth[:, None] / start.focal
+            away = np.linalg.norm(self.rays[frame][..., :2] - xy[:, None], axis=-1)
+            away = median_of(away, 5) * depth[:, None] / start.focal
+            middle = np.stack([median_of(each, 5) for each in np.moveaxis(xy, 2, 0)], axis=-1)
+            middle = middle @ self.camera.K[:2, :2].T + self.camera.K[:2, 2]
         person = away.argmin(axis=1)
         away = away[np.arange(len(rows)), person]
-        middle = (
-            np.stack([median_of(xy[..., n], 5) for n in (0, 1)], axis=-1) @ self.camera.K[:2, :2].T
-            + self.camera.K[:2, 2]
-        )
         inside = (middle > 0).all(axis=1) & (middle < self.camera.image_size).all(axis=1)
         inside &= depth > _LEAST_DEPTH_M
         return rows, frame, person, np.where(depth > _LEAST_DEPTH_M, away, np.inf), inside
@@ -330,14 +333,15 @@ class Filmed:
 
     def _refined(self, start: Start, placed: Placed, most_s: float, focal: bool) -> Start:
         """The start adjusted to the projections of the people that agree."""
-        free = np.array([True] * 6 + [most_s > 0] + [focal] * 4)
-        for near_m in _NEAR_M:
+        free, bTc = np.array([True] * 6 + [most_s > 0] + [focal] * 4), start.bTc
+        for number, near_m in enumerate(_NEAR_M):
             rows, frame, person, away, _ = self._matched(start, placed, near_m)
             used = away < near_m
             if used.sum() < _LEAST_PEOPLE:
                 return self._judged(start, placed, near_m)
-            fit = _Fit(self, placed, start, free, rows[used], frame[used], person[used])
-            start, sigma = fit.solved()
+            given = replace(start, bTc=bTc)
+            fit = _Fit(self, placed, given, free, rows[used], frame[used], person[used])
+            start, sigma = fit.solved(_KNOTS if number == len(_NEAR_M) - 1 else 1)
         start = replace(
             start,
             sigma_turn_deg=float(np.degrees(np.linalg.norm(sigma[:3]))),
@@ -363,9 +367,9 @@ class _Fit:
     person: Index
 
     def moved(self, x: Array) -> Start:
-        """The start changed by the free parameters."""
+        """The start changed by the free parameters, the first ones of `x`."""
         every, given = np.zeros(len(self.free)), self.start
-        every[self.free] = x
+        every[self.free] = x[: self.free.sum()]
         middle = (given.wTo @ self.filmed._poses(given.bTc)[self.frame])[:, :3, 3].mean(axis=0)
         turn, mount = Rotation.from_rotvec(every[[[0, 1, 2], [8, 9, 10]]]).as_matrix()
         return replace(
@@ -376,36 +380,53 @@ class _Fit:
             focal=given.focal * float(np.exp(every[7])),
         )
 
-    def solved(self) -> tuple[Start, Array]:
-        """The adjusted start, and standard deviations of the free parameters."""
-        rays = self.filmed.rays[self.frame, self.person]
+    def solved(self, knots: int) -> tuple[Start, Array]:
+        """The adjusted start, and standard deviations of the free parameters, if the odometry's
+        drift is linear between `knots` (1: no drift).
+        """
+        filmed, free = self.filmed, int(self.free.sum())
+        rays = filmed.rays[self.frame, self.person]
         known = np.isfinite(rays[..., 0] + self.placed.points[self.rows][..., 0])
         count = dilution(self.placed.time_s[self.rows])
         mount = np.flatnonzero(np.flatnonzero(self.free) >= 8)
+        # The log has an axis along gravity if one is vertical within a few degrees.
+        axis = np.argmax(np.abs(self.start.wTo[2, :3]))
+        level = abs(self.start.wTo[2, axis]) > np.cos(_LEVEL_RAD)
+        at = np.linspace(filmed.own_s[0], filmed.own_s[-1], knots)
+        own_s = filmed.own_s
+        grows = np.cumsum(filmed.trajectory.drifted(filmed._oTb, own_s)[:, 3, 3])
+        drifts = np.sqrt(np.diff(np.interp(at, own_s[1:], grows)) + _DRIFT_M**2)
+        part = np.array([np.interp(own_s[self.frame], at, row) for row in np.eye(knots)[1:]])
 
         def residuals(x: Array) -> Array:
-            now = self.moved(x)
-            at = self.filmed._seen(now, self.placed, self.rows, self.frame)[known]
-            depth = np.maximum(at[:, 2:], _LEAST_DEPTH_M)
-            away = (rays[known][:, :2] / now.focal * depth - at[:, :2]) / _SIGMA_M
-            return np.concatenate([away.ravel(), np.sqrt(count) * x[mount] / _MOUNT_RAD])
+            now, drift = self.moved(x), x[free:].reshape(-1, 3)
+            at = filmed._seen(now, self.placed, self.rows, self.frame)
+            if knots > 1:
+                wRc = (now.wTo @ filmed._poses(now.bTc)[self.frame])[:, :3, :3]
+                at = at - np.einsum("nji,nj->ni", wRc, part.T @ drift)[:, None]
+            depth = np.maximum(at[known][:, 2:], _LEAST_DEPTH_M)
+            away = (rays[known][:, :2] / now.focal * depth - at[known][:, :2]) / _SIGMA_M
+            steps = np.diff(drift, axis=0, prepend=0.0) / drifts[:, None]
+            tilt = now.wTo[:2, axis] / _TILT_RAD * level
+            priors = np.concatenate([x[mount] / _MOUNT_RAD, tilt, steps.ravel()])
+            return np.concatenate([away.ravel(), np.sqrt(count) * priors])
 
-        begin = np.zeros(self.free.sum())
+        begin = np.zeros(free + 3 * (knots - 1))
         fit = least_squares(residuals, begin, x_scale=0.01, loss="cauchy", max_nfev=_STEPS)
         misfit = max(1.0, float(np.median(np.abs(fit.fun)) / 0.6745))
-        inverse = np.linalg.pinv(fit.jac.T @ fit.jac)
-        return self.moved(fit.x), misfit * np.sqrt(count * np.diag(inverse))
+        variance = np.diag(np.linalg.pinv(fit.jac.T @ fit.jac, hermitian=True))
+        return self.moved(fit.x), misfit * np.sqrt(count * np.maximum(variance, 0.0))
 
 
 @dataclass(frozen=True)
 class _Spectrum:
     """Fourier transforms of a track's moments, for its registration at all lags."""
 
-    known: Array
+    known: NDArray[np.complex128]
     """(L, J) mask of joints."""
-    points: Array
+    points: NDArray[np.complex128]
     """(L, J, 3) joints, relative to `centre`."""
-    square: Array
+    square: NDArray[np.complex128]
     """(L, J) squared distance of joints from `centre`."""
     centre: Array
     """(3,) mean position."""
@@ -426,7 +447,7 @@ class _Spectrum:
         other, and scores (L,): the number of joints, nearer ones counting more.
         """
 
-        def correlated(of: str, a: Array, b: Array) -> Array:
+        def correlated(of: str, a: NDArray[np.complex128], b: NDArray[np.complex128]) -> Array:
             return np.fft.irfft(np.einsum(of, a, b.conj()), axis=0)
 
         count = correlated("fj,fj->f", self.known, other.known)

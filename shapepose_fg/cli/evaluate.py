@@ -1,7 +1,7 @@
 """The command `evaluate`: scores results against a truth, as tables for terminals and papers."""
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -55,7 +55,7 @@ def evaluate(
 
     from shapepose_fg.core.camera import Axis
     from shapepose_fg.core.rig_file import CAMERAS
-    from shapepose_fg.evaluation.score import FIGURES, score
+    from shapepose_fg.evaluation.score import score
     from shapepose_fg.evaluation.truth import read_people
     from shapepose_fg.io.calibration import read_rig
 
@@ -73,6 +73,13 @@ def evaluate(
     scores = {
         str(path): score(read_people(path, **how), true, result_frames(frames)) for path in results
     }
+    show_scores(scores, format)
+
+
+def show_scores(scores: "Mapping[str, Score]", format: str = "text") -> None:
+    """Print scores by the names of the results, as text, markdown, latex or json."""
+    from shapepose_fg.evaluation.score import FIGURES
+
     if format == "json":
         every = {name: each.as_dict() for name, each in scores.items()}
         print(json.dumps(every if len(every) > 1 else next(iter(every.values())), indent=2))
@@ -80,7 +87,8 @@ def evaluate(
     note(*dict.fromkeys(told for each in scores.values() for told in each.notes))
     tables = [
         (["result", *FIGURES.values()], [[n, *_cells(e.figures)] for n, e in scores.items()]),
-        *([_pcp("limb", scores, limbs=True), _pcp("person", scores, limbs=False)]),
+        _pcp("limb", scores, limbs=True),
+        _pcp("person", scores, limbs=False),
     ]
     for number, (heads, rows) in enumerate(tables):
         if number > 0:
@@ -93,7 +101,7 @@ def evaluate(
 
 
 def _pcp(
-    kind: str, scores: "dict[str, Score]", *, limbs: bool
+    kind: str, scores: "Mapping[str, Score]", *, limbs: bool
 ) -> tuple[list[str], list[list[str]]]:
     """Heads and rows of the PCP by limb or by person."""
     every = {name: each.limbs if limbs else each.people for name, each in scores.items()}

@@ -12,7 +12,7 @@ from shapepose_fg.cli.batch.command import batch
 from shapepose_fg.cli.calibrate import calibrate
 from shapepose_fg.cli.compile import compile_kernels
 from shapepose_fg.cli.detect import detect
-from shapepose_fg.cli.evaluate import evaluate
+from shapepose_fg.cli.evaluate import evaluate, show_scores
 from shapepose_fg.cli.explain import explain
 from shapepose_fg.cli.export import export
 from shapepose_fg.cli.live import live
@@ -31,7 +31,7 @@ from shapepose_fg.cli.setup import check_calibration
 from shapepose_fg.cli.simulate import simulate
 from shapepose_fg.cli.stopping import Stopped, stoppable
 from shapepose_fg.cli.synchronise import synchronise
-from shapepose_fg.cli.terminal import note_log, say, show, use_any_streams
+from shapepose_fg.cli.terminal import note_log, say, use_any_streams
 from shapepose_fg.cli.terminal import progress as progress_bar
 from shapepose_fg.cli.tracks import tracks
 from shapepose_fg.cli.train_fitter import train_fitter
@@ -129,7 +129,7 @@ def demo(
 
     with progress_bar("reconstructing") as progress:
         result = run_demo(progress)
-    show(result.tables())
+    show_scores({"demo": result.score()})
     print()
     for line in result.save(output, report=report):
         print(line)

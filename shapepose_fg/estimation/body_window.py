@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from factors import DEFAULT_WIDTH_SIGMA, Motion
 from shapepose_fg.body.fitting.chains import Links
@@ -202,7 +201,8 @@ class BodyWindow:
         """
         velocity = velocities(self.joints(state), self.times_s)[:, feet]
         covariance = self.covariances(state).velocities()[:, feet]
-        seen = near_in_time(self.last.evidence.inlier[:, feet].any(axis=-1), self.times_s, UNSEEN_S)
+        seen = np.asarray(self.last.evidence.inlier[:, feet].any(axis=-1))
+        seen = near_in_time(seen, self.times_s, UNSEEN_S)
         velocity = np.where(seen[..., None], velocity, np.nan)
         density = standing_density(velocity, covariance, self.times_s)
         density = np.where(density > FREE_M2_S, np.inf, density)
@@ -409,7 +409,7 @@ class BodyWindow:
         after, arrows = np.zeros((n * N, n * N)), np.zeros((n * N, 10))
         for t in range(T - 1, -1, -1):
             L, ahead = kept[t, :N, :N], kept[t, N : N + n * N, :N]
-            inverse = _lower_inverse(L)
+            inverse = np.linalg.inv(np.tril(L))
             W = ahead @ inverse
             across = -after @ W  # of those after it with this one
             own = inverse.T @ inverse - W.T @ across
@@ -436,14 +436,14 @@ class Marginals:
     window: BodyWindow
     state: BodyState
     poses: Array
-    """(T, N, N) of each frame's root (tangents of the world), angles and place."""
+    """(T, N, N) covariances of each frame's root (tangents of the world), angles and place."""
     steps: Array
-    """(T, N, N) of the pose of the next frame, rows, with that of this one, columns; nothing in the
-    last."""
+    """(T, N, N) covariances of the next frame's pose, rows, with this one's, columns; zero in
+    the last."""
     shape: Array
-    """(10, 10) of the betas."""
+    """(10, 10) covariance of the betas."""
     across: Array
-    """(T, N, 10) of poses with the betas."""
+    """(T, N, 10) covariances of poses with the betas."""
 
     @cached_property
     def slopes(self) -> Array:
@@ -513,7 +513,3 @@ def nearest_keypoint(energy: BodyEnergy) -> Index:
 def _symmetric(lower: Array) -> Array:
     whole = np.tril(lower)
     return whole + np.tril(whole, -1).T
-
-
-def _lower_inverse(L: Array) -> Array:
-    return solve_triangular(L, np.eye(len(L)), lower=True, check_finite=False)

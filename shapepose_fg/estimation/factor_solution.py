@@ -30,7 +30,7 @@ class FactorSolution:
     person: BodyGraph
     """The person, whose state and graph are those of the solution."""
     covariance: Array
-    """(T, J, 3, 3) of the joints in the graph, m²."""
+    """(T, J, 3, 3) covariances of the joints in the graph, m²."""
     marginals: Marginals
     """Those of the model."""
 

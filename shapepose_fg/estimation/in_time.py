@@ -7,7 +7,7 @@ import numpy as np
 from shapepose_fg.core.arrays import Array, Index, Mask
 
 SPEED_S = 0.05
-"""Time before and after a frame for estimating a velocity, s."""
+"""Time before and after a frame for estimating a velocity, s; at least one frame."""
 _AROUND_S = 0.3
 """Time before and after a step over which motion is a median, s; errors for a quarter of it have no
 effect."""
@@ -83,8 +83,10 @@ def moments(times_s: Array) -> tuple[Index, Index, Array]:
     """(T,) first and last frame from which a frame's velocity is computed, and the time between
     them, seconds; NaN for a single frame.
     """
-    first = np.searchsorted(times_s, times_s - SPEED_S, side="left")
-    last = np.searchsorted(times_s, times_s + SPEED_S, side="right") - 1
+    at, end = np.arange(len(times_s)), len(times_s) - 1
+    first = np.searchsorted(times_s, times_s - SPEED_S - 1e-9, side="left")
+    last = np.searchsorted(times_s, times_s + SPEED_S + 1e-9, side="right") - 1
+    first, last = np.clip(first, 0, at - 1).clip(0), np.clip(last, at + 1, None).clip(None, end)
     return first, last, np.where(last > first, times_s[last] - times_s[first], np.nan)
 
 

@@ -224,21 +224,26 @@ def _rows(people: PlainPeople, index: Mask) -> PlainPeople:
 def _scored_frames(
     people: PlainPeople, truth: PlainPeople, frames: Iterable[int] | None
 ) -> NDArray[np.int64]:
-    """The frames that the truth covers, among those that the predictions cover."""
+    """The frames with somebody that both cover, in rising order."""
+    every = np.unique(np.concatenate([people.frame, truth.frame])).astype(np.int64)
 
-    def covers(each: PlainPeople) -> set[int]:
-        return set(each.frame.tolist()).union(*(each.covered or ()))
+    def covers(each: PlainPeople) -> Mask:
+        spans = [(every >= span.start) & (every < span.stop) for span in each.covered or ()]
+        return np.logical_or.reduce([np.isin(every, each.frame), *spans])
 
-    annotated = scored = covers(truth)
+    annotated = scored = every[covers(truth)]
     if people.covered is not None:
-        scored = scored & covers(people)
-    scored = scored if frames is None else scored & set(frames)
+        scored = every[covers(truth) & covers(people)]
+    if frames is not None:
+        frames = frames if isinstance(frames, range) else set(frames)
+        scored = np.array([frame for frame in scored.tolist() if frame in frames], dtype=np.int64)
     if len(scored) == 0:
-        listed = ", ".join(f"{span[0]}-{span[-1]}" for span in spans_of(sorted(annotated))[:9])
+        spans = spans_of(annotated.tolist())[:9]
+        listed = ", ".join(f"{span[0]}-{span[-1]}" for span in spans)
         raise InputError(
             f"none of the reconstructed frames is annotated; reconstruct annotated frames: {listed}"
         )
-    return np.array(sorted(scored), dtype=np.int64)
+    return scored
 
 
 def _limbs(
@@ -267,9 +272,12 @@ def _matched(
     """Joints (M, J, 3) of matched predictions and of the truth, and covariances (M, J, 3, 3), NaN
     where unknown.
     """
-    persons, who = np.unique(truth.person, return_inverse=True)
-    table = np.full((len(scored), len(persons), *truth.joints.shape[1:]), np.nan)
-    table[np.searchsorted(scored, truth.frame), who] = truth.joints
+    at = np.searchsorted(scored, truth.frame)
+    order = np.argsort(at, kind="stable")
+    place = np.empty(len(at), dtype=np.intp)  # number of each person within the frame
+    place[order] = np.arange(len(at)) - np.searchsorted(at[order], at[order])
+    table = np.full((len(scored), place.max(initial=0) + 1, *truth.joints.shape[1:]), np.nan)
+    table[at, place] = truth.joints
     matches = match_people(people.frame, people.joints, table, scored.tolist())
     joints = people.joints[matches.row]
     covariance = np.full((*joints.shape, 3), np.nan)

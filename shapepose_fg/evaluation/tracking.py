@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
-from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
+from shapepose_fg.body.model.body_model import BodyParameters
 from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25
@@ -25,6 +24,7 @@ from shapepose_fg.evaluation.metrics import (
     metrics_of,
     share,
 )
+from shapepose_fg.io.solved_setup import model_of
 
 WRISTS = [BODY_25.index("RWrist"), BODY_25.index("LWrist")]
 FAST_M_S = 1.5
@@ -217,19 +217,9 @@ def body_joints(people: Reconstruction) -> Array:
     """(N, J, 3) joints of the fitted bodies, metres, with the detector offsets that the run
     estimated; NaN without a body.
     """
-    model = detector_s_body(people)
+    model = model_of(people.run)
     columns = (people.betas, people.global_orient, people.body_pose, people.transl)
     return model.keypoints(BodyParameters(*columns))
-
-
-def detector_s_body(people: Reconstruction) -> BodyModel:
-    """The open body, with its joints moved by the detector offsets that the run estimated."""
-    model, offsets = BodyModel.default(), people.run.get("keypoint_offsets")
-    return (
-        model
-        if offsets is None
-        else model.with_keypoint_offsets(KeypointOffsets.from_dict(offsets))
-    )
 
 
 def views_used(people: Reconstruction) -> Index:

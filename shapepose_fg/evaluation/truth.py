@@ -69,6 +69,8 @@ def read_people(
     frame rate to which AMASS is thinned; `body` the body model that its shapes belong to.
     """
     path = Path(path)
+    if not path.exists():
+        raise InputError(f"{path}: there is no such file or folder; check the path")
     if path.is_dir() and not (path / PEOPLE).is_file():
         for folder in (path, path / "hdPose3d_stage1_coco19"):
             if scenes := sorted(folder.glob("body3DScene_*.json")):

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model.smpl_file import SmplArrays, read_smpl_file
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
@@ -36,3 +37,16 @@ def body_of(run: Mapping[str, Any], given: Path | None = None) -> SmplArrays:
         return read_smpl_file(file)
     problem = "the body model of this result is missing"
     raise InputError(f"{file}: {problem}; restore it, or give its path with --body")
+
+
+def model_of(run: Mapping[str, Any], given: Path | None = None) -> BodyModel:
+    """The body model of `body_of`, with the detector's offsets that the run estimated."""
+    model, offsets = BodyModel(body_of(run, given)), run.get("keypoint_offsets")
+    try:
+        moved = (
+            KeypointOffsets.identity() if offsets is None else KeypointOffsets.from_dict(offsets)
+        )
+    except (KeyError, TypeError, ValueError):
+        cure = "restore the file or remove the entry"
+        raise InputError(f"run.json: keypoint_offsets is not valid; {cure}") from None
+    return model.with_keypoint_offsets(moved)

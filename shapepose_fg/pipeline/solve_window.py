@@ -64,13 +64,13 @@ def solve_window(
 
     Rows of one track at several frames are a window, one factor graph with a body in every frame.
     A single row of a track is solved by the frame-by-frame method, which with the paper's
-    `EstimatorConfig` is its Algorithm 1, and so are all rows where the fitter has no body model. `views` are the cameras, by row if they move. `extra_factors`, one function or several, add
+    `EstimatorConfig` is its Algorithm 1, and so are all rows where the fitter has no body model.
+    `views` are the cameras, by row if they move. `extra_factors`, one function or several, add
     factors of your own to every window. Without `assigning` detections keep their people.
 
-    In each round the body is fitted to estimates of all joints from the views only, and then
-    constrains the joints. Its constraint on a joint excludes that joint's own views
-    (`BodyFit.prior_xyz`), so that no measurement counts twice. Motion constrains the joints, never
-    the targets of the body.
+    Frame by frame, in each round the body is fitted to estimates of all joints from the views only,
+    and then constrains the joints. Its constraint on a joint excludes that joint's own views
+    (`BodyFit.prior_xyz`), so that no measurement counts twice.
     """
     if len(views) != observations.confidence.shape[2] or views.rows_known not in (
         None,

@@ -174,6 +174,8 @@ def test_rows_without_a_body_are_unknown(people):
     assert np.isfinite(np.delete(found.sigma, 3, 0)).all()
     unknown = np.full(people.known.shape, Known.UNKNOWN, dtype=np.uint8)
     assert np.isnan(joint_angles(replace(people, known=unknown), "z").sigma).all()
+    exact = replace(people, covariance=np.zeros_like(people.covariance))
+    assert np.isnan(joint_angles(exact, "z").sigma).all()  # no measurement without a covariance
     with pytest.raises(InputError, match="up="):
         joint_angles(people)
 

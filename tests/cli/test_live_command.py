@@ -231,7 +231,7 @@ def test_people_can_be_looked_at_while_they_go_elsewhere(
     told = [json.loads(line) for line in out.read_text().splitlines()]
     now = {each["time_s"]: each["people"] for each in told if each["kind"] == "now"}
     chunks = list(rerun.chunk.RrdReader(looked).stream())
-    assert {"/world/people/1/body", "/world/people/0/bones", "/world/cameras/cam2"} < {
+    assert {"/world/people/1/body/head", "/world/people/0/bones", "/world/cameras/cam2"} < {
         each.entity_path for each in chunks
     }
     assert all(any(person["joints"]) for people in now.values() for person in people)

@@ -127,8 +127,9 @@ def test_marginals_are_those_of_the_graph_and_its_step_moves_nothing() -> None:
 def test_a_frame_by_itself_is_a_window_of_one() -> None:
     window, truth, start = _person(2)
     alone = BodyWindow(
-        window.observations.rows(np.array([4])), window.sigmas_px[4:5], window.views, window.energy.model,
-        window.config, MotionModel.load(tuple(window.energy.model.keypoint_names)), CONSTANT_VELOCITY,
+        window.observations.rows(np.array([4])), window.sigmas_px[4:5], window.views,
+        window.energy.model, window.config,
+        MotionModel.load(tuple(window.energy.model.keypoint_names)), CONSTANT_VELOCITY,
     )  # fmt: skip
     state = alone.solve(start[4:5])
     assert np.linalg.norm(alone.joints(state) - truth[4:5], axis=-1).mean() < 0.03

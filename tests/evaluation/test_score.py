@@ -97,6 +97,9 @@ def test_only_frames_that_both_cover_are_scored(truth):
         made.frames == 4 and made.tracks.misses == 4
     )  # the run covers frame 3, and is empty there
     assert score(part, plain(truth), range(2)).tracks.misses == 0
+    whole = replace(part, covered=[range(10**12)])  # what a file says is not expanded
+    assert score(whole, replace(plain(truth), covered=[range(10**12)])).frames == 12
+    assert score(whole, plain(truth), range(2, 10**12)).frames == 10
     with pytest.raises(InputError, match="annotated frames: 0-11"):
         score(part, plain(truth), range(20, 30))
 

@@ -26,7 +26,8 @@ def recording(seed, *, apart=1.0, people=4, frames=40):
 
 
 def by_trackeval(frames):
-    trackeval = pytest.importorskip("trackeval", reason="trackeval is not installed")
+    without = "needs pip install --no-deps trackeval: its OpenCV would replace the headless one"
+    trackeval = pytest.importorskip("trackeval", reason=without)
     names = [np.unique(np.concatenate([each[side] for each in frames])) for side in (0, 1)]
     ids = [[np.searchsorted(names[side], each[side]) for each in frames] for side in (0, 1)]
     data = {

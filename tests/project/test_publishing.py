@@ -39,14 +39,26 @@ def test_the_citation_has_what_the_format_requires():
     assert all(f"{who['family-names']}, {who['given-names']}" in readme for who in paper["authors"])
 
 
+def step(word: str, folder: Path, tag: str, repository: str) -> int:
+    """Exit code of the release's step whose commands contain a word, run in a folder."""
+    (found,) = [each["run"] for each in WORKFLOW["jobs"]["build"]["steps"] if word in str(each)]
+    names = {"GITHUB_SERVER_URL": "https://github.com", "GITHUB_REPOSITORY": repository}
+    environment = {**os.environ, **names, "GITHUB_REF_NAME": tag}
+    command = ["bash", "-ec", found]
+    return subprocess.run(command, cwd=folder, env=environment, check=False).returncode
+
+
+def test_only_the_version_of_the_tag_is_published_and_only_from_its_own_repository():
+    tag, own = f"v{PROJECT['version']}", PROJECT["urls"]["Repository"].split("/", 3)[3]
+    assert step("grep -qx", ROOT, tag, own) == 0
+    assert step("grep -qx", ROOT, "v99.0", own) != 0
+    assert step("grep -qx", ROOT, tag, "somebody/else") != 0
+
+
 def test_links_of_the_published_readme_need_no_other_file(tmp_path):
     shutil.copy(ROOT / "README.md", tmp_path)
-    where = PROJECT["urls"]["Repository"].removeprefix("https://github.com/")
-    names = {"GITHUB_SERVER_URL": "https://github.com", "GITHUB_REPOSITORY": where}
-    for step in WORKFLOW["jobs"]["build"]["steps"]:
-        if "sed -i" in step.get("run", ""):
-            environment = {**os.environ, **names, "GITHUB_REF_NAME": "v0.1.0"}
-            subprocess.run(["bash", "-ec", step["run"]], cwd=tmp_path, env=environment, check=True)
+    where = PROJECT["urls"]["Repository"].split("/", 3)[3]
+    assert step("sed -i", tmp_path, "v0.1.0", where) == 0
     text = (tmp_path / "README.md").read_text(encoding="utf-8")
     before = (ROOT / "README.md").read_text(encoding="utf-8")
     links, old = (re.findall(r"(!?)\[[^]]*\]\(([^)]*)\)", each) for each in (text, before))

@@ -127,9 +127,11 @@ class Links:
         return energy, np.concatenate((edge, after)) - np.concatenate((before, edge))
 
     def linear(self, root: Array, others: Array) -> list[tuple[list[Array], Array]]:
-        """The prior around rotations of the root (T, 3, 3) and everything else (T, N - 3), whitened, as parts.
+        """Whitened parts of the prior around rotations of the root (T, 3, 3) and the other
+        parameters (T, N - 3).
 
-        A part is its K matrices, (S, N, N) each, of rows that follow each other, and its residuals (S, N).
+        A part is its K matrices, (S, N, N) each, of rows that follow each other, and its residuals
+        (S, N).
         """
         turn, N = log_so3(root[1:] @ root[:-1].swapaxes(1, 2)), self._slow.shape[1]
         count = len(turn)

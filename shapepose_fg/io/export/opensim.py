@@ -5,7 +5,9 @@ The set-ups name the model and the marker set of Pose2Sim (BSD-3), which are not
 from the folder `OpenSim_Setup` of that package.
 """
 
+from collections.abc import Iterable
 from xml.etree import ElementTree
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
@@ -72,17 +74,16 @@ def write_opensim(job: Job) -> Written:
         markers = markers_of(take, place, MarkerSet.OPENSIM)
         if len(markers.frames) == 0:
             continue
-        name, span = f"person_{who}", take.times_s[markers.frames[[0, -1]]]
-        for part, tool in (
-            ("scale", _scale_tool(name, markers, span.tolist(), marker_file or "markers.xml")),
-            ("ik", _ik_tool(name, markers, span.tolist())),
-        ):
-            document = ElementTree.Element("OpenSimDocument", Version="40000")
-            document.append(tool)
-            ElementTree.indent(document)
-            text = ElementTree.tostring(document, encoding="unicode", xml_declaration=True)
+        name = f"person_{who}"
+        span = "{:.6f} {:.6f}".format(*take.times_s[markers.frames[[0, -1]]])
+        scale = _scale_tool(name, markers, span, marker_file or "markers.xml")
+        for part, tool in {"scale": scale, "ik": _ik_tool(name, markers, span)}.items():
+            document = f'<OpenSimDocument Version="40000">{tool}</OpenSimDocument>'
+            root = ElementTree.fromstring(document.replace("\n", ""))
+            ElementTree.indent(root)
+            text = ElementTree.tostring(root, encoding="unicode", xml_declaration=True)
             written.add(job.folder / f"{name}_{part}.xml", text + "\n")
-        motion = mot_text(take, place, BodyModel(job.arrays), f"{name}_angles")
+        motion = mot_text(take, place, job.model, f"{name}_angles")
         if motion is not None:
             written.add(job.folder / f"{name}_angles.mot", motion)
     needed = f"{MODEL} and {marker_file or 'a marker set, as markers.xml,'}"
@@ -121,71 +122,51 @@ def mot_text(take: Take, person: int, model: BodyModel, name: str) -> str | None
     return "\n".join([*head, *lines]) + "\n"
 
 
-def _element(tag: str, *parts: object, **attributes: str) -> ElementTree.Element:
-    """An element with a text, or with elements inside."""
-    made = ElementTree.Element(tag, attributes)
-    for part in parts:
-        if isinstance(part, ElementTree.Element):
-            made.append(part)
-        else:
-            made.text = str(part)
-    return made
+def _set(name: str, objects: Iterable[str]) -> str:
+    """A set of objects in OpenSim's XML."""
+    return f"<{name}><objects>{''.join(objects)}</objects></{name}>"
 
 
-def _objects(tag: str, parts: list[ElementTree.Element]) -> ElementTree.Element:
-    """A set of objects."""
-    return _element(tag, _element("objects", *parts))
-
-
-def _scale_tool(
-    name: str, markers: Markers, span: list[float], marker_file: str
-) -> ElementTree.Element:
+def _scale_tool(name: str, markers: Markers, span: str, marker_file: str) -> str:
     """Scaling of the model by distances of markers, over the whole recording."""
-    measurements = []
+    measurements = list[str]()
     for what, (pairs, bodies) in _MEASUREMENTS.items():
         there = [pair for pair in pairs if set(pair.split()) <= set(markers.names)]
-        scaled = [_element("BodyScale", _element("axes", "X Y Z"), name=body)
-                  for body in bodies.split()]  # fmt: skip
+        each = (f"<MarkerPair><markers>{pair}</markers></MarkerPair>" for pair in there)
+        scaled = (f'<BodyScale name="{body}"><axes>X Y Z</axes></BodyScale>'
+                  for body in bodies.split())  # fmt: skip
         if there:
-            each = [_element("MarkerPair", _element("markers", pair)) for pair in there]
-            parts = (_objects("MarkerPairSet", each), _objects("BodyScaleSet", scaled))
+            parts = _set("MarkerPairSet", each) + _set("BodyScaleSet", scaled)
             measurements.append(
-                _element("Measurement", _element("apply", "true"), *parts, name=what)
+                f'<Measurement name="{what}"><apply>true</apply>{parts}</Measurement>'
             )
-    period = _element("time_range", f"{span[0]:.6f} {span[1]:.6f}")
-    maker = (_element("model_file", MODEL), _element("marker_set_file", marker_file))
-    scaler = (
-        _element("apply", "true"),
-        _element("scaling_order", "measurements"),
-        _objects("MeasurementSet", measurements),
-        _element("marker_file", f"{name}.trc"),
-        period,
-        _element("preserve_mass_distribution", "true"),
-        _element("output_model_file", f"{name}.osim"),
-    )
-    placer = _element("MarkerPlacer", _element("apply", "false"))
-    return _element("ScaleTool", _element("GenericModelMaker", *maker),
-                    _element("ModelScaler", *scaler), placer, name=name)  # fmt: skip
+    return f"""<ScaleTool name="{name}">
+<GenericModelMaker><model_file>{MODEL}</model_file>
+<marker_set_file>{marker_file}</marker_set_file></GenericModelMaker>
+<ModelScaler><apply>true</apply><scaling_order>measurements</scaling_order>
+{_set("MeasurementSet", measurements)}
+<marker_file>{name}.trc</marker_file><time_range>{span}</time_range>
+<preserve_mass_distribution>true</preserve_mass_distribution>
+<output_model_file>{name}.osim</output_model_file></ModelScaler>
+<MarkerPlacer><apply>false</apply></MarkerPlacer></ScaleTool>"""
 
 
-def _ik_tool(name: str, markers: Markers, span: list[float]) -> ElementTree.Element:
+def _ik_tool(name: str, markers: Markers, span: str) -> str:
     """Inverse kinematics; the weight of a marker is its inverse variance, relative to the median
     marker.
     """
-    spread = np.nanmedian(np.where(markers.there, markers.sigma_m, np.nan)[markers.frames], axis=0)
-    weights = np.nan_to_num((np.nanmedian(spread) / spread) ** 2, nan=0.0).clip(0, 10)
-    tasks = [
-        _element("IKMarkerTask", _element("apply", str(weight > 0).lower()),
-                 _element("weight", f"{weight:.3f}"), name=marker)
+    sigma = np.where(markers.there & np.isfinite(markers.sigma_m), markers.sigma_m, np.inf)
+    spread = np.median(sigma[markers.frames], axis=0)
+    usual = np.median(spread[np.isfinite(spread)]) if np.isfinite(spread).any() else 1.0
+    ratio = usual / np.where(np.isfinite(spread), np.maximum(spread, 1e-6), usual)
+    weights = np.where(markers.there.any(axis=0), ratio**2, 0).clip(0, 10)
+    tasks = (
+        f"<IKMarkerTask name={quoteattr(marker)}><apply>{str(weight > 0).lower()}</apply>"
+        f"<weight>{weight:.3f}</weight></IKMarkerTask>"
         for marker, weight in zip(markers.names, weights.tolist(), strict=True)
-    ]  # fmt: skip
-    return _element(
-        "InverseKinematicsTool",
-        _element("model_file", f"{name}.osim"),
-        _objects("IKTaskSet", tasks),
-        _element("marker_file", f"{name}.trc"),
-        _element("time_range", f"{span[0]:.6f} {span[1]:.6f}"),
-        _element("report_errors", "true"),
-        _element("output_motion_file", f"{name}_ik.mot"),
-        name=name,
     )
+    return f"""<InverseKinematicsTool name="{name}"><model_file>{name}.osim</model_file>
+{_set("IKTaskSet", tasks)}
+<marker_file>{name}.trc</marker_file><time_range>{span}</time_range>
+<report_errors>true</report_errors><output_motion_file>{name}_ik.mot</output_motion_file>
+</InverseKinematicsTool>"""

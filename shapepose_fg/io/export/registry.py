@@ -10,6 +10,7 @@ from typing import Any, get_args
 
 import numpy as np
 
+from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.smpl_file import SmplArrays
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Axis
@@ -20,7 +21,7 @@ from shapepose_fg.core.run_summary import covered_frames
 from shapepose_fg.core.storage.files import write_content
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.export.take import Take
-from shapepose_fg.io.solved_setup import CAMERAS, body_of
+from shapepose_fg.io.solved_setup import CAMERAS, body_of, model_of
 
 
 class MarkerSet(StrEnum):
@@ -59,6 +60,11 @@ class Job:
     def arrays(self) -> SmplArrays:
         """The body model; InputError if its file is missing."""
         return body_of(self.take.people.run, self.body_file)
+
+    @cached_property
+    def model(self) -> BodyModel:
+        """The body model, with the detector's offsets; InputError if its file is missing."""
+        return model_of(self.take.people.run, self.body_file)
 
 
 @dataclass

@@ -2,6 +2,7 @@
 residuals.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import ModuleType
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import gammaincinv
 
+from shapepose_fg.body.model.rotation import quaternion
 from shapepose_fg.body.model.smpl_file import SmplArrays
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Axis, Camera, Rig
@@ -21,7 +23,8 @@ from shapepose_fg.core.drawing import bones_of, colour_of, thinned, vertex_norma
 from shapepose_fg.core.errors import optional
 from shapepose_fg.core.observation_table import Gate
 from shapepose_fg.core.reconstruction import Known, Reconstruction, sigma_m
-from shapepose_fg.io.export.skinned import motion_of, skin
+from shapepose_fg.core.skeleton import SMPL_24
+from shapepose_fg.io.export.skinned import BONES, motion_of, skin
 from shapepose_fg.io.export.take import Take
 from shapepose_fg.io.footage.footage import Footage
 from shapepose_fg.io.footage.placement import CameraFootage, Placement
@@ -33,8 +36,13 @@ _REGION = float(np.sqrt(2 * gammaincinv(1.5, 0.95)))
 _JOINT_M, _GUESSED_M, _BONE_M = 0.016, 0.010, 0.007
 _PALE = 0.6
 """Share of white in the colour of a joint that no view detected."""
-_CHUNK = 64
-"""Number of bodies that are posed in one batch."""
+Drawn = dict[int, dict[int, Array]]
+"""By person whose body is shown, and bone: rotations (M, 3, 3) of the bones nearby, relative to
+this one, for which its part was shaped."""
+_BEND_RAD = 0.35
+"""Bend of a joint, radians, after which the shapes of the parts nearby are logged again."""
+_NEAR = 0.1
+"""Minimum weight of a bone that shapes a part."""
 _GATES = {
     Gate.TOO_FAR: (213, 43, 43),
     Gate.CONTRADICTS_BODY: (214, 39, 190),
@@ -74,11 +82,12 @@ def log_take(stream: Any, take: Take, arrays: SmplArrays | None) -> None:
     if take.rig is not None:
         _log_moving(rr, stream, take, take.rig)
         _log_observations(rr, stream, take, take.rig)
+    drawn: Drawn = {}
     for person in range(len(take.persons)):
         _log_looks(rr, stream, int(take.persons[person]), skin_of)
         _log_person(rr, stream, take, person)
         if skin_of is not None:
-            _log_bodies(rr, stream, take, person, skin_of)
+            _log_bodies(rr, stream, take, person, skin_of, drawn)
     stream.reset_time()
 
 
@@ -89,7 +98,8 @@ class LiveLog:
 
     def __init__(self, stream: Any, rig: Rig, arrays: SmplArrays) -> None:
         self._rr, self._stream, self._rig = optional("rerun", "view"), stream, rig
-        self._skin, self._met, self._there = Skin.of(arrays), set[int](), set[int]()
+        self._skin, self._met = Skin.of(arrays), set[int]()
+        self._there, self._drawn = set[int](), Drawn()
         log_world(stream, rig.up, rig)
 
     def moment(self, rows: Reconstruction) -> None:
@@ -101,6 +111,7 @@ class LiveLog:
             for gone in (person_path(who), _sigma_path(who)):
                 self._stream.log(gone, self._rr.Clear(recursive=True))
         self._there = set(persons.tolist())
+        self._drawn = {who: parts for who, parts in self._drawn.items() if who in self._there}
         if len(rows) == 0:
             return
         places = np.arange(len(rows), dtype=np.intp)[:, None]
@@ -119,23 +130,32 @@ class LiveLog:
                 self._met.add(who)
                 _log_looks(self._rr, self._stream, who, self._skin)
             _log_person(self._rr, self._stream, take, person)
-            _log_bodies(self._rr, self._stream, take, person, self._skin)
+            _log_bodies(self._rr, self._stream, take, person, self._skin, self._drawn)
 
 
 @dataclass(frozen=True)
 class Skin:
-    """A body model, and the simplified surface that is drawn."""
+    """A body model, and the parts of its simplified surface that are drawn: one for each bone.
+
+    A part moves rigidly with its bone, so that most frames of a body are 24 poses instead of all
+    vertices. Neighbouring parts share triangles.
+    """
 
     arrays: SmplArrays
-    kept: Index
-    """Indices of the vertices that are drawn."""
-    faces: NDArray[np.int32]
-    """(F, 3) triangles between these."""
+    parts: tuple[tuple[Index, NDArray[np.int32]], ...]
+    """By bone: indices of its vertices, and triangles (F, 3) between these."""
 
     @classmethod
     def of(cls, arrays: SmplArrays) -> "Skin":
-        """Simplify the surface for a viewer."""
-        return cls(arrays, *thinned(arrays.template, arrays.faces)[:2])
+        """Simplify the surface for a viewer, and cut it at the bones."""
+        kept, faces, _ = thinned(arrays.template, arrays.faces)
+        parts = []
+        bone_of = arrays.weights[kept].argmax(axis=1)[faces]
+        for bone in range(BONES):
+            own = faces[(bone_of == bone).any(axis=1)]
+            vertices, triangles = np.unique(own, return_inverse=True)
+            parts.append((kept[vertices], triangles.reshape(-1, 3).astype(np.int32)))
+        return cls(arrays, tuple(parts))
 
 
 def log_world(stream: Any, up: Axis, rig: Rig | None) -> None:
@@ -145,6 +165,10 @@ def log_world(stream: Any, up: Axis, rig: Rig | None) -> None:
     stream.log("world", getattr(rr.ViewCoordinates, axes), static=True)
     if rig is not None:
         _log_cameras(rr, stream, rig)
+
+
+def _part_path(who: int, bone: int) -> str:
+    return f"{person_path(who)}/body/{SMPL_24[bone]}"
 
 
 def _sigma_path(who: int) -> str:
@@ -157,10 +181,10 @@ def _log_looks(rr: ModuleType, stream: Any, who: int, skin_of: Skin | None) -> N
     stream.log(
         _sigma_path(who), rr.SeriesLines(colors=colour[None], names=f"person {who}"), static=True
     )
-    if skin_of is not None:
-        shade = [*colour.tolist(), round(255 * 0.55)]
-        surface = rr.Mesh3D.from_fields(triangle_indices=skin_of.faces, albedo_factor=shade)
-        stream.log(f"{person_path(who)}/body", surface, static=True)
+    shade = [*colour.tolist(), round(255 * 0.55)]
+    for bone, (_, faces) in enumerate(() if skin_of is None else skin_of.parts):
+        surface = rr.Mesh3D.from_fields(triangle_indices=faces, albedo_factor=shade)
+        stream.log(_part_path(who, bone), surface, static=True)
 
 
 def _log_person(rr: ModuleType, stream: Any, take: Take, person: int) -> None:
@@ -217,32 +241,54 @@ def _ellipsoids(rr: ModuleType, centres: Array, covariance: Array, colour: Array
     )
 
 
-def _log_bodies(rr: ModuleType, stream: Any, take: Take, person: int, skin_of: Skin) -> None:
-    """Log the body of one person, in the frames that have one."""
-    path, arrays, faces = (
-        f"{person_path(int(take.persons[person]))}/body",
-        skin_of.arrays,
-        skin_of.faces,
-    )
+def _log_bodies(
+    rr: ModuleType, stream: Any, take: Take, person: int, skin_of: Skin, drawn: Drawn
+) -> None:
+    """Log the body of one person, in the frames that have one: the poses of the bones, and the
+    shape of a part when it appears, or when a joint has bent since.
+    """
+    who, arrays = int(take.persons[person]), skin_of.arrays
     motion = motion_of(take, person, arrays, np.eye(3))
     index = np.zeros(0, dtype=np.intp) if motion is None else motion.index
-    for at in np.setdiff1d(np.flatnonzero(take.rows[person] >= 0), index).tolist():
+    appears = np.diff(index, prepend=-1 if who in drawn else -2) > 1
+    gone = np.setdiff1d(np.r_[0, index + 1], index)
+    for at in gone[gone < len(take.frames)].tolist():
         _set_time(stream, take, at)
-        stream.log(path, rr.Clear(recursive=False))
+        stream.log(f"{person_path(who)}/body", rr.Clear(recursive=True))
+    shapes = drawn.pop(who, {})
     if motion is None:
         return
-    betas = take.column("betas", person)[index]
-    for start in range(0, len(index), _CHUNK):
-        part = slice(start, start + _CHUNK)
-        posed = motion.rotations[part], motion.pelvis[part]
-        vertices = skin(arrays, betas[part], *posed, skin_of.kept).astype(np.float32)
-        for place, at in enumerate(index[part].tolist()):
-            _set_time(stream, take, at)
-            normals = vertex_normals(vertices[place], faces).astype(np.float32)
-            stream.log(
-                path,
-                rr.Mesh3D.from_fields(vertex_positions=vertices[place], vertex_normals=normals),
-            )
+    if index[-1] == len(take.frames) - 1:
+        drawn[who] = shapes
+    times = [
+        rr.TimeColumn("frame", sequence=take.frames[index]),
+        rr.TimeColumn("time", duration=take.times_s[index]),
+    ]
+    turns, joints = motion.turns(), motion.joints()
+    for bone, (kept, faces) in enumerate(skin_of.parts):
+        path = _part_path(who, bone)
+        near = arrays.weights[kept].max(axis=0) > _NEAR
+        bends = turns[:, bone, None].mT @ turns[:, near]
+        for n, at in enumerate(index.tolist()):
+            alike = (bends[n] * shapes.get(bone, 0.0)).sum(axis=(1, 2))  # 1 + 2 cos of the bend
+            if appears[n] or alike.min() < 1 + 2 * math.cos(_BEND_RAD):
+                shapes[bone] = bends[n]
+                turn, way = motion.rotations[n, None], motion.pelvis[n, None]
+                vertices = skin(arrays, motion.rest.betas[None], turn, way, kept)[0]
+                vertices = (vertices - joints[n, bone]) @ turns[n, bone]
+                normals = vertex_normals(vertices, faces)
+                _set_time(stream, take, at)
+                stream.log(
+                    path,
+                    rr.Mesh3D.from_fields(vertex_positions=vertices, vertex_normals=normals),
+                )
+        place, turn = joints[:, bone], np.roll(quaternion(turns[:, bone]), -1, axis=-1)
+        if len(index) == 1:  # live: rerun collects single rows, but not columns
+            _set_time(stream, take, int(index[0]))
+            stream.log(path, rr.Transform3D.from_fields(translation=place[0], quaternion=turn[0]))
+        else:
+            poses = rr.Transform3D.columns(translation=place, quaternion=turn)
+            rr.send_columns(path, times, poses, recording=stream)
 
 
 def _log_moving(rr: ModuleType, stream: Any, take: Take, rig: Rig) -> None:

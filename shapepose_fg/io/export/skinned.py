@@ -86,6 +86,10 @@ class Motion:
         """(F, 24, 3) joint positions in the world, metres."""
         return pose_joints(self.rest.offsets[None], self.rotations, self.pelvis)
 
+    def turns(self) -> Array:
+        """(F, 24, 3, 3) rotation of each bone, world from bone."""
+        return _accumulated(self.rotations)
+
     def segments(self, longest_hole: int) -> Iterator["Motion"]:
         """Split the motion at gaps; gaps of up to `longest_hole` frames are interpolated.
 

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.biomechanics.joint_angles import joint_angles
-from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.core.arrays import Index
 from shapepose_fg.core.errors import optional
 from shapepose_fg.core.reconstruction import OpenedReconstruction
@@ -46,7 +45,7 @@ def csv_text(take: Take) -> str:
 def write_angles(job: Job) -> Written:
     """Write `angles.csv`: a line for each person and frame with a body."""
     take, written = job.take, Written()
-    angles = joint_angles(take.people, take.up, BodyModel(job.arrays))
+    angles = joint_angles(take.people, take.up, job.model)
     times = take.times_s[np.searchsorted(take.frames, take.people.frame)]
     columns = angles.columns() | {"time_s": times}
     order = np.lexsort((take.people.person, take.people.frame))

@@ -179,8 +179,8 @@ def humans(rows: Reconstruction) -> Iterator[Human]:
 
     hips = place(*_present(names, "MidHip", "RHip", "LHip"))
     turns = np.concatenate([rows.global_orient[:, None], rows.body_pose], axis=1)
-    known = np.isfinite(hips).all(axis=1) & np.isfinite(turns).all(axis=(1, 2))
-    smpl = exp_so3(np.where(known[:, None, None], turns, 0.0))
+    known = np.isfinite(np.concatenate([hips[:, None], turns], axis=1)).all(axis=(1, 2))
+    smpl = exp_so3(np.where(np.isfinite(turns), turns, 0.0))
     world_from_body = rigid(smpl[:, 0] @ _FRONT_LEFT_UP, hips)
     xyz = (xyz - hips[:, None]) @ world_from_body[:, :3, :3]
 
@@ -198,12 +198,15 @@ def humans(rows: Reconstruction) -> Iterator[Human]:
     }
     angles = {"waist": pitch} | _head_angles(torso.mT @ head)
     for limb in _LIMBS:
-        points = [place(name) for name in limb.joints]
+        start, middle, end = (place(name) for name in limb.joints)
         # SMPL's arms point to the sides at rest, those of this model hang.
         hang = exp_so3(np.array([limb.side * math.pi / 2 if limb.is_arm else 0.0, 0.0, 0.0]))
-        upper, bend = _hinged(*np.diff(points, axis=0), by_body(limb.smpl) @ hang, limb.is_arm)
+        own = by_body(limb.smpl) @ hang
+        upper, bend = _hinged(middle - start, end - middle, own, limb.is_arm)
         lower = upper @ exp_so3(np.nan_to_num(bend)[:, None] * _HINGE)
-        for name, turn, point in zip(limb.links, (upper, lower, lower), points, strict=True):
+        for name, turn, point in zip(
+            limb.links, (upper, lower, lower), (start, middle, end), strict=True
+        ):
             links[name] = rigid(turn, point)
         turned = torso.mT @ upper if limb.is_arm else upper
         mirrored = turned * np.outer((1, limb.side, 1), (1, limb.side, 1))

@@ -5,7 +5,6 @@ from typing import get_args
 
 import numpy as np
 
-from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.smpl_file import SmplArrays
 from shapepose_fg.core.camera import Axis, Rig
 from shapepose_fg.core.errors import InputError
@@ -15,7 +14,7 @@ from shapepose_fg.core.result_files import results_folder
 from shapepose_fg.core.storage.files import write_atomically
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.export.take import Take
-from shapepose_fg.io.solved_setup import CAMERAS, body_of
+from shapepose_fg.io.solved_setup import CAMERAS, body_of, model_of
 from shapepose_fg.tracking.listing import list_tracks
 from shapepose_fg.viz.report.facts import objects
 from shapepose_fg.viz.report.figures import Curve, angle_curves
@@ -74,7 +73,7 @@ def write_report(
     curves = dict[int, list[Curve]]()
     if arrays is not None and objects(people.run.get("configuration")).get("temporal", True):
         try:
-            curves = angle_curves(people, up, BodyModel(arrays))
+            curves = angle_curves(people, up, model_of(people.run, body))
         except InputError as error:
             remarks.append(f"joint angles are not drawn: {error}")
     text = page_text(title, people, list_tracks(people, arrays, every), scene, remarks, curves)

@@ -1,6 +1,7 @@
 """Joint angles as tables, and files for OpenSim."""
 
 import csv
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import numpy as np
@@ -87,3 +88,16 @@ def test_set_ups_of_scaling_and_inverse_kinematics(folder):
     weight = {each.get("name"): float(each.findtext("weight")) for each in ik.iter("IKMarkerTask")}
     assert weight["RKnee"] == pytest.approx(1) and weight["LWrist"] == pytest.approx(0.01)
     assert set(weight) <= markers
+
+
+def test_markers_without_covariances_have_equal_weights(folder, tmp_path):
+    people = Reconstruction.load(folder)
+    joints = np.array(people.joints)
+    joints[:, people.joint_names == "Nose"] = np.nan
+    unknown = replace(people, joints=joints, covariance=np.full_like(people.covariance, np.nan),
+                      known=np.zeros_like(people.known))  # fmt: skip
+    unknown.save(tmp_path, built_in_scene(people=2).rig)
+    export_result(tmp_path, [FORMATS["opensim"]], tmp_path)
+    ik = ElementTree.parse(tmp_path / "person_0_ik.xml").getroot()
+    weight = {each.get("name"): float(each.findtext("weight")) for each in ik.iter("IKMarkerTask")}
+    assert weight.pop("Nose") == 0 and set(weight.values()) == {1.0}

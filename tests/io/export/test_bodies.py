@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
@@ -13,6 +14,7 @@ from shapepose_fg.core.skeleton import SMPL_24
 from shapepose_fg.io.export.glb import influences, write_glb
 from shapepose_fg.io.export.motion_files import write_amass, write_bvh
 from shapepose_fg.io.export.registry import Job, read_take
+from shapepose_fg.io.export.rerun_app import write_rrd
 from shapepose_fg.io.export.skinned import motion_of
 from shapepose_fg.io.export.take import Take, y_up
 
@@ -357,3 +359,40 @@ def test_several_shapes_become_one_and_it_is_said_how_far_that_is_off(result, ar
         assert not any(
             "several shapes" in note for note in write(Job(Take.of(alone, "z"), tmp_path)).notes
         )
+
+
+# rerun
+
+
+def test_bodies_for_rerun_are_parts_that_stay_near_the_surface(job, true_bodies):
+    """Each part has been shaped before, and moved since; who is away has no shape."""
+    rerun = pytest.importorskip("rerun")
+    (path,) = write_rrd(job).files
+    shapes, poses, cleared = {}, {}, set()
+    for chunk in rerun.chunk.RrdReader(path).stream():
+        for row in chunk.to_record_batch().to_pylist():
+            place = chunk.entity_path
+            if row.get("Clear:is_recursive") and place == "/world/people/7/body":
+                cleared.add(row["frame"])
+            if row.get("Mesh3D:vertex_positions") is not None:
+                shapes.setdefault(place, {})[row["frame"]] = row["Mesh3D:vertex_positions"]
+            if row.get("Transform3D:quaternion") is not None:
+                turn, way = row["Transform3D:quaternion"], row["Transform3D:translation"]
+                poses.setdefault(place, {})[row["frame"]] = turn[0], way[0]
+    parts = [place for place in shapes if place.startswith("/world/people/7/body/")]
+    assert len(parts) == len(SMPL_24) and set(parts) <= poses.keys()
+    assert AWAY[0] in cleared and BARE in cleared
+    for frame in (FIRST, AWAY[0] - 1, AWAY[-1] + 1, BARE + 1, FIRST + FRAMES - 1):
+        _, surface = true_bodies(7, frame)
+        apart = []
+        for place in parts:
+            before = max(each for each in shapes[place] if each <= frame)
+            assert not any(before < each < frame for each in cleared)
+            turn, way = poses[place][frame]
+            points = Rotation.from_quat(turn).apply(np.array(shapes[place][before])) + way
+            apart.append(cKDTree(surface).query(points)[0])
+        assert np.quantile(np.concatenate(apart), 0.9) < 10 * MM
+        assert np.concatenate(apart).max() < 60 * MM
+    vertices = sum(len(next(iter(shapes[place].values()))) for place in parts)
+    logged = sum(len(each) for place in parts for each in shapes[place].values())
+    assert logged < 0.8 * vertices * (FRAMES - len(AWAY))

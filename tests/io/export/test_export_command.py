@@ -130,7 +130,7 @@ def test_a_recording_for_rerun_read_back(copied, result, capfd):
     assert {
         f"/world/people/{who}/{part}"
         for who in (3, 7)
-        for part in ("joints", "bones", "uncertainty", "body")
+        for part in ("joints", "bones", "uncertainty", "body/pelvis", "body/left_hand")
     } < paths
     assert {
         "/world/cameras/cam0",
@@ -183,7 +183,7 @@ def test_what_is_viewed_can_be_saved_instead(copied, tmp_path, capsys):
     assert run("view", copied, "--save", path) == 0
     assert capsys.readouterr().out == f"written  {path}\n"
     paths = {chunk.entity_path for chunk in rerun.chunk.RrdReader(path).stream()}
-    assert {"/world/people/3/joints", "/world/people/7/body", "/world/cameras/cam0"} < paths
+    assert {"/world/people/3/joints", "/world/people/7/body/head", "/world/cameras/cam0"} < paths
     assert (
         run("view", copied, "--save", path, "--connect", "rerun+http://localhost:9876/proxy") == 2
     )
