@@ -81,6 +81,7 @@ def solve_bodies(
     sigmas = np.where(evidence.inlier, sigmas / np.maximum(kept, 1e-9)[..., None], 0.0)
 
     # Bodies and joints together. Rows without a body keep what their views determine.
+    agreed = np.asarray(evidence.inlier.sum(axis=-1) >= 2)
     found = _Found.of_views(evidence, config.refine.max_sigma_m, start.status)
     people, spread = list[BodyGraph](), list[Marginals]()
     feet = feet_of(config.joints if config.motion.contact else ())
@@ -127,7 +128,9 @@ def solve_bodies(
         bodies = JointTargets(found.joints, inverses(found.fit.covariance + np.eye(3) * 1e-6))
         found.covariance[:] += carried_covariance(found.evidence, bodies, sigmas, views, gates)
     found.covariance[:] += mirrored_spread(found.joints, observations.mirrored, config.joints)
-    return found.solution(observations, enough, strong, people)
+    # Views that agreed on a joint, of which none is used: they contradict the body.
+    against = agreed & ~found.evidence.inlier.any(axis=-1)
+    return found.solution(observations, enough, strong, against, people)
 
 
 @dataclass(frozen=True)
@@ -166,7 +169,12 @@ class _Found:
         fit.status[rows] = FitStatus.OK
 
     def solution(
-        self, rows: Observations, enough: Mask, strong: Mask, people: Sequence[BodyGraph]
+        self,
+        rows: Observations,
+        enough: Mask,
+        strong: Mask,
+        against: Mask,
+        people: Sequence[BodyGraph],
     ) -> WindowSolution:
         """The solution, with codes and statuses."""
         inlier = self.evidence.inlier
@@ -197,7 +205,7 @@ class _Found:
             velocity_covariance=self.velocity_covariance,
             confidence=mean_confidence(rows, inlier),
             inlier=inlier,
-            contradicts=np.zeros(known.shape, dtype=bool),
+            contradicts=against,
             residual_px=self.evidence.residual_px,
             known=known.astype(np.uint8),
             fit=self.fit,

@@ -1,7 +1,7 @@
 """Solves people whose bodies are in the graph together with the factors that users add to them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -16,8 +16,9 @@ from shapepose_fg.estimation.user_factors import CoupledGraph
 
 RUNAWAY_M = 1.0
 """Distance of a joint with a user factor from its solution without at which it has diverged, m."""
-_ROUNDS = 6
-"""Maximum number of linearisations of the bodies; detections are gated anew in each."""
+_ROUNDS, _STEPS = 8, 4
+"""Maximum number of linearisations of the bodies, and of GTSAM's steps around each; detections are
+gated anew in each."""
 _SETTLED_M = 5e-4
 """Mean motion of joints at which a solution has converged, m."""
 
@@ -52,6 +53,7 @@ def solve_with_factors(
 def _solved(
     people: list[BodyGraph], ties: CoupledGraph, config: WindowGraphConfig
 ) -> list[FactorSolution]:
+    few = replace(config, max_iterations=min(config.max_iterations, _STEPS))
     before = [(each.state, each.window.last) for each in people]
     try:
         for _ in range(_ROUNDS):
@@ -59,7 +61,7 @@ def _solved(
             if len(ties.active) == 0:
                 return []
             order = ordering(people, values)
-            values = descend(graph, values, order, config, over_time=people[0].temporal)
+            values = descend(graph, values, order, few, over_time=people[0].temporal)
             moved = [each.take(values) for each in people]
             _keep_own(ties, values)
             for each in people:
