@@ -54,7 +54,8 @@ _UNUSUAL = 3.0
 KNOWN_LENS = Freedom()
 """Lenses that are not adjusted."""
 _FILM = (
-    "film two or more people for a minute who walk through all views, near and far, not on one line"
+    "film people for a minute who walk through all views, near and far, not on one line, and move "
+    "their arms"
 )
 
 

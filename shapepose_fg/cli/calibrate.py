@@ -331,7 +331,7 @@ def _world(found: "Calibrated", stature: float | None, distances: list[str]) -> 
         f"{2e3 * move:.0f} mm and all lengths to {200 * world.sigma_scale:.1f} % (two sigma, worst "
         "camera)"
     )
-    better = "; a distance measured between two cameras, --distance, gives lengths to 1 %"
+    better = "; a distance measured between two cameras, --distance, gives lengths to about 1 %"
     return [
         f"scale: {whose}: ± {100 * world.sigma_scale:.1f} %, one sigma",
         f"up: z, {level}; the floor is at 0",

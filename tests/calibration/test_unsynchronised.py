@@ -68,9 +68,13 @@ def test_the_command_finds_poses_and_times_from_people_alone(
     steps = list[tuple[int, int]]()
 
     def watched(*given):
-        return calibrate_unsynchronised(
-            *given[:-1], lambda *each: (steps.append(each), given[-1](*each))
-        )
+        *others, progress = given
+
+        def told(done: int, total: int) -> None:
+            steps.append((done, total))
+            progress(done, total)
+
+        return calibrate_unsynchronised(*others, progress=told)
 
     monkeypatch.setattr(unsynchronised, "calibrate_unsynchronised", watched)
     write_rig(rig, tmp_path / "lenses.json")
