@@ -313,7 +313,8 @@ class BodyWindow:
         ratio = (np.nan_to_num(evidence.residual_px) ** 2).sum(axis=-1) / sigma**2
         ahead = self.views.cTw[..., 2, :]
         depth = evidence.points @ ahead[..., :3].mT + ahead[..., None, :, 3]
-        gate = (self.config.rho_2d_m * self.views.focal / np.maximum(depth, 0.2) / sigma) ** 2
+        focal = self.views.focal[:, None]
+        gate = (self.config.rho_2d_m * focal / np.maximum(depth, 0.2) / sigma) ** 2
         squared = np.where(evidence.inlier, np.minimum(ratio, gate), gate)
         if self._kernel == "cauchy":
             c2 = DEFAULT_WIDTH_SIGMA["cauchy"] ** 2

@@ -290,9 +290,9 @@ def test_extending(tmp_path, monkeypatch):
     assert names["together"].run["extra_factors"] == {"carry_a_board": {"made": 6, "inactive": 0}}
     # Over time: standing feet hardly move, and those that step are where they were.
     before = np.quantile(steps(names["loose"], names["FEET"]), [0.2, 0.9])
-    for each in ("standing", "people"):
+    for each, less in (("standing", 0.5), ("people", 0.8)):
         after = np.quantile(steps(names[each], names["FEET"]), [0.2, 0.9])
-        assert after[0] < 0.5 * before[0] and after[1] > 0.9 * before[1]
+        assert after[0] < less * before[0] and after[1] > 0.8 * before[1]
         assert (
             joint_metrics(names[each], truth).mpjpe_mm
             < 1.05 * joint_metrics(names["loose"], truth).mpjpe_mm
