@@ -7,6 +7,7 @@ cameras look along +z, x right, y down.
 """
 
 from factors.body_prior import body_prior_factor, body_prior_factors
+from factors.body_shape import shape_factors
 from factors.contact import standing_factors
 from factors.graph_files import draw_graph, load_graph, save_graph
 from factors.joining import Increment, PeopleInGraph, PosedCamera, Sighting, reported_factor
@@ -14,6 +15,7 @@ from factors.key_space import KeySpace
 from factors.keys import (
     CameraKey,
     JointKey,
+    body_keys,
     camera_key,
     camera_keys,
     format_key,
@@ -22,6 +24,7 @@ from factors.keys import (
     offset_key,
     offset_keys,
     reported_keys,
+    shape_key,
     split_camera_key,
     split_key,
     state_keys,
@@ -92,6 +95,7 @@ __all__ = [
     "Sighting",
     "assert_jacobian",
     "assert_zero_at_truth",
+    "body_keys",
     "body_prior_factor",
     "body_prior_factors",
     "camera_key",
@@ -134,6 +138,8 @@ __all__ = [
     "robust",
     "robust_kernel",
     "save_graph",
+    "shape_factors",
+    "shape_key",
     "sigma_px",
     "split_camera_key",
     "split_key",

@@ -169,11 +169,13 @@ _KINDS = {
     )
 }
 _LINEAR = "linear"
-"""Kind of a `LinearContainerFactor` on points. `data` are A and b of |A x - b|², for any number of
-keys and rows."""
+"""Kind of a `LinearContainerFactor` on points and vectors. `data` are A and b of |A x - b|², for
+any number of keys and rows; `sizes` are those of the variables where they are not all points."""
+_LARGEST_VECTOR = 1000
 _VALUES: dict[str, tuple[tuple[int, ...], Callable[[gtsam.Values, int, Array], None]]] = {
     "point": ((3,), lambda values, key, x: values.insert(key, x)),
     "pose": ((4, 4), lambda values, key, T: values.insert(key, _pose(T))),
+    "vector": ((-1,), lambda values, key, x: values.insert(key, x)),
 }
 
 
@@ -201,7 +203,7 @@ class _Writer:
                 )
             found: dict[str, Any] = {"kind": name, "keys": list(factor.keys())}
             if name == _LINEAR:
-                return found | _linear_data(factor)
+                return found | _linear_data(factor, self._values)
             found["data"] = [each.tolist() for each in self._data(name, factor)]
             if name != "motion":
                 found |= _noise_data(factor.noiseModel())
@@ -219,16 +221,20 @@ class _Writer:
         """All variables, grouped by type."""
         found: dict[str, list[Any]] = {name: [] for name in _VALUES}
         for key in self._values.keys():  # noqa: SIM118
-            for name, get in (("point", self._values.atPoint3), ("pose", self._values.atPose3)):
+            for name, get in (
+                ("point", self._values.atPoint3),
+                ("pose", self._values.atPose3),
+                ("vector", self._values.atVector),
+            ):
                 try:
                     value: Any = get(key)
                 except RuntimeError:
                     continue
-                found[name].append([key, (value if name == "point" else value.matrix()).tolist()])
+                found[name].append([key, (value.matrix() if name == "pose" else value).tolist()])
                 break
             else:
                 raise ValueError(
-                    f"variable {format_key(key)} is neither Point3 nor Pose3: leave it out"
+                    f"variable {format_key(key)} is no Point3, Pose3 or vector: leave it out"
                 )
         return found
 
@@ -306,20 +312,24 @@ def _kernel_data(kernel: Any) -> list[Any]:
     raise ValueError(f"a kernel must be one of {', '.join(ESTIMATORS)}")
 
 
-def _linear_data(factor: gtsam.LinearContainerFactor) -> dict[str, Any]:
-    """Data of a linear factor on points, whitened. It is linearised at zero: the result is the same
-    at any point.
+def _linear_data(factor: gtsam.LinearContainerFactor, values: gtsam.Values) -> dict[str, Any]:
+    """Data of a linear factor on points and vectors, whitened. It is linearised at zero: the result
+    is the same at any point.
     """
-    origin, keys = gtsam.Values(), factor.keys()
+    origin, keys, sizes = gtsam.Values(), factor.keys(), list[int]()
     for key in keys:
-        origin.insert(key, np.zeros(3))
+        try:
+            sizes.append(len(values.atVector(key)))
+        except RuntimeError:  # a point, or what is refused below
+            sizes.append(3)
+        origin.insert(key, np.zeros(sizes[-1]))
     linear = factor.linearize(origin) if factor.isJacobian() else None
     A, b = (
         linear.jacobian()
         if isinstance(linear, gtsam.JacobianFactor)
         else (np.zeros((0, 0)), np.zeros(0))
     )
-    if A.shape[1] != 3 * len(keys):
+    if A.shape[1] != sum(sizes):
         raise ValueError(
             "a linear factor must be a Jacobian on points, because rotations change its point of "
             "linearisation"
@@ -329,14 +339,16 @@ def _linear_data(factor: gtsam.LinearContainerFactor) -> dict[str, Any]:
         raise ValueError(
             "has no point of linearisation, and so no error: create it with factors.linear_factor"
         )
-    return {"data": [A.tolist(), b.tolist()]}
+    found: dict[str, Any] = {"data": [A.tolist(), b.tolist()]}
+    return found if set(sizes) <= {3} else found | {"sizes": sizes}
 
 
 def _factor(record: Any) -> gtsam.NonlinearFactor:
     """Make a factor from its record; ValueError, KeyError or TypeError if the record is invalid."""
     kind, keys = _KINDS.get(record["kind"]), [_key(key) for key in record["keys"]]
     if record["kind"] == _LINEAR:
-        return _linear(keys, *record["data"])
+        A, b = record["data"]
+        return _linear(keys, A, b, record.get("sizes", [3] * len(keys)))
     if kind is None:
         raise ValueError(
             f"kind must be one of {', '.join(_KINDS)}, {_LINEAR}, got {str(record['kind'])[:40]!r}"
@@ -364,11 +376,15 @@ def _factor(record: Any) -> gtsam.NonlinearFactor:
     return kind.make(keys, *arrays, noise)
 
 
-def _linear(keys: list[int], A: Any, b: Any) -> gtsam.NonlinearFactor:
+def _linear(keys: list[int], A: Any, b: Any, sizes: Any) -> gtsam.NonlinearFactor:
     rows = len(b)
     if not (rows and keys) or len(set(keys)) < len(keys):
         raise ValueError("needs rows, and keys that differ")
-    blocks = np.split(_array(A, (rows, 3 * len(keys))), len(keys), axis=1)
+    if len(sizes) != len(keys) or not all(
+        type(each) is int and 0 < each <= _LARGEST_VECTOR for each in sizes
+    ):
+        raise ValueError(f"sizes must be one of 1 to {_LARGEST_VECTOR} for each key")
+    blocks = np.split(_array(A, (rows, sum(sizes))), np.cumsum(sizes)[:-1], axis=1)
     return linear_factor(keys, blocks, _array(b, (rows,)))
 
 
@@ -380,6 +396,8 @@ def _key(number: Any) -> int:
 
 def _array(numbers: Any, shape: tuple[int, ...]) -> Array:
     found = np.array(numbers, dtype=np.float64)
+    if shape == (-1,):
+        shape = (min(found.size, _LARGEST_VECTOR),)
     if found.shape != shape or not (np.abs(found) <= _LARGEST).all():
         raise ValueError(f"numbers must be finite and of the shape {shape}, got {found.shape}")
     return found

@@ -26,11 +26,11 @@ MAX_JOINT = 999
 MAX_FRAME = 99_999_999
 """Largest frame number in a key: 19 days at 60 frames a second."""
 
-_JOINT, _VELOCITY, _CAMERA, _OFFSET, _REPORTED, _ACCELERATION = 1, 2, 3, 4, 7, 8
+_JOINT, _VELOCITY, _CAMERA, _OFFSET, _REPORTED, _ACCELERATION, _BODY = 1, 2, 3, 4, 7, 8, 9
 _STATE = (_JOINT, _VELOCITY, _ACCELERATION)
 _SOURCES = 3
 _NAMES = {_JOINT: "position", _VELOCITY: "velocity", _ACCELERATION: "acceleration"}
-_NAMES |= {_CAMERA: "camera", _REPORTED: "reported position"}
+_NAMES |= {_CAMERA: "camera", _REPORTED: "reported position", _BODY: "body"}
 _NAMES |= {_OFFSET + source: f"offset {source}" for source in range(_SOURCES)}
 _PER_JOINT = MAX_FRAME + 1
 _PER_PERSON = (MAX_JOINT + 1) * _PER_JOINT
@@ -113,6 +113,16 @@ def reported_keys(person: int, joints: ArrayLike, frames: ArrayLike = 0) -> NDAr
     `frames` broadcast against each other.
     """
     return _pack(_REPORTED, person, joints, frames)
+
+
+def body_keys(person: int, frames: ArrayLike) -> NDArray[np.int64]:
+    """Keys of a person's body pose in each of some `frames`: a vector of root, angles, place."""
+    return _pack(_BODY, person, 0, frames)
+
+
+def shape_key(person: int) -> int:
+    """Key of a person's body shape: a vector (10,), the betas."""
+    return int(_pack(_BODY, person, 1, 0))
 
 
 def split_key(key: int) -> JointKey:

@@ -16,12 +16,13 @@ def linear_factor(
 ) -> gtsam.LinearContainerFactor:
     """Linear factor on K variables: r = sum_k A_k x_k - z  ~  N(0, diag(sigma²)).
 
-    `keys` (K,) are distinct keys of `Point3` variables, such as positions and velocities of joints.
-    `matrices` are the K matrices A_k, (M, 3) each; a number stands for that number times the
-    identity. `measured` (M,) is z, or one number for all rows; `sigma` (M,), or one number, is in
-    the residual's unit. GTSAM's own JacobianFactor takes at most three variables from Python. In a
-    nonlinear graph, the error of a linear factor without a linearisation point is always 0; this
-    function sets one. ValueError if shapes do not fit or a value is not finite.
+    `keys` (K,) are distinct keys of `Point3` variables, such as positions and velocities of joints,
+    or of vectors, such as bodies. `matrices` are the K matrices A_k, (M, 3) each, or as wide as the
+    vector; a number stands for that number times the identity of a point. `measured` (M,) is z, or
+    one number for all rows; `sigma` (M,), or one number, is in the residual's unit. GTSAM's own
+    JacobianFactor takes at most three variables from Python. In a nonlinear graph, the error of a
+    linear factor without a linearisation point is always 0; this function sets one. ValueError if
+    shapes do not fit or a value is not finite.
     """
     names = np.atleast_1d(np.asarray(keys)).tolist()
     if len(names) == 0 or len(set(names)) < len(names):
@@ -30,7 +31,7 @@ def linear_factor(
         raise ValueError(f"matrices must be one for each of {len(names)} keys, got {len(matrices)}")
     blocks = [_block(each) for each in matrices]
     rows = len(blocks[0])
-    if any(block.shape != (rows, 3) for block in blocks):
+    if any(block.ndim != 2 or len(block) != rows for block in blocks):
         raise ValueError(
             f"matrices must be (M, 3), all of as many rows, got {[block.shape for block in blocks]}"
         )
@@ -48,8 +49,8 @@ def linear_factor(
     # The only constructor in GTSAM's Python interface that takes any number of variables.
     linear = gtsam.JacobianFactor(gtsam.GaussianConditional(terms, 1, z / deviation, unit))
     origin = gtsam.Values()
-    for key in names:
-        origin.insert(key, np.zeros(3))
+    for key, block in zip(names, blocks, strict=True):
+        origin.insert(key, np.zeros(block.shape[1]))
     return gtsam.LinearContainerFactor(linear, origin)
 
 

@@ -128,7 +128,7 @@ class JointAngles:
     @property
     def sigma(self) -> Array:
         """(N, A) standard deviations, degrees."""
-        return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
+        return np.sqrt(np.maximum(np.diagonal(self.covariance, axis1=1, axis2=2), 0.0))
 
     def columns(self) -> dict[str, NDArray[Any]]:
         """Frame, time and person of each row, then `right_knee_flexion_deg`,

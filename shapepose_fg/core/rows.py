@@ -32,7 +32,10 @@ class Rows:
     def put(self, index: Any, other: Self) -> None:
         """Overwrite the rows `index` (R,) by the rows of `other`."""
         for name, values in self._columns().items():
-            values[index] = getattr(other, name)
+            if isinstance(values, Rows):
+                values.put(index, getattr(other, name))
+            else:
+                values[index] = getattr(other, name)
 
     def with_rows(self, index: Any, other: Self) -> Self:
         """Return a copy in which the rows `index` (R,) are those of `other`."""

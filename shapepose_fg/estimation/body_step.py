@@ -45,39 +45,19 @@ class BodyStep:
         """Fit bodies (R) again where targets differ from `told`, those of the `last` fit; also
         returns these rows.
         """
-        near_m = _SAME * self.config.refine.settled_m
-        over_time = np.concatenate(
-            [np.full(len(person), person.temporal) for person in self.people]
-        )
-        rows = np.arange(len(targets))
+        near_m, rows = _SAME * self.config.refine.settled_m, np.arange(len(targets))
         if near_m > 0:
-            rows = np.union1d(
-                changed_targets(told, targets, near_m, _AS_MUCH),
-                np.flatnonzero(over_time | ~last.ok),
-            )
+            changed = changed_targets(told, targets, near_m, _AS_MUCH)
+            rows = np.union1d(changed, np.flatnonzero(~last.ok))
         return last.with_rows(rows, self.fit(targets, last, rows)) if len(rows) > 0 else last, rows
 
     def fit(self, targets: JointTargets, last: BodyFit, rows: Index | None = None) -> BodyFit:
-        """Fit the bodies of some `rows` (K,) or all, starting at the `last` ones (R).
-
-        The shape of a group is then estimated from those of its rows in `rows`, and may differ from
-        that of its other rows. Reported accuracies over time include this; single frames are groups
-        of their own.
-        """
-        lengths = [len(person) for person in self.people]
-        groups = (
-            np.repeat(np.arange(len(lengths)), lengths) if max(lengths, default=1) > 1 else None
-        )
+        """Fit the bodies of some `rows` (K,) or all, starting at the `last` ones (R)."""
         if rows is not None:
-            targets = targets.rows(rows)
-            last, groups = last.rows(rows), None if groups is None else groups[rows]
+            targets, last = targets.rows(rows), last.rows(rows)
         if self.config.refine.body_from_views:
-            return self.fitter.fit(targets, last, groups)
-        fit = (
-            self.fitter.fit_whole(targets, last)
-            if groups is None
-            else self.fitter.fit(targets, last, groups)
-        )
+            return self.fitter.fit(targets, last)
+        fit = self.fitter.fit_whole(targets, last)
         return replace(
             fit,
             prior_xyz=fit.joints,
@@ -91,8 +71,7 @@ class BodyStep:
         tied = {each for person in self.people for each in person.coupled}
         for joints in sorted(tied, key=sorted) if self.config.refine.body_from_views else ():
             # Coupled joints would get each other's views twice: by the coupling, and by the body.
-            ties = [np.full(len(person), joints in person.coupled) for person in self.people]
-            rows = np.flatnonzero(np.concatenate(ties))
+            rows = np.flatnonzero([joints in person.coupled for person in self.people])
             columns = np.array(sorted(joints))
             information = targets.information.copy()
             information[:, columns] = 0.0

@@ -3,14 +3,13 @@ step.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
-from shapepose_fg.core.arrays import Array, Index, Mask
+from shapepose_fg.body.fitting.fitter import JointTargets
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.decompositions import principal_axes
-from shapepose_fg.estimation.in_time import near_in_time
-from shapepose_fg.estimation.joint_chains import Problem
+from shapepose_fg.estimation.linearisation import inverses
 
 FEET = ("Ankle", "Heel", "BigToe", "SmallToe")
 """Joints that may stand, independently on either side: toes stand while the heel rises."""
@@ -33,6 +32,9 @@ correlated for longer, but their covariances are too wide. Among 0.03, 0.05 and 
 least error over all speeds in simulated recordings of 4 and 6 cameras (crowd 777, salsa 31)."""
 UNSEEN_S = 0.5
 """Time before and after a joint is seen for which its speed is taken from the body, seconds."""
+ALIKE_S = 0.25
+"""Frames within this time count as one look of the views at a standing foot, seconds: detectors'
+errors last."""
 FREE_M2_S = 0.02
 """Density above which a step is unconstrained: at 30 frames a second it corresponds to 2.6 cm,
 where the motion model is stronger."""
@@ -43,28 +45,6 @@ def feet_of(joints: Sequence[str]) -> Index:
     return np.array(
         [n for n, name in enumerate(joints) if name[:1] in "RL" and name[1:] in FEET], dtype=np.intp
     )
-
-
-def walking(problem: Problem, feet: Index, initial: Array, lost: Mask | None) -> Problem:
-    """Return the problem with constraints on standing `feet` (F,); arguments are those of
-    `WindowGraph.solve`.
-
-    The feet are first solved independently, without these constraints.
-    """
-    standing = problem.standing.copy()
-    for chains in problem.chains(feet.tolist()):
-        joints, states, at = chains.joints, chains.solved(initial), initial.copy()
-        at[:, joints], velocity = states[..., :3].swapaxes(0, 1), states[..., 3:6].swapaxes(0, 1)
-        if lost is not None:
-            # A standing guess of the body is not evidence, except for a short time.
-            velocity = np.where(
-                near_in_time(~lost[:, joints], problem.times_s, UNSEEN_S)[..., None],
-                velocity,
-                np.nan,
-            )
-        density = standing_density(velocity, chains.covariances(at)[1], problem.times_s)
-        standing[:, joints] = np.where(density > FREE_M2_S, np.inf, density)
-    return replace(problem, standing=standing)
 
 
 def standing_density(velocity: Array, covariance: Array, times_s: Array) -> Array:
@@ -82,6 +62,34 @@ def standing_density(velocity: Array, covariance: Array, times_s: Array) -> Arra
     probability = smoothed(np.where(known[..., None], log, 0.0), times_s)
     density = probability @ (2 * SPEEDS_M_S**2 * CORRELATION_S)
     return (density[1:] + density[:-1]) / 2
+
+
+def held_in_place(targets: JointTargets, density: Array, times_s: Array) -> tuple[Array, Array]:
+    """Constraint on F joints in T frames from where the views have them in the other frames of the
+    same stance: information (T, F, 3, 3), 1/m², and information times position (T, F, 3), 1/m.
+
+    `targets` (T, F) are what the views say of joints in each frame. Between frames a joint is a
+    random walk of `density` (T - 1, F), m²/s, free where infinite. As errors of detectors last, a
+    frame counts as its share of `ALIKE_S`.
+    """
+    share = np.minimum(np.gradient(times_s) / ALIKE_S, 1.0)
+    L = targets.information * share[:, None, None, None]
+    eta = (L @ np.nan_to_num(targets.xyz)[..., None])[..., 0]
+    q = density * np.diff(times_s)[:, None]
+    found, pull = np.zeros_like(L), np.zeros_like(eta)
+    for rows, steps in ((range(1, len(L)), -1), (range(len(L) - 2, -1, -1), 1)):
+        message, force = np.zeros_like(L[0]), np.zeros_like(eta[0])
+        for t in rows:
+            walk = q[min(t, t + steps)]
+            free = ~np.isfinite(walk)
+            walk = np.where(free, 0.0, walk)[:, None, None]
+            message, force = message + L[t + steps], force + eta[t + steps]
+            kept = inverses(np.eye(3) + walk * message)
+            message, force = message @ kept, (kept.mT @ force[..., None])[..., 0]
+            message[free], force[free] = 0.0, 0.0
+            found[t] += (message + message.mT) / 2
+            pull[t] += force
+    return found, pull
 
 
 def log_densities(velocity: Array, covariance: Array) -> Array:

@@ -48,10 +48,6 @@ class RefineConfig(Settings):
 
     alternations: Repeats = 3
     """N of Algorithm 1: maximum number of body fits and joint solutions."""
-    window_alternations: Repeats = 1
-    """N of Algorithm 1 for windows of several frames, which start from initial estimates of all
-    joints (`draft`). Windows with user factors alternate as often as single frames, because these
-    factors may move joints far from the views' estimates."""
     settled_m: MetresOrNone = 0.002
     """Maximum motion of joints per round in a converged window, m: most frames take one or two
     rounds. 0: never."""
@@ -69,6 +65,10 @@ class RefineConfig(Settings):
     a joint is from a fit without that joint's own views. In Algorithm 1 it is fitted to X_n, and
     its joints are the prior."""
 
+    with_body: bool = True
+    """Whether joints and bodies of a window of several frames are one problem
+    (`body_window.BodyWindow`)."""
+
     @classmethod
     def paper(cls) -> "RefineConfig":
         """Algorithm 1 as written, with N = 10."""
@@ -78,6 +78,7 @@ class RefineConfig(Settings):
             disagreement=0.0,
             complete_start=False,
             body_from_views=False,
+            with_body=False,
         )
 
     @property

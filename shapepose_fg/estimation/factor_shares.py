@@ -7,7 +7,7 @@ import numpy as np
 
 from factors import split_key
 from shapepose_fg.core.arrays import Array
-from shapepose_fg.estimation.window_graph import UserFactor, WindowGraph
+from shapepose_fg.estimation.user_factors import PersonWindow, UserFactor
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class FactorEvidence:
     variables without this factor."""
 
 
-def factor_evidence(window: WindowGraph, t: int, joint: int) -> list[FactorEvidence]:
+def factor_evidence(window: PersonWindow, t: int, joint: int) -> list[FactorEvidence]:
     """Information on the position of a joint in row `t` of a solved window, from the user factors
     on it.
 
@@ -53,7 +53,7 @@ def factor_evidence(window: WindowGraph, t: int, joint: int) -> list[FactorEvide
 
 
 def _evidence(
-    factor: UserFactor, key: int, window: WindowGraph, marginals: gtsam.Marginals
+    factor: UserFactor, key: int, window: PersonWindow, marginals: gtsam.Marginals
 ) -> FactorEvidence:
     linear = factor.factor.linearize(window.values)
     keys = list(linear.keys())

@@ -6,8 +6,8 @@ import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index, Mask
 
-SPEED_S = 0.1
-"""Time before and after a frame for estimating a velocity, s."""
+SPEED_S = 0.05
+"""Time before and after a frame for estimating a velocity, s; at least one frame."""
 _AROUND_S = 0.3
 """Time before and after a step over which motion is a median, s; errors for a quarter of it have no
 effect."""
@@ -75,10 +75,19 @@ def velocities(points: Array, times_s: Array) -> Array:
     """(T, J, 3) velocities of points (T, J, 3), m/s, over `SPEED_S` before and after; NaN for a
     single frame.
     """
-    first = np.searchsorted(times_s, times_s - SPEED_S, side="left")
-    last = np.searchsorted(times_s, times_s + SPEED_S, side="right") - 1
-    lasts = np.where(last > first, times_s[last] - times_s[first], np.nan)
+    first, last, lasts = moments(times_s)
     return (points[last] - points[first]) / lasts[:, None, None]
+
+
+def moments(times_s: Array) -> tuple[Index, Index, Array]:
+    """(T,) first and last frame from which a frame's velocity is computed, and the time between
+    them, seconds; NaN for a single frame.
+    """
+    at, end = np.arange(len(times_s)), len(times_s) - 1
+    first = np.searchsorted(times_s, times_s - SPEED_S - 1e-9, side="left")
+    last = np.searchsorted(times_s, times_s + SPEED_S + 1e-9, side="right") - 1
+    first, last = np.clip(first, 0, at - 1).clip(0), np.clip(last, at + 1, None).clip(None, end)
+    return first, last, np.where(last > first, times_s[last] - times_s[first], np.nan)
 
 
 def near_in_time(marked: Mask, times_s: Array, within_s: float) -> Mask:
@@ -87,11 +96,6 @@ def near_in_time(marked: Mask, times_s: Array, within_s: float) -> Mask:
     last = np.searchsorted(times_s, times_s + within_s, side="right")
     count = np.concatenate([np.zeros((1, marked.shape[1]), dtype=int), np.cumsum(marked, axis=0)])
     return count[last] > count[first]
-
-
-def spanned(marked: Mask) -> Mask:
-    """(T, J) frames from the first to the last that is `marked` (T, J), inclusive."""
-    return np.maximum.accumulate(marked, axis=0) & np.maximum.accumulate(marked[::-1], axis=0)[::-1]
 
 
 def waited_s(seen: Mask, times_s: Array) -> Array:
@@ -111,19 +115,6 @@ def carried(values: Array, seen: Mask, times_s: Array) -> Array:
         frames = np.flatnonzero(seen[:, joint])
         nearest = frames[np.abs(times_s[:, None] - times_s[frames]).argmin(axis=1)]
         result[:, joint] = values[nearest, joint]
-    return result
-
-
-def interpolated(points: Array, times_s: Array) -> Array:
-    """Points (T, J, 3) with linearly interpolated gaps and constant ends; joints that are never
-    known stay NaN.
-    """
-    known = np.asarray(np.isfinite(points).all(axis=2))
-    result = points.copy()
-    for joint in np.flatnonzero(known.any(axis=0) & ~known.all(axis=0)).tolist():
-        there = known[:, joint]
-        for axis in range(3):
-            result[:, joint, axis] = np.interp(times_s, times_s[there], points[there, joint, axis])
     return result
 
 

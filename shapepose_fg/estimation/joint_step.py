@@ -1,23 +1,26 @@
-"""The X step: solves people's joints, given the views and the body."""
+"""The X step in single frames: solves people's joints, given the views and the body."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
+from factors import DEFAULT_WIDTH_SIGMA
 from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Views
+from shapepose_fg.core.kernel_geometry import ROBUST
 from shapepose_fg.core.observations import Observations
-from shapepose_fg.estimation.contact import feet_of
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
-from shapepose_fg.estimation.in_time import interpolated
-from shapepose_fg.estimation.joint_chains import Projections, solved_apart
+from shapepose_fg.estimation.kernels import ready, solve_chains
 from shapepose_fg.estimation.linearisation import ViewEvidence
-from shapepose_fg.estimation.motion_model import LOST_M
 from shapepose_fg.estimation.window_graph import WindowGraph
 
+UNDETERMINED_M = 10.0
+"""Standard deviation, metres, above which a joint is undetermined, in its worst direction."""
 _SIGMA_M = 0.02
 """Usual standard deviation of a joint seen by several views, metres."""
+_HELD = 1e-6
+"""Information of the prior that keeps joints in place, 1/m²: one kilometre."""
 
 
 def solve_between(
@@ -29,20 +32,40 @@ def solve_between(
     config: EstimatorConfig,
 ) -> Array:
     """X (R, J, 3) of people in single frames, metres, without a graph, for the rounds before the
-    last.
+    last; NaN where neither views nor body place a joint.
 
-    The result is about that of GTSAM, which starts from it in the last round.
-    """  # fmt: skip
+    The result is about that of GTSAM, which starts from it in the last round. A joint that moves by
+    more than `UNDETERMINED_M` keeps its initial position.
+    """
     initial = _start(evidence.points, evidence.sigma_m, of_body, config)
-    scale = 1.0 / np.sqrt(config.graph.weight_2d)  # as in `WindowGraph`
-    used = evidence.inlier & (sigmas_px > 0) & np.isfinite(initial[..., :1])
-    kernel, in_step = config.observations.robust_kernel, np.zeros(used.shape)
-    seen = Projections(cameras, observed.xy, sigmas_px * scale, used, in_step, kernel, scale)
-    pulls, solver = of_body.where(of_body.known, config.graph.weight_shape), config.graph
+    scale, kernel = 1.0 / np.sqrt(config.graph.weight_2d), config.observations.robust_kernel
+    width = 1.0 if kernel is None else DEFAULT_WIDTH_SIGMA[kernel] / scale
+    known = np.isfinite(initial).all(axis=-1, keepdims=True)
+    used = evidence.inlier & (sigmas_px > 0) & known
+    weights = np.where(used, 1.0 / np.where(used, scale * sigmas_px, 1.0) ** 2, 0.0)
+    pulls, (R, J) = of_body.where(of_body.known, config.graph.weight_shape), initial.shape[:2]
+    start = np.where(known, initial, 0.0)
+    # A very weak prior: with one view the depth would be undetermined.
+    information = pulls.information + _HELD * np.eye(3)
+    right = (pulls.information @ pulls.xyz[..., None])[..., 0] + _HELD * start
     # The error is quadratic in the step: a hundredth of a sigma corresponds to the tolerance 1e-4.
-    return solved_apart(
-        seen, pulls, initial, solver.max_iterations, _SIGMA_M * float(np.sqrt(solver.tolerance))
-    )
+    settled_m, found = _SIGMA_M * float(np.sqrt(config.graph.tolerance)), start.copy()
+    same = len(cameras.projection) == 1
+    for n, rows in enumerate([slice(None)] if same else [slice(n, n + 1) for n in range(R)]):
+        states, xy, weight, own, to = (
+            ready(each[rows].reshape(-1, *each.shape[2:]))
+            for each in (found, observed.xy, weights, information, right)
+        )
+        states = states[:, None]
+        solve_chains(
+            states, np.arange(len(states)), own[:, None], np.empty((len(states), 0, 3, 3)),
+            to[:, None], cameras.projection[n : n + 1], xy[None], weight[None],
+            np.zeros((1, *weight.shape)), ROBUST[kernel], width, config.graph.max_iterations,
+            settled_m, np.empty((0, 1, 1, 1)),
+        )  # fmt: skip
+        found[rows] = states.reshape(-1, J, 3)
+    far = np.abs(found - start).max(axis=-1, keepdims=True) > UNDETERMINED_M
+    return np.where(known, np.where(far, start, found), np.nan)
 
 
 def solve_joints(
@@ -55,39 +78,17 @@ def solve_joints(
     """Solve people's graphs, each with its part of the rows of views and body; results are in
     `positions`.
 
-    People coupled by factors must all be included. Single frames may start at `near` (R, J, 3), the
-    result of `solve_between`.
+    People coupled by factors must all be included. They start at `near` (R, J, 3), the result of
+    `solve_between`, if given.
     """
     for person, part in parts:
-        _prepare(person, evidence, of_body, part, config, None if near is None else near[part])
+        points, sigma_m, body = evidence.points[part], evidence.sigma_m[part], of_body.rows(part)
+        initial = _start(points, sigma_m, body, config)
+        used = evidence.inlier[part] & np.isfinite(initial[..., :1])
+        person.prepare(used, body, initial if near is None else near[part])
     for person, _ in parts:
         if person is person.ties.people[0]:
             person.optimise()
-
-
-def _prepare(
-    person: WindowGraph,
-    evidence: ViewEvidence,
-    of_body: JointTargets,
-    part: slice,
-    config: EstimatorConfig,
-    near: Array | None,
-) -> None:
-    """Set up the problem of one person."""
-    views, body = evidence.message.rows(part), of_body.rows(part)
-    inlier, sigma_m, points = evidence.inlier[part], evidence.sigma_m[part], evidence.points[part]
-    initial = _start(points, sigma_m, body, config)
-    if not person.temporal:
-        used = inlier & np.isfinite(initial[..., :1])
-        person.prepare(used, views, body, initial if near is None else near)
-        return
-    initial = interpolated(np.where(np.isfinite(points), points, initial), person.times_s)
-    # X_0 is not evidence: a joint without other information is undetermined.
-    mentioned = (inlier.any(axis=-1) | body.known).any(axis=0) | person.touched
-    initial[:, ~mentioned] = np.nan
-    lost = sigma_m > LOST_M
-    feet = feet_of(config.joints if config.motion.contact else ())
-    person.prepare(inlier, views, body, initial, lost, feet)
 
 
 def _start(points: Array, sigma_m: Array, body: JointTargets, config: EstimatorConfig) -> Array:

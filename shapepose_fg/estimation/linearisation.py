@@ -15,6 +15,7 @@ from shapepose_fg.core.bounds import Factor, Metres, MetresOrNone, Settings, Sha
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.kernel_geometry import ROBUST
 from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.rows import Rows
 from shapepose_fg.estimation.kernels import complete, look, ready
 
 MIN_DEPTH_M = 0.2
@@ -139,7 +140,7 @@ def squared_distance(said: JointTargets, xyz: Array, covariance: Array) -> Array
 
 
 @dataclass(frozen=True)
-class ViewEvidence:
+class ViewEvidence(Rows):
     """Linearised measurements of the views at joints `points`."""
 
     points: Array

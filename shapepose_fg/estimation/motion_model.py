@@ -1,20 +1,19 @@
-"""Motion of joints, and temporal correlation of errors: measured values, read from a file."""
+"""Motion of joints: measured values, read from a file."""
 
 from dataclasses import dataclass
 from importlib.resources import as_file, files
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 
 from factors import CONSTANT_VELOCITY, MEASURED_S, Motion
 from shapepose_fg.core.arrays import Array
-from shapepose_fg.core.bounds import Factor, Seconds, Settings
+from shapepose_fg.core.bounds import Factor, Settings
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import read_json
 
 FORMAT = "shapepose-fg motion model 1"
-GAP_S = 0.4
-"""Length of the gaps across which densities of hidden joints were measured, seconds."""
 LOST_M = 0.1
 """Standard deviation of a joint by its views, in the worst direction, above which the joint is
 lost, metres."""
@@ -30,40 +29,22 @@ class MotionConfig(Settings):
     psd_scale: Factor = 1.0
     """Factor on the power spectral densities of the joints' accelerations: larger values follow
     faster and smooth less."""
-    around_s: Seconds = 0.5
-    """Time around frames with a lost joint (`LOST_M`), seconds, in which the difference between
-    joint and body is estimated (`factors.motion`)."""
     contact: bool = True
     """Whether standing feet are constrained to stay in place between frames
     (`estimation.contact`)."""
     floor: bool = True
     """Whether to search for a floor under standing feet; bodies over time then stay above it."""
-    keep_limbs: bool = True
-    """Whether unseen joints are moved to positions possible for a body, and limbs with an uncertain
-    end get the body's length; the motion model moves each joint independently."""
 
-
-@dataclass(frozen=True)
-class CorrelatedError:
-    """Temporal correlation of the error of estimates of a joint."""
-
-    white_share: float
-    """Share of white noise in the variance, between 0 and 1."""
-    correlation_s: float
-    """Time constant of the rest, with the autocorrelation exp(-t / this), s."""
-    kept: float = 0.0
-    """Share of the white part that smoothing does not remove, because it is correlated over a few
-    frames, 0 to 1."""
-
-    @property
-    def possible(self) -> bool:
-        """Whether these values are finite and within their bounds."""
-        return 0 < self.white_share < 1 and 0 < self.correlation_s < np.inf and 0 <= self.kept <= 1
+    replaced: ClassVar[dict[str, str]] = {
+        name: "was removed: over time bodies and joints are one problem"
+        for name in ("around_s", "keep_limbs")
+    }
+    """Settings of earlier versions, and their replacements."""
 
 
 @dataclass(frozen=True)
 class MotionModel:
-    """Parameters of a window's motion factors for J joints."""
+    """Parameters of the motion of J joints."""
 
     psd_still: Array
     """(J,) power spectral density of the acceleration of a joint nearly at rest, m²/s³,
@@ -74,13 +55,6 @@ class MotionModel:
     psd_lost: Array
     """(J,) minimum of this density while a joint is lost. Its speed is then unknown, so the minimum
     is the mean over all speeds."""
-    views: CorrelatedError
-    """Error of estimates of a joint from all views of one frame."""
-    body: CorrelatedError
-    """Error of estimates of a joint from the body, without the joint's own views."""
-    around_s: float = 0.5
-    """Time around frames with a lost joint in which the difference between joint and body is
-    estimated, s."""
     law: Motion = CONSTANT_VELOCITY
     """Motion model of the states."""
 
@@ -98,10 +72,6 @@ class MotionModel:
         m²/s³.
         """
         return self.psd_still + self.psd_speed * np.asarray(speed_m_s) ** 2
-
-    def density_lost(self, speed_m_s: Array) -> Array:
-        """Density (..., J) while joints are lost, with uncertain speed."""
-        return np.maximum(self.density(speed_m_s, GAP_S), self.law.density(self.psd_lost, GAP_S))
 
     @classmethod
     def load(
@@ -133,12 +103,6 @@ class MotionModel:
             known = {name: tuple(map(float, numbers)) for name, numbers in data["joints"].items()}
             if any(len(numbers) != 3 for numbers in known.values()):
                 raise ValueError("a joint must have 3 densities")
-            views, body = (
-                CorrelatedError(
-                    *(float(data[name][key]) for key in ("white_share", "correlation_s", "kept"))
-                )
-                for name in ("views", "body")
-            )
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise InputError(
                 f"{path}: this is not a motion model ({error}); give the entries of "
@@ -152,13 +116,8 @@ class MotionModel:
                 f"{path}: densities must be positive; give the entries of "
                 "estimation/data/motion.json"
             )
-        if not (views.possible and body.possible):
-            raise InputError(
-                f"{path}: for views and body, white_share must be between 0 and 1, correlation_s "
-                "positive and kept 0 to 1; give the entries of estimation/data/motion.json"
-            )
         chosen = config.psd_scale * np.array(
             [known.get(name, tuple(table.mean(axis=0))) for name in joints]
         )
         still, speed, lost = np.ascontiguousarray(chosen.T)
-        return cls(still, speed, lost, views, body, config.around_s, law)
+        return cls(still, speed, lost, law)

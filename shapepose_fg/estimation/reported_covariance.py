@@ -1,9 +1,4 @@
-"""Results of a solved window: correlated errors, further uncertainty, how joints are known, and
-problems.
-"""
-
-from collections import Counter
-from collections.abc import Sequence
+"""Results of people solved frame by frame: uncertainty, how joints are known, and problems."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,11 +15,8 @@ from shapepose_fg.estimation.association_uncertainty import (
     limbs_to_exchange,
     mirrored_spread,
 )
-from shapepose_fg.estimation.asynchronous_views import carried_to_frames
 from shapepose_fg.estimation.camera_pose_uncertainty import carried_covariance
-from shapepose_fg.estimation.covariance_calibration import LASTS_S, Calibration, CovarianceFeatures
-from shapepose_fg.estimation.in_time import carried, smoothed_in_time, waited_s
-from shapepose_fg.estimation.limbs import limbs_kept
+from shapepose_fg.estimation.covariance_calibration import Calibration, CovarianceFeatures
 from shapepose_fg.estimation.linearisation import (
     ViewEvidence,
     information_by_view,
@@ -34,13 +26,12 @@ from shapepose_fg.estimation.linearisation import (
     squared_distance,
     weakest_sigma,
 )
-from shapepose_fg.estimation.missed_detections import SPEED_M_S, elsewhere_variance, limbs_that_hide
-from shapepose_fg.estimation.motion_model import LOST_M
+from shapepose_fg.estimation.missed_detections import elsewhere_variance, limbs_that_hide
 from shapepose_fg.estimation.noise_law import core_sigma_m, variance_ratio
 from shapepose_fg.estimation.state import State
 from shapepose_fg.estimation.state_covariances import state_covariances
-from shapepose_fg.estimation.window_graph import WindowGraph
-from shapepose_fg.estimation.window_solution import PersonGraph, WindowSolution, tied
+from shapepose_fg.estimation.user_factors import factors_of
+from shapepose_fg.estimation.window_solution import CorrectedGraph, WindowSolution, tied
 
 RUNAWAY_M = 1.0
 """Distance of a joint with a user factor from its initial position at which it has diverged, m."""
@@ -57,22 +48,13 @@ WEAK_PROBABILITY = 0.5
 
 def outcome(state: State, fitter: BodyFitter) -> WindowSolution:
     """Results of a window with solved joints: covariances with all uncertainty, codes, statuses."""
-    rows, people, shape = state.observations, state.people, state.joints.shape
-    solved, covariance, velocity_covariance = (np.full((*shape, 3), np.nan) for _ in range(3))
-    velocity = np.full(shape, np.nan)
-    for person, (of_positions, of_velocities) in zip(
-        people, state_covariances(people), strict=True
-    ):
-        solved[person.rows] = covariance[person.rows] = of_positions
-        if person.temporal:
-            velocity[person.rows] = person.velocity
-            velocity_covariance[person.rows] = of_velocities
-            covariance[person.rows] = with_lasting(state, person, of_positions)
-    X = limbs_kept(state, covariance, fitter) if state.config.motion.keep_limbs else state.joints
-    fit = final_bodies(state, covariance, fitter)
-    carried = carried_to_frames(rows, X, np.nan_to_num(velocity), state.views)
-    final = linearise(carried, state.sigmas, X, state.views, state.config.observations)
-    covariance = _calibrated(state, X, covariance, final)
+    rows, people, X = state.observations, state.people, state.joints
+    solved, nowhere = np.full((*X.shape, 3), np.nan), np.full(X.shape, np.nan)
+    for person, of_positions in zip(people, state_covariances(people), strict=True):
+        solved[person.rows] = of_positions
+    fit = final_bodies(state, solved, fitter)
+    final = linearise(rows, state.sigmas, X, state.views, state.config.observations)
+    covariance = _calibrated(state, X, solved, final)
     if state.views.carried is not None:
         covariance += carried_covariance(
             final, state.of_body, state.sigmas, state.views, state.config.observations
@@ -80,10 +62,8 @@ def outcome(state: State, fitter: BodyFitter) -> WindowSolution:
     reported = strong(state)
     hiding = limbs_that_hide(state.config.joints)
     elsewhere = elsewhere_variance(X, rows.frame, reported, state.views, hiding)
-    for person in people:
-        waited = waited_s(np.asarray(reported[person.rows].any(axis=-1)), person.times_s)
-        moved = np.minimum(elsewhere[person.rows], (SPEED_M_S * waited) ** 2)
-        covariance[person.rows] += moved[..., None, None] * np.eye(3)
+    hidden = np.where(reported.any(axis=-1), 0.0, elsewhere)
+    covariance += hidden[..., None, None] * np.eye(3)
     covariance += mirrored_spread(X, rows.mirrored, state.config.joints)
     wrong = problems(state, covariance)
     doubted = np.median(rows.mirrored.max(axis=2, initial=0.0), axis=1) > DOUBTED
@@ -96,8 +76,8 @@ def outcome(state: State, fitter: BodyFitter) -> WindowSolution:
         observations=rows,
         joints=X,
         covariance=covariance,
-        velocity=velocity,
-        velocity_covariance=velocity_covariance,
+        velocity=nowhere,
+        velocity_covariance=np.full_like(covariance, np.nan),
         confidence=mean_confidence(rows, state.inlier),
         inlier=state.inlier,
         contradicts=state.contradicts,
@@ -107,25 +87,16 @@ def outcome(state: State, fitter: BodyFitter) -> WindowSolution:
         status=status,
         problems=wrong,
         people=tied([
-            PersonGraph(
-                person, X[person.rows], covariance[person.rows], fit.rows(person.rows),
-                state.joints[person.rows], solved[person.rows], state.motion.views,
-                state.of_body.rows(person.rows),
+            CorrectedGraph(
+                window=person, joints=X[person.rows], covariance=covariance[person.rows],
+                bodies=fit.rows(person.rows), solved=state.joints[person.rows],
+                solved_covariance=solved[person.rows],
+                body=state.of_body.rows(person.rows),
             )
             for person in people
         ]),
         factors=factors_of(people),
     )  # fmt: skip
-
-
-def factors_of(people: Sequence[WindowGraph]) -> dict[str, tuple[int, int]]:
-    """Number of factors by user function, and how many were inactive in the last problem."""
-    ties = {id(person.ties): person.ties for person in people}.values()
-    made, active = (
-        Counter(factor.name for each in ties for factor in of(each))
-        for of in (lambda each: each.factors, lambda each: each.active)
-    )
-    return {name: (count, count - active[name]) for name, count in made.items()}
 
 
 def final_bodies(state: State, covariance: Array, fitter: BodyFitter) -> BodyFit:
@@ -134,10 +105,7 @@ def final_bodies(state: State, covariance: Array, fitter: BodyFitter) -> BodyFit
     In this way, the bodies follow these factors. Joints and covariances are final and not affected.
     """
     fit = state.fit
-    chosen = [
-        person.rows for person in state.people
-        if person.touched.any() and (person.temporal or fit.ok[person.rows].all())
-    ]  # fmt: skip
+    chosen = [person.rows for person in state.people if person.touched.any()]
     if len(chosen) == 0:
         return fit
     rows = np.concatenate(chosen)
@@ -150,66 +118,29 @@ def final_bodies(state: State, covariance: Array, fitter: BodyFitter) -> BodyFit
 
 def _calibrated(state: State, X: Array, covariance: Array, final: ViewEvidence) -> Array:
     """Covariances (N, J, 3, 3) of the joints `X` with all uncertainty, for the detector's noise
-    law.
-
-    `covariance` is that of the graph, with correlated errors, and `final` the linearised
-    observations at `X`. In rows without temporal factors, the result is not smaller than
-    `covariance`.
+    law; not smaller than `covariance`, that of the graph. `final` are the linearised observations
+    at `X`.
     """
-    rows, body, count, joints = (
-        state.observations,
-        state.of_body,
-        state.inlier.sum(axis=-1),
-        state.config.joints,
-    )
-    config, alone = state.config.observations, np.ones(len(X), dtype=bool)
-    for person in state.people:
-        alone[person.rows] = not person.temporal
+    rows, body, joints = state.observations, state.of_body, state.config.joints
+    config, count = state.config.observations, state.inlier.sum(axis=-1)
     sigma_m = core_sigma_m(rows.confidence, config) * config.scatter(joints)[:, None]
     by_view = information_by_view(final, state.sigmas, state.views, config)
+    alone = np.ones(len(X), dtype=bool)
     ratio = variance_ratio(
         state.config.noise, alone, rows.confidence, sigma_m, by_view, body.information
     )
     widened = ratio[..., None, None] * covariance
-    of_body = np.nan_to_num(squared_distance(body, state.joints, widened))
+    of_body = np.nan_to_num(squared_distance(body, X, widened))
     association = association_spread(rows, state.sigmas, final, body, state.views, config)
-    moved = np.nan_to_num(state.joints - rows.initial)
+    association = np.where((count > 0)[..., None, None], association, 0.0)
+    moved = np.nan_to_num(X - rows.initial)
     draft = moved[..., None] * moved[..., None, :]
-    exchange = exchange_spread(
-        state.joints, state.fit.joints, rows.frame, limbs_to_exchange(joints)
-    )
-    for person in state.people:
-        mine, times_s = person.rows, person.times_s
-        association[mine] = smoothed_in_time(association[mine], times_s, LASTS_S, count[mine] > 0)
-        for clue in (of_body, draft, exchange):
-            clue[mine] = smoothed_in_time(clue[mine], times_s, LASTS_S)
+    exchange = exchange_spread(X, state.fit.joints, rows.frame, limbs_to_exchange(joints))
     clues = CovarianceFeatures(rows.frame, X, count, widened, of_body, association, draft, exchange)
     found = Calibration.load(joints).covariance(clues)
-    single = alone[:, None] & np.isfinite(found).all(axis=(-2, -1))
-    found[single] = covariance[single] + raise_eigenvalues(found[single] - covariance[single], 0.0)
+    known = np.isfinite(found).all(axis=(-2, -1))
+    found[known] = covariance[known] + raise_eigenvalues(found[known] - covariance[known], 0.0)
     return found
-
-
-def with_lasting(state: State, person: WindowGraph, marginal: Array) -> Array:
-    """(T, J, 3, 3) covariance of joints, m²: `marginal` of the person's graph, plus the errors it
-    omits.
-
-    Added are the correlated share of the single-frame covariance by views and body; and of the
-    white share, the part that smoothing does not really remove, because errors are correlated over
-    a few frames (`CorrelatedError.kept`). For unseen joints this is taken from the nearest frame in
-    which they are seen. For joints solved with offsets, `marginal` already includes the correlated
-    error.
-    """
-    said = state.of_views.information[person.rows]
-    information = said + state.of_body.information[person.rows]
-    simple = np.broadcast_to(~person.with_offsets, said.shape[:2])
-    seen = (weakest_sigma(said) <= LOST_M) & simple
-    f, kept = state.motion.views.white_share, state.motion.views.kept
-    left = np.zeros(information.shape)
-    left[seen] = inverses(information[seen])
-    left = carried(left, seen, person.times_s)
-    total = np.where(seen, 1 - kept, 1.0)[..., None, None] * marginal + (1 - f + kept * f) * left
-    return np.where(simple[..., None, None], total, marginal)
 
 
 def strong(state: State) -> Mask:

@@ -4,9 +4,9 @@ few frames.
 
 import numpy as np
 
+from factors import Motion
 from shapepose_fg.core.arrays import Array, Whole
 from shapepose_fg.estimation.in_time import motion_of
-from shapepose_fg.estimation.joint_chains import motion_information
 from shapepose_fg.estimation.kernels import solve_chains
 from shapepose_fg.estimation.motion_model import MotionModel
 
@@ -74,3 +74,19 @@ def smoothed(
     return np.where(ever[..., None], mean, np.nan), np.where(
         ever[..., None, None], isotropic, np.nan
     )
+
+
+def motion_information(law: Motion, dt_s: Array, density: Array) -> tuple[Array, Array]:
+    """Information of a motion model about C chains of T states, along one axis: diagonal blocks (C,
+    T, n, n), and blocks with the state before (C, T - 1, n, n).
+
+    Steps `dt_s` (T - 1,), densities (T - 1, C). There is a prior on initial derivatives, none on
+    positions.
+    """
+    F = law.transition(dt_s)
+    noise = np.linalg.inv(law.noise(dt_s)) / density.T[..., None, None]
+    own = np.zeros((noise.shape[0], len(dt_s) + 1, *F.shape[1:]))
+    own[:, 0] = np.diag([0.0, *np.power(law.start, -2.0)])
+    own[:, 1:] += noise
+    own[:, :-1] += F.mT @ noise @ F
+    return own, -noise @ F

@@ -12,8 +12,8 @@ from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.draft import first_places
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.linearisation import ViewEvidence, observation_sigmas
-from shapepose_fg.estimation.motion_model import MotionModel
-from shapepose_fg.estimation.window_graph import FactorFunction, WindowGraph, add_factors
+from shapepose_fg.estimation.user_factors import FactorFunction, add_factors
+from shapepose_fg.estimation.window_graph import WindowGraph
 
 
 @dataclass
@@ -30,8 +30,6 @@ class State:
     """(N, J, 3) X_0, metres; NaN if unknown."""
     config: EstimatorConfig
     """Settings of stage II."""
-    motion: MotionModel
-    """Motion model of joints, and temporal correlation of errors."""
     people: list[WindowGraph]
     """Graphs of the people."""
     joints: Array
@@ -59,7 +57,6 @@ class State:
         views: Views,
         fitter: BodyFitter,
         config: EstimatorConfig,
-        motion: MotionModel,
         extra_factors: Sequence[FactorFunction] = (),
     ) -> "State":
         """Initial state: X_0, standard deviations of the observations there, and graphs including
@@ -68,9 +65,9 @@ class State:
         first = first_places(observations, views, fitter, config)
         sigmas = observation_sigmas(observations, first, views, config.observations, config.joints)
         people = list[WindowGraph]()
-        for rows in window_rows(observations):
+        for rows in np.concatenate([np.empty(0, np.intp), *window_rows(observations)])[:, None]:
             given = observations.rows(rows), sigmas[rows], views.rows(rows)
-            people.append(WindowGraph(*given, config, motion, rows, first[rows]))
+            people.append(WindowGraph(*given, config, rows, first[rows]))
         if len(extra_factors) > 0:
             add_factors(people, extra_factors)
         N, J, V = sigmas.shape
@@ -78,7 +75,7 @@ class State:
             JointTargets(np.full((N, J, 3), np.nan), np.zeros((N, J, 3, 3))) for _ in range(2)
         )
         return cls(
-            observations, views, sigmas, first, config, motion, people, first.copy(),
+            observations, views, sigmas, first, config, people, first.copy(),
             np.zeros((N, J, V), dtype=bool), np.zeros((N, J), dtype=bool), of_views, of_body,
             np.zeros(N, dtype=bool),
             BodyFit.failed(np.full(N, FitStatus.TOO_FEW_JOINTS), J),
@@ -100,14 +97,6 @@ class State:
         for kept, new in ((self.of_views, evidence.message), (self.of_body, of_body)):
             kept.xyz[rows], kept.information[rows] = new.xyz, new.information
         self.fit = self.fit.with_rows(rows, fit)
-
-
-def parts_of(people: Sequence[WindowGraph]) -> list[tuple[WindowGraph, slice]]:
-    """People with the slices of their rows in the concatenation of all."""
-    ends = np.cumsum([len(person) for person in people]).tolist()
-    return [
-        (person, slice(end - len(person), end)) for person, end in zip(people, ends, strict=True)
-    ]
 
 
 def window_rows(observations: Observations) -> list[Index]:

@@ -192,9 +192,10 @@ def marginal(
     The covariance of each is as reported; errors of two joints of a person, in standard deviations,
     have the measured correlation (`correlation`). With the `rig` of the reconstruction
     (`cameras.json`), errors from poses of moving cameras are common to all that they see. With the
-    `graphs` of a result with user factors (`window_solutions(people, rig, extra_factors=...)`),
-    joints coupled by these, also of two people, have the graph's correlation. Raises NotDetermined
-    for a joint without a position, ValueError for one that does not exist.
+    `graphs` of a result (`window_solutions(people, rig)`, with `extra_factors=` for user factors),
+    joints of one frame, and those that factors couple, also of two people, have the graph's
+    correlation. Raises NotDetermined for a joint without a position, ValueError for one that does
+    not exist.
     """
     rows, numbers = (
         np.array([_place(people, each) for each in joints], dtype=np.intp).reshape(-1, 2).T
@@ -218,12 +219,10 @@ def _of_graphs(
     graphs: Sequence[PersonGraph], joints: Sequence[JointAt], numbers: Index, errors: Array
 ) -> Array:
     """Correlations `errors` (K, 3, K, 3) of K joints, in standard deviations; replaced by the
-    graph's for pairs coupled by user factors.
+    graph's for pairs that it correlates.
     """
     K, found, tied = len(joints), errors.copy(), False
-    for graph in {
-        id(each.window.ties): each for each in graphs if len(each.window.ties.active) > 0
-    }.values():
+    for graph in {id(each.window.ties): each for each in graphs}.values():
         members = {each.person: each for each in graph.together or [graph]}
         keys = dict[int, int]()
         for n, asked in enumerate(joints):
@@ -231,10 +230,9 @@ def _of_graphs(
             if person is not None and asked.frame in person.frames:
                 key = int(person.keys[np.flatnonzero(person.frames == asked.frame)[0], numbers[n]])
                 keys |= {n: key} if graph.values.exists(key) else {}
-        parts = graph.window.ties.parts
-        nodes = {n: (joints[n].person, int(numbers[n])) for n in keys}
+        nodes = {n: (joints[n].person, int(numbers[n]), joints[n].frame) for n in keys}
         pairs = [(a, b) for a in keys for b in keys if a < b and keys[a] != keys[b]]
-        pairs = [(a, b) for a, b in pairs if any({nodes[a], nodes[b]} <= part for part in parts)]
+        pairs = [(a, b) for a, b in pairs if graph.coupled(nodes[a], nodes[b])]
         asked = sorted({keys[n] for pair in pairs for n in pair})
         if len(asked) == 0:
             continue

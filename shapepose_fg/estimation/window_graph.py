@@ -1,123 +1,39 @@
-"""Factor graph of a person over a window of frames: a position of every joint in every frame.
+"""Factor graph of a person in a frame: a position of every joint.
 
-Stage II of the paper, the X step: E(X) = w_2D E_2D(X) + w_shape E_shape(X, Theta) with fixed Theta.
-With several frames, joints also have velocities, and motion factors between their states.
+The X step of the paper, in single frames: E(X) = w_2D E_2D(X) + w_shape E_shape(X, Theta) with
+fixed Theta.
 """
 
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from collections.abc import Iterable, Sequence
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from factors import (
+    DEFAULT_WIDTH_SIGMA,
     KernelName,
     body_prior_factors,
-    diagonal,
-    format_key,
-    lasting_prior_factors,
     make_camera,
-    moving_projection_factors,
-    offset_factors,
-    offset_keys,
     projection_factors,
     robust_kernel,
     split_key,
-    standing_factors,
     state_keys,
 )
 from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Views
-from shapepose_fg.core.decompositions import symmetric_root
 from shapepose_fg.core.observations import Observations
-from shapepose_fg.estimation.asynchronous_views import leads
-from shapepose_fg.estimation.contact import walking
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
-from shapepose_fg.estimation.in_time import motion_of, near_in_time, spanned
-from shapepose_fg.estimation.joint_chains import Chains, Problem, Projections, Said
 from shapepose_fg.estimation.minimise import NotFinite, confirmed, descend, undetermined_key
-from shapepose_fg.estimation.motion_model import MotionModel
-
-_OF_VIEWS, _OF_BODY = 0, 1
-"""Numbers of the sources of estimates, for the keys of their offsets."""
+from shapepose_fg.estimation.user_factors import PersonWindow
 
 
-@dataclass(frozen=True)
-class UserFactor:
-    """A user factor."""
-
-    factor: gtsam.NonlinearFactor
-    keys: tuple[int, ...]
-    """Variables of the factor: states of joints of people in the window, and user variables."""
-    name: str
-    """Name of the function that created the factor."""
-
-
-@dataclass
-class CoupledGraph:
-    """People of a window, and user variables, that user factors couple, and that are solved as one
-    graph.
-
-    A person without such factors is separate.
-    """
-
-    people: list["WindowGraph"]
-    """The people in this graph."""
-    factors: list[UserFactor] = field(default_factory=list)
-    """The user factors that couple these people."""
-    start: gtsam.Values = field(default_factory=gtsam.Values)
-    """Initial values of user variables."""
-    parts: list[frozenset[tuple[int, int]]] = field(default_factory=list)
-    """Disjoint sets of coupled variables: (track, joint), or (-1, key) for user variables."""
-    active: list[UserFactor] = field(default_factory=list)
-    """Factors with all variables in the last problem; the others were inactive."""
-
-    def tie(self, nodes: Iterable[tuple[int, int]]) -> None:
-        """Record that a factor couples these variables."""
-        joined = frozenset(nodes)
-        apart = [each for each in self.parts if not each & joined]
-        self.parts = [*apart, joined.union(*(each for each in self.parts if each & joined))]
-
-    def take_in(self, other: "CoupledGraph") -> None:
-        """Merge with the coupling of other people, who share this object from now on."""
-        if other is self:
-            return
-        for key in other.start.keys():  # noqa: SIM118 - GTSAM's, not a dictionary's
-            if self.start.exists(key):
-                raise ValueError(f"your variable {format_key(key)} has two initial values")
-        self.start.insert(other.start)
-        self.people += other.people
-        self.factors += other.factors
-        for part in other.parts:
-            self.tie(part)
-        for person in other.people:
-            person.ties = self
-
-
-class WindowGraph:
-    """Graph of one person in T frames; T = 1 is a single frame, without velocities.
+class WindowGraph(PersonWindow):
+    """Graph of one person in one frame, T = 1.
 
     Joints, and people, are coupled only by user factors, so that marginal covariances are cheap.
     Coupled people (`ties`) are one graph; `graph` and `values` are then of all of them.
-
-    **Correlated errors.** A detector that is wrong by 2 cm is so in the next frame too, and so is
-    the body's estimate. In a window of several frames therefore
-
-    - projections and body priors have only the white share of their variance, so that motion
-      smooths only that;
-      `state_covariances` exclude the rest (`reported_covariance.with_lasting` adds it);
-    - where a joint is lost (`lost` of `solve`) the body's prior gets a slowly decaying offset
-      (`factors.motion`): the
-      difference between joint and body when it was seen; and so do the views' estimates, which,
-      with nearly parallel
-      rays, would otherwise be averaged over time as if independent in every frame;
-    - joints with user factors are solved with offsets of both views and body, and the views'
-      estimates are one Gaussian
-      each: a user factor is weighed against all of the error, and the covariances include it.
     """
 
     def __init__(
@@ -126,172 +42,28 @@ class WindowGraph:
         sigmas_px: Array,
         views: Views,
         config: EstimatorConfig,
-        motion: MotionModel,
         rows: Index | None = None,
         first: Array | None = None,
     ) -> None:
-        """Build the factors of all observations: T rows of one person, ascending frames.
+        """Build the factors of all observations: one row.
 
-        `sigmas_px` (T, J, V), 0 if the view has no detection of the joint; `views` are their
-        cameras; `rows` (T,) are the indices in a larger problem, `first` (T, J, 3) the initial
-        joints.
+        `sigmas_px` (1, J, V), 0 if the view has no detection of the joint; `views` are their
+        cameras; `rows` (1,) is the index in a larger problem, `first` (1, J, 3) the initial joints.
         """
         T, J, _ = sigmas_px.shape
-        if np.any(np.diff(observations.frame) <= 0):
-            raise ValueError(f"frames of a person must increase, got {observations.frame}")
+        frames, track = observations.frame, int(observations.track[0])
+        if T != 1:
+            raise ValueError(f"a graph is of one frame, got {T}")
+        keys = state_keys(track, np.arange(J), frames[:, None], 2)
+        super().__init__(track, frames, observations.time_s.mean(axis=1), keys, rows, first)
         self.config = config.graph
-        self.rows = np.arange(T) if rows is None else rows
-        """(T,) row indices in the whole problem."""
-        self.track = int(observations.track[0])
-        """Track number of the person."""
-        self.frames = observations.frame
-        """(T,) frame of each row."""
-        self.times_s = observations.time_s.mean(axis=1)
-        """(T,) time of each frame, seconds."""
-        joints = np.arange(J)
-        self.state_keys = state_keys(self.track, joints, self.frames[:, None], motion.law.order)
-        """(T, J, n) keys of each joint's state, a `Point3` each: position, velocity, and further
-        derivatives of the motion model; in the graph of a single frame, positions only."""
-        self.graph = gtsam.NonlinearFactorGraph()
-        """The factors of the last solution."""
-        self.values = gtsam.Values()
-        """The last solution, for `gtsam.Marginals` and for graphs to which this one is added."""
-        self.failure = ""
-        """Reason why the last solution failed; empty on success."""
-        self._motion = motion
         self._observations, self._sigmas_px, self._views = observations, sigmas_px, views
         self._names = config.joints
-        self._cameras = _cameras(views)
         self._kernel: KernelName | None = config.observations.robust_kernel
-        self._offset_keys = np.stack(
-            [
-                offset_keys(self.track, joints, self.frames[:, None], source)
-                for source in (_OF_VIEWS, _OF_BODY)
-            ]
-        )
-        self.first: Array = np.full((T, J, 3), np.nan) if first is None else first
-        """(T, J, 3) initial joints, accurate to decimetres, metres; NaN if unknown. Functions may
-        use them to choose what their factors connect."""
-        self.people: list[WindowGraph] = [self]
-        """All people in the window, including this one; for single frames, in the frame."""
-        self.ties = CoupledGraph([self])
-        """The people coupled to this one by user factors, and these factors."""
-        self.touched: Mask = np.zeros(J, dtype=bool)
-        """(J,) joints with a user factor."""
         self.present: Mask = np.zeros((T, J), dtype=bool)
-        """(T, J) joints in the last problem."""
-        self.positions = self.velocity = np.full((T, J, 3), np.nan)
-        """(T, J, 3) positions and velocities of the last solution, metres and m/s; NaN if not in
-        it."""
-        self.chains: list[Chains] = []
-        """The last multi-frame problem, as chains of joints without user factors."""
-
-    @property
-    def keys(self) -> NDArray[np.int64]:
-        """(T, J) key of each joint's position, `Point3`, metres."""
-        return self.state_keys[..., 0]
-
-    @property
-    def velocity_keys(self) -> NDArray[np.int64]:
-        """(T, J) key of each joint's velocity, `Point3`, m/s; not in the graph of a single
-        frame.
-        """
-        return self.state_keys[..., 1]
-
-    def __len__(self) -> int:
-        """Number of frames, T."""
-        return len(self.frames)
-
-    @property
-    def states(self) -> NDArray[np.int64]:
-        """(T, J, n + 2) keys of all variables of a joint in a frame: state, offset of the views,
-        offset of the body.
-        """
-        return np.concatenate([self.state_keys, np.moveaxis(self._offset_keys, 0, -1)], axis=-1)
-
-    @property
-    def seen(self) -> Mask:
-        """(T, J, V) whether there is a detection of the joint."""
-        return self._observations.seen
-
-    @property
-    def temporal(self) -> bool:
-        """Whether there are several frames, so that joints have velocities and motion factors."""
-        return len(self) > 1
-
-    @property
-    def partners(self) -> "list[WindowGraph]":
-        """The window's people after this one, so that each pair occurs once."""
-        return self.people[next(n for n, each in enumerate(self.people) if each is self) + 1 :]
-
-    def shared(self, other: "WindowGraph") -> tuple[Index, Index]:
-        """Rows (S,) of this person and of another in their common frames."""
-        _, mine, theirs = np.intersect1d(
-            self.frames, other.frames, assume_unique=True, return_indices=True
-        )
-        return mine, theirs
-
-    def add(self, item: gtsam.NonlinearFactor | gtsam.Values, name: str = "") -> None:
-        """Add a user factor, which stays through all alternations, or initial values of user
-        variables.
-
-        A factor may be on `state_keys` of this person and of all others of the window (`people`),
-        who are then solved jointly, and on user variables with initial values given before. It is
-        inactive while one of its variables is not in the problem, because neither views nor body
-        nor motion determine it, and `run` counts it under `name`, the function that created it.
-        Raises ValueError for any other key, and for initial values of a joint.
-        """
-        if isinstance(item, gtsam.Values):
-            self._add_start(item)
-            return
-        nodes, touched = list[tuple[int, int]](), list[tuple[WindowGraph, int]]()
-        whose = f"your factor{f' ({name})' if name else ''}"
-        for key in item.keys():  # noqa: SIM118 - GTSAM's, not a dictionary's
-            person = next((each for each in (self, *self.people) if key in each._own), None)
-            if person is not None:
-                joint = split_key(key).joint
-                touched.append((person, joint))
-                nodes.append((person.track, joint))
-                continue
-            holder = self._holder(key)
-            if holder is None:
-                raise ValueError(
-                    f"{whose} uses {format_key(key)}, which is not in this window: use keys of "
-                    "its people (`keys` and `velocity_keys` of `window.people`; people are not "
-                    "in every frame), or first yield gtsam.Values with the initial value of your "
-                    "variable"
-                )
-            nodes.append((-1, key))
-            self.ties.take_in(holder)
-        for person, joint in touched:
-            self.ties.take_in(person.ties)
-            person.touched[joint] = True
-        if len(touched) == 0 and len(nodes) == 0:
-            raise ValueError(f"{whose} has no variable")
-        self.ties.factors.append(UserFactor(item, tuple(item.keys()), name))
-        self.ties.tie(nodes)
-
-    def _add_start(self, start: gtsam.Values) -> None:
-        """Add initial values of user variables; existing ones are kept."""
-        new = gtsam.Values(start)
-        for key in start.keys():  # noqa: SIM118 - GTSAM's, not a dictionary's
-            if any(key in person._own for person in self.people):
-                raise ValueError(
-                    f"{format_key(key)} is the key of a joint: use gtsam.symbol for your variables"
-                )
-            if self._holder(key) is not None:
-                new.erase(key)
-        self.ties.start.insert(new)
-
-    def _holder(self, key: int) -> CoupledGraph | None:
-        """The coupling that contains a user variable."""
-        return next(
-            (each.ties for each in (self, *self.people) if each.ties.start.exists(key)), None
-        )
-
-    @cached_property
-    def _own(self) -> frozenset[int]:
-        return frozenset(self.state_keys.ravel().tolist())
+        """(1, J) joints in the last problem."""
+        self.positions = np.full((T, J, 3), np.nan)
+        """(1, J, 3) positions of the last solution, metres; NaN if not in it."""
 
     @property
     def coupled(self) -> list[frozenset[int]]:
@@ -303,70 +75,29 @@ class WindowGraph:
         return [each for each in mine if len(each) > 1]
 
     @property
-    def with_offsets(self) -> Mask:
-        """(J,) joints with a user factor, in a window of several frames: always solved with
-        offsets.
-        """
-        return self.touched if self.temporal else np.zeros_like(self.touched)
+    def seen(self) -> Mask:
+        """(1, J, V) whether there is a detection of the joint."""
+        return self._observations.seen
 
-    def solve(
-        self,
-        inlier: Mask,
-        views: JointTargets,
-        body: JointTargets,
-        initial: Array,
-        lost: Mask | None = None,
-        feet: Index | None = None,
-    ) -> Array:
-        """`prepare` and `optimise` for a person without coupling; returns joints (T, J,
-        3), metres.
+    def solve(self, inlier: Mask, body: JointTargets, initial: Array) -> Array:
+        """`prepare` and `optimise` for a person without coupling; returns joints (1, J, 3),
+        metres.
         """
-        self.prepare(inlier, views, body, initial, lost, feet)
+        self.prepare(inlier, body, initial)
         self.optimise()
         return self.positions
 
-    def prepare(
-        self,
-        inlier: Mask,
-        views: JointTargets,
-        body: JointTargets,
-        initial: Array,
-        lost: Mask | None = None,
-        feet: Index | None = None,
-    ) -> None:
-        """Build the problem of this person's joints, starting at `initial` (T, J, 3) metres.
+    def prepare(self, inlier: Mask, body: JointTargets, initial: Array) -> None:
+        """Build the problem of this person's joints, starting at `initial` (1, J, 3) metres.
 
-        `inlier` (T, J, V) are the used observations (delta_ij of Eq. 2), `views` their estimates at
-        `initial`, `body` the priors (Eq. 3). A joint with NaN in `initial` is not in the problem
-        and stays NaN; in a window of several frames this applies to all frames of the joint. `lost`
-        (T, J): weakly observed joints. `feet` (F,): joints that may stand (`contact.walking`). In a
-        window of several frames each joint is first solved independently (`joint_chains`), without
-        user factors, and GTSAM starts there.
+        `inlier` (1, J, V) are the used observations (delta_ij of Eq. 2), `body` the priors (Eq. 3).
+        A joint with NaN in `initial` is not in the problem and stays NaN.
         """
-        self.failure, self.chains = "", []
-        self.present = np.asarray(np.isfinite(initial).all(axis=2))
-        if self.temporal:
-            self.present &= np.asarray(self.present.all(axis=0))
-        problem = self._problem(inlier, views, body, initial, lost)
-        joints = np.flatnonzero(self.present[0])
-        if self.temporal and feet is not None:
-            problem = walking(problem, np.intersect1d(joints, feet), initial, lost)
-        states = np.full((*self.states.shape, 3), np.nan)
-        states[self.present, 0] = initial[self.present]
-        if self.temporal:
-            self.chains = problem.chains(joints.tolist())
-            for chains in self.chains:
-                chains.put(chains.solved(initial), states)
-        self._start(states)
-        self.graph = gtsam.NonlinearFactorGraph()
-        self._add(self._seen(problem.seen))
-        if problem.seen.lead_s.any():
-            self._add(self._seen_between(problem.seen, states))
-        self._add(self._pulled(problem.pulls))
-        for source, said in enumerate(problem.said):
-            self._add(self._lasting(said, source))
-        if self.temporal:
-            self._add(self._moving(problem))
+        self.failure, self.present = "", np.asarray(np.isfinite(initial).all(axis=2))
+        self.build()
+        deque(map(self.values.insert, self._present_keys(), initial[self.present]), maxlen=0)
+        self._add(self._seen(inlier & (self._sigmas_px > 0) & self.present[..., None]))
+        self._add(self._pulled(body.where(self.present, self.config.weight_shape)))
 
     def optimise(self) -> None:
         """Minimise over the joints of this person and all coupled people, who must be prepared,
@@ -375,29 +106,8 @@ class WindowGraph:
         GTSAM takes a single step if that suffices, else Levenberg-Marquardt steps. `graph` and
         `values` of all of them are then those of the whole problem.
         """
-        ties, people = self.ties, self.ties.people
-        graph, values = self.graph, self.values
-        if len(people) > 1:
-            graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-            for person in people:
-                graph.push_back(person.graph)
-                values.insert(person.values)
-        there = values.exists
-        ties.active = [
-            each
-            for each in ties.factors
-            if all(there(key) or ties.start.exists(key) for key in each.keys)
-        ]
-        for each in ties.active:
-            graph.add(each.factor)
-        if not ties.start.empty():
-            values = gtsam.Values(values)
-            idle = gtsam.Values(ties.start)
-            used = {key for each in ties.active for key in each.keys}
-            for key in ties.start.keys():  # noqa: SIM118 - GTSAM's, not a dictionary's
-                if key not in used:
-                    idle.erase(key)
-            values.insert(idle)
+        people = self.ties.people
+        graph, values = self.ties.joined()
         failure = ""
         if not values.empty():
             try:
@@ -405,104 +115,43 @@ class WindowGraph:
             except NotFinite as error:
                 failure = str(error)
             except RuntimeError as error:
-                failure = f"the solver failed: its system is singular{_where(error, people)}"
+                where = _where(error, people, self._names)
+                failure = f"the solver failed: its system is singular{where}"
         for person in people:
-            person.graph, person.values, person.failure = graph, values, failure
-            person.positions, person.velocity = person._points()
-
-    def _problem(
-        self, inlier: Mask, views: JointTargets, body: JointTargets, near: Array, lost: Mask | None
-    ) -> Problem:
-        """The problem of `solve`; the noise of accelerations depends on speeds at the positions
-        `near`.
-        """
-        of_views = of_body = self.present & self.with_offsets
-        density, share = np.zeros((len(self) - 1, near.shape[1])), 1.0
-        if self.temporal:
-            share = self._motion.views.white_share
-            variance = 1.0 / np.maximum(np.linalg.eigvalsh(views.information)[..., 0], 1.0)
-            speed, turning = motion_of(near, variance, self.times_s)
-            density = self._motion.density(speed, turning=turning)
-            if lost is not None:
-                around = near_in_time(lost, self.times_s, self._motion.around_s)
-                of_body = self.present & (self.with_offsets | around)
-                of_views = self.present & (self.with_offsets | lost)
-                density = np.where(lost[1:] & lost[:-1], self._motion.density_lost(speed), density)
-        # A correlated error is not an outlier, and a weight also multiplies the kernel's cost: in
-        # pixels the kernel's width is as before either scaled the sigma.
-        scale, weight, xy = (
-            np.sqrt(share / self.config.weight_2d),
-            self.config.weight_shape,
-            self._observations.xy,
-        )
-        lead = leads(self._observations, self._views) if self.temporal else np.zeros(inlier.shape)
-        used = inlier & (self._sigmas_px > 0) & (self.present & ~of_views)[..., None]
-        return Problem(
-            times_s=self.times_s,
-            law=self._motion.law,
-            density=density,
-            seen=Projections(
-                self._views, xy, self._sigmas_px * scale, used, lead, self._kernel, scale
-            ),
-            pulls=body.where(self.present & ~of_body, weight / share),
-            said=(
-                Said(views, 1.0 / self.config.weight_2d, self._motion.views, of_views),
-                Said(body, 1.0 / weight, self._motion.body, of_body),
-            ),
-            standing=np.full(density.shape, np.inf),
-        )
+            assert isinstance(person, WindowGraph)
+            person.set_graph(graph, values)
+            person.failure = failure
+            person.positions = np.full((*person.present.shape, 3), np.nan)
+            if person.present.any():
+                person.positions[person.present] = list(
+                    map(values.atPoint3, person._present_keys())
+                )
 
     def _minimum(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
         """The solution, starting at `values`; raises RuntimeError if there is none."""
         if len(self.ties.factors) > 0:
-            chains = all(len(part) == 1 for part in self.ties.parts) and len(self.ties.people) == 1
-            over_time = any(person.temporal for person in self.ties.people)
-            own = not self.ties.start.empty()
-            return descend(
-                graph,
-                values,
-                self._ordering() if chains and not own else None,
-                self.config,
-                over_time=over_time,
-            )
-        ordering = self._ordering()
+            return descend(graph, values, None, self.config, over_time=False)
+        ordering = gtsam.Ordering(self._present_keys())
         found = confirmed(graph, values, ordering, self.config)
-        return (
-            descend(graph, values, ordering, self.config, over_time=self.temporal)
-            if found is None
-            else found
-        )
+        if found is not None:
+            return found
+        return descend(graph, values, ordering, self.config, over_time=False)
 
-    def _ordering(self) -> gtsam.Ordering:
-        """Elimination by joint, then frame, which causes no fill-in."""
-        return gtsam.Ordering(self.states.swapaxes(0, 1)[self._there.swapaxes(0, 1)].tolist())
+    def _present_keys(self) -> list[int]:
+        return self.keys[self.present].tolist()
 
     def _add(self, factors: Iterable[gtsam.NonlinearFactor]) -> None:
         deque(map(self.graph.add, factors), maxlen=0)
 
-    def _seen(self, seen: Projections) -> Sequence[gtsam.NonlinearFactor]:
-        """Projection factors of used observations exposed at the frame's time."""
-        frame, joint, view = chosen = np.nonzero(seen.used & (seen.lead_s == 0.0))
+    def _seen(self, used: Mask) -> Sequence[gtsam.NonlinearFactor]:
+        """Projection factors of used observations."""
+        _, joint, view = chosen = np.nonzero(used)
+        # In pixels the kernel's width is as before the weight scaled the sigma.
+        scale, kernel = 1.0 / np.sqrt(self.config.weight_2d), self._kernel
+        width = None if kernel is None else DEFAULT_WIDTH_SIGMA[kernel] / scale
         return projection_factors(
-            self._cameras,
-            frame * len(self._views) + view if self._views.rows_known is not None else view,
-            self.keys[frame, joint],
-            seen.xy[chosen],
-            seen.sigmas_px[chosen],
-            robust_kernel(seen.kernel, None if seen.kernel is None else seen.width),
-        )
-
-    def _seen_between(self, seen: Projections, states: Array) -> list[gtsam.NonlinearFactor]:
-        """Factors of the others, linearised at `states` (T, J, S, 3): one per joint and frame."""
-        used = seen.used & (seen.lead_s != 0.0)
-        position, velocity = np.nan_to_num(states[:, :, 0]), np.nan_to_num(states[:, :, 1])
-        moved = position[:, :, None] + seen.lead_s[..., None] * velocity[:, :, None]
-        at, _, slope = seen.views.project_apart(moved)
-        frame, joint, _ = chosen = np.nonzero(used & np.isfinite(at).all(axis=-1))
-        return moving_projection_factors(
-            self.keys[frame, joint], self.velocity_keys[frame, joint], seen.lead_s[chosen],
-            moved[chosen], slope[chosen], at[chosen] - seen.xy[chosen], seen.sigmas_px[chosen],
-            seen.kernel, seen.width,
+            cameras_of(self._views), view, self.keys[0, joint], self._observations.xy[chosen],
+            scale * self._sigmas_px[chosen], robust_kernel(kernel, width),
         )  # fmt: skip
 
     def _pulled(self, pulls: JointTargets) -> list[gtsam.NonlinearFactor]:
@@ -512,120 +161,20 @@ class WindowGraph:
         symmetric = (covariances + covariances.swapaxes(1, 2)) / 2
         return list(body_prior_factors(self.keys[known], pulls.xyz[known], symmetric))
 
-    def _lasting(self, said: Said, source: int) -> list[gtsam.NonlinearFactor]:
-        """Factors of estimates with correlated errors, with a slowly decaying offset each."""
-        if not said.where.any():
-            return []
-        known, keys = said.message.known & said.where, self._offset_keys[source]
-        roots = symmetric_root(said.message.information[known] / said.scale)
-        xyz, share = said.message.xyz[known], said.errors.white_share
-        factors = lasting_prior_factors(self.keys[known], keys[known], xyz, roots, share)
-        # An offset in every frame of the span, so that a joint's states are a chain.
-        chain = spanned(said.where)
-        for joint in np.flatnonzero(chain.any(axis=0)).tolist():
-            there = chain[:, joint]
-            factors += offset_factors(
-                keys[there, joint], self.times_s[there], said.errors.correlation_s
-            )
-        return factors
 
-    def _moving(self, problem: Problem) -> list[gtsam.NonlinearFactor]:
-        """Motion factors of the joints in the problem, and factors of standing feet."""
-        factors = list[gtsam.NonlinearFactor]()
-        unknown = [diagonal(np.full(3, sigma)) for sigma in problem.law.start]
-        for joint in np.flatnonzero(self.present[0]).tolist():
-            states = self.state_keys[:, joint]
-            for key, noise in zip(states[0, 1:].tolist(), unknown, strict=True):
-                factors.append(gtsam.PriorFactorPoint3(key, np.zeros(3), noise))
-            factors += problem.law.factors(states, self.times_s, problem.density[:, joint])
-        step, joint = np.nonzero(np.isfinite(problem.standing))
-        before, after, held = (
-            self.keys[step, joint],
-            self.keys[step + 1, joint],
-            problem.standing[step, joint],
-        )
-        return factors + standing_factors(before, after, np.diff(self.times_s)[step], held)
-
-    def _start(self, states: Array) -> None:
-        """Set `values` from `states` (T, J, S, 3), NaN where absent."""
-        self._there = np.isfinite(states[..., 0])
-        self.values = gtsam.Values()
-        deque(
-            map(self.values.insert, self.states[self._there].tolist(), states[self._there]),
-            maxlen=0,
-        )
-
-    def _points(self) -> tuple[Array, Array]:
-        """Positions and velocities (T, J, 3) of the last solution."""
-        positions, speeds = (np.full((*self.present.shape, 3), np.nan) for _ in range(2))
-        if not self.present.any():
-            return positions, speeds
-        kinds = [(positions, self.keys), *([(speeds, self.velocity_keys)] if self.temporal else [])]
-        if len(self.ties.people) > 1 or not self.ties.start.empty():
-            for into, keys in kinds:
-                into[self.present] = [
-                    self.values.atPoint3(key) for key in keys[self.present].tolist()
-                ]
-            return positions, speeds
-        # Values are sorted by key: kind, joint, frame.
-        points, count = gtsam.utilities.extractPoint3(self.values), int(self.present.sum())
-        for n, (into, _) in enumerate(kinds):
-            into.swapaxes(0, 1)[self.present.T] = points[n * count : (n + 1) * count]
-        return positions, speeds
-
-
-FactorFunction = Callable[
-    [WindowGraph, NDArray[np.int64]], Iterable[gtsam.NonlinearFactor | gtsam.Values]
-]
-"""Function that makes your own factors for a person's window, from its keys (T, J) and those of
-`window.people`."""
-ExtraFactors = FactorFunction | Sequence[FactorFunction]
-"""One function for user factors, or several."""
-
-
-def add_factors(people: Sequence[WindowGraph], functions: Sequence[FactorFunction]) -> None:
-    """Add the factors of user functions to the people of a window; if all have a single frame, to
-    those of each frame.
-    """
-    alone = all(len(person) == 1 for person in people)
-    together: dict[int, list[WindowGraph]] = {}
-    for person in people:
-        together.setdefault(int(person.frames[0]) if alone else 0, []).append(person)
-    for person in people:
-        person.people = together[int(person.frames[0]) if alone else 0]
-    for function in functions:
-        for person in people:
-            for item in function(person, person.keys):
-                person.add(item, name_of(function))
-
-
-def functions_of(given: ExtraFactors | None) -> tuple[FactorFunction, ...]:
-    """User functions as a tuple."""
-    if given is None:
-        return ()
-    return (given,) if callable(given) else tuple(given)
-
-
-def name_of(function: FactorFunction) -> str:
-    """Name of a user function."""
-    inner = getattr(function, "func", function)  # of functools.partial
-    return str(getattr(inner, "__name__", type(inner).__name__))
-
-
-def _where(error: RuntimeError, people: Sequence[WindowGraph]) -> str:
+def _where(error: RuntimeError, people: Sequence[PersonWindow], names: Sequence[str]) -> str:
     """Description of the joint that a singular system leaves undetermined."""
     key = undetermined_key(error)
-    if key is None or all(key not in set(person.states.ravel().tolist()) for person in people):
+    if key is None or all(key not in set(person.state_keys.ravel().tolist()) for person in people):
         return ""
     joint = split_key(key)
     whose = f" of person {joint.person}" if len(people) > 1 else ""
     return (
-        f" near {people[0]._names[joint.joint]}{whose} in frame {joint.frame}: no factor "
-        "determines it there"
+        f" near {names[joint.joint]}{whose} in frame {joint.frame}: no factor determines it there"
     )
 
 
-def _cameras(views: Views) -> list[gtsam.PinholeCameraCal3_S2]:
+def cameras_of(views: Views) -> list[gtsam.PinholeCameraCal3_S2]:
     """GTSAM cameras: V of them, or T V by row if they move."""
     last = np.broadcast_to([0.0, 0.0, 0.0, 1.0], (*views.cTw.shape[:-2], 1, 4))
     wTc = np.linalg.inv(np.concatenate([views.cTw, last], axis=-2))

@@ -8,7 +8,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import lasting_difference_factors, offset_factors, offset_keys, reported_keys
+from factors import gaussian, reported_keys
 from shapepose_fg.body.fitting.fitter import BodyFit, JointTargets
 from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.core.camera import Rig, Views
@@ -21,14 +21,12 @@ from shapepose_fg.core.reconstruction import BODY, Reconstruction
 from shapepose_fg.core.rows import Rows
 from shapepose_fg.estimation.asynchronous_views import carried_to_frames
 from shapepose_fg.estimation.minimise import undetermined_key
-from shapepose_fg.estimation.motion_model import CorrelatedError
+from shapepose_fg.estimation.user_factors import PersonWindow
 from shapepose_fg.estimation.window_graph import WindowGraph
 
 LEAST_M = 1e-4
 """Minimum additional standard deviation of the reported joint relative to the solver's graph,
 metres, where the report is not less certain."""
-_OF_SOLUTION = 2
-"""Number of the source of the whole solution's offset, for keys."""
 
 
 @dataclass(frozen=True)
@@ -114,32 +112,33 @@ class WindowSolution(Rows):
 
 
 @dataclass(frozen=True)
-class PersonGraph:
-    """Solved graph of one person in T frames.
+class Sources:
+    """What a joint's estimate consists of, for explaining it."""
 
-    The solver's graph has only the white share of all errors. `graph` has all of it: besides each
-    position of the solver's graph there is a reported one, which differs by corrections after
-    solving, with a correlated error. Its marginal covariances, for `keys`, are the reported ones,
-    and its values the reported joints.
+    place: Array
+    """(3,) the joint, metres."""
+    whole: Array
+    """(3, 3) all information on it, 1/m²."""
+    of_body: Array
+    """(3, 3) information from the body in the same frame, without the joint's own views."""
+    widen: float
+    """Ratio of the detections' variance in the graph to that of their noise model."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PersonGraph:
+    """Solved graph of one person in T frames. The marginal covariances of `keys` are the reported
+    ones, and their values the joints.
     """
 
-    window: WindowGraph
-    """The solver's problem."""
+    window: PersonWindow
+    """The person's variables and user factors; its graph is the solver's."""
     joints: Array
     """(T, J, 3) reported joints, metres in the world; NaN if unknown."""
     covariance: Array
     """(T, J, 3, 3) reported covariance, m²; NaN if unknown."""
     bodies: BodyFit
     """The bodies, T rows."""
-    solved: Array
-    """(T, J, 3) joints of the solver, metres."""
-    solved_covariance: Array
-    """(T, J, 3, 3) covariance of `solved`: marginals of the solver's graph, m²."""
-    lasting: CorrelatedError
-    """Temporal correlation of the error that is in the report but not in the solver's graph."""
-    body: JointTargets
-    """(T, J) constraints from the body without each joint's own views; none where it is
-    not used."""
     together: "list[PersonGraph]" = field(default_factory=list, repr=False)
     """People coupled by user factors, including this one (`tied`); empty if none."""
 
@@ -160,107 +159,166 @@ class PersonGraph:
 
     @property
     def keys(self) -> NDArray[np.int64]:
-        """(T, J) keys of the reported positions, `Point3`, metres; unknown joints (NaN) are not in
-        the graph.
+        """(T, J) keys of the positions, `Point3`, metres; unknown joints (NaN) are not in the
+        graph.
         """
-        return reported_keys(self.person, np.arange(self.joints.shape[1]), self.frames[:, None])
+        return self.window.keys
 
     @property
     def velocity_keys(self) -> NDArray[np.int64]:
-        """(T, J) keys of the velocities, `Point3`, m/s; not in the graph of a single frame."""
+        """(T, J) keys of the velocities, `Point3`, m/s; in the graph where a user factor is on
+        them.
+        """
         return self.window.velocity_keys
 
-    @cached_property
+    @property
     def graph(self) -> gtsam.NonlinearFactorGraph:
-        """All factors: projections, bodies, motion, user factors, and the correlated errors. It is
-        a chain over time for each joint, unless user factors couple joints. Coupled people
-        (`together`) are one graph, with the keys of all of them.
+        """All factors: projections, bodies, motion, user factors. Coupled people (`together`) are
+        one graph, with the keys of all of them.
         """
-        graph = gtsam.NonlinearFactorGraph(self.window.graph)
-        for person in self.together or [self]:
-            for factor in person._differences():
-                graph.push_back(factor)
-        return graph
+        return self.window.graph
 
-    def _differences(self) -> list[gtsam.NonlinearFactor]:
-        """Factors between the reported positions and the solver's, with a correlated error."""
-        reported, offsets, known = self.keys, self._offset_keys, self._known
-        factors = lasting_difference_factors(
-            reported[known],
-            self.window.keys[known],
-            offsets[known],
-            (self.joints - self.solved)[known],
-            self._more[known],
-            self.lasting.white_share,
-        )
-        for joint in np.flatnonzero(known.any(axis=0)).tolist():
-            there = known[:, joint]
-            factors += offset_factors(
-                offsets[there, joint], self.window.times_s[there], self.lasting.correlation_s
-            )
-        return factors
-
-    @cached_property
+    @property
     def values(self) -> gtsam.Values:
-        """The solution: the solver's variables, the reported positions, and their offsets, which
-        are 0.
+        """The solution."""
+        return self.window.values
+
+    def coupled(self, one: tuple[int, int, int], other: tuple[int, int, int]) -> bool:
+        """Whether to take the correlation of two joints (person, joint, frame) from the graph:
+        where both are in one frame, or user factors couple them. A detector's errors last longer
+        than the graph has them.
         """
-        values, zero = gtsam.Values(self.window.values), np.zeros(3)
-        for person in self.together or [self]:
-            known = person._known
-            for key, place in zip(person.keys[known].tolist(), person.joints[known], strict=True):
-                values.insert(key, place)
-            for key in person._offset_keys[known].tolist():
-                values.insert(key, zero)
-        return values
+        return one[2] == other[2] or any({one[:2], other[:2]} <= p for p in self.window.ties.parts)
+
+    def sources(self, t: int, joint: int) -> Sources | None:
+        """What a joint in row `t` is known from; None if it is unknown."""
+        if not np.isfinite(self.covariance[t, joint]).all():
+            return None
+        whole = np.asarray(np.linalg.inv(self.covariance[t, joint]), dtype=np.float64)
+        of_body = self.window.of_body(t, joint)
+        return Sources(self.joints[t, joint], whole, of_body, self.window.widen)
 
     def not_determined(self, error: RuntimeError, joint_names: list[str]) -> NotDetermined | None:
         """The joint, time and missing evidence for GTSAM's `error`, if this graph, or one that
         includes it, has no solution. None if the error concerns another variable.
         """
         key = undetermined_key(error)
-        keys = np.concatenate(
-            [self.window.states, self.keys[..., None], self._offset_keys[..., None]], axis=-1
-        )
+        body = np.broadcast_to(self.window.body_keys[:, None, None], (*self.keys.shape, 1))
+        keys = np.concatenate([self._variables, body], axis=-1)
         found = np.argwhere(keys == key)
-        if key is None or len(found) == 0:
+        if key is None or key < 0 or len(found) == 0:
             return None
-        t, joint, _ = found[0].tolist()
+        t, joint, kind = found[0].tolist()
+        frame, time_s = int(self.frames[t]), float(self.window.times_s[t])
+        if kind == keys.shape[-1] - 1:
+            said = "the joints of the frame do not determine it"
+            return NotDetermined(self.person, "body", frame, time_s, said)
         views = int(self.window.seen[t, joint].sum())
-        name, frame = str(joint_names[joint]), int(self.frames[t])
         saw = {0: "no camera saw it", 1: "only one camera saw it"}.get(
             views, f"{views} cameras saw it"
         )
-        body = (
-            "the body constrains it"
-            if self.body.known[t, joint]
-            else "the body does not constrain it"
-        )
-        return NotDetermined(
-            self.person, name, frame, float(self.window.times_s[t]), f"{saw}, and {body}"
-        )
+        says = "constrains" if self._body_says(t, joint) else "does not constrain"
+        said = f"{saw}, and the body {says} it"
+        return NotDetermined(self.person, str(joint_names[joint]), frame, time_s, said)
 
     @property
-    def _offset_keys(self) -> NDArray[np.int64]:
-        return offset_keys(
-            self.person, np.arange(self.joints.shape[1]), self.frames[:, None], _OF_SOLUTION
-        )
+    def _variables(self) -> NDArray[np.int64]:
+        """(T, J, n) keys of a joint's variables."""
+        return self.window.state_keys
+
+    def _body_says(self, t: int, joint: int) -> bool:
+        """Whether the body constrains a joint."""
+        del t, joint
+        return True
+
+
+@dataclass(frozen=True, kw_only=True)
+class CorrectedGraph(PersonGraph):
+    """Solved graph of one person in a frame, whose body is no variable.
+
+    Besides each position of the solver's graph there is a reported one in `graph`, which differs by
+    corrections after solving: its marginal covariances, for `keys`, are the reported ones, and its
+    values the reported joints.
+    """
+
+    window: WindowGraph
+    """The solver's problem."""
+    solved: Array
+    """(1, J, 3) joints of the solver, metres."""
+    solved_covariance: Array
+    """(1, J, 3, 3) covariance of `solved`: marginals of the solver's graph, m²."""
+    body: JointTargets
+    """(1, J) constraints from the body without each joint's own views; none where it is
+    not used."""
+
+    @property
+    def keys(self) -> NDArray[np.int64]:
+        """(1, J) keys of the reported positions, `Point3`, metres; unknown joints (NaN) are not in
+        the graph.
+        """
+        return reported_keys(self.person, np.arange(self.joints.shape[1]), self.frames[:, None])
+
+    @cached_property
+    def graph(self) -> gtsam.NonlinearFactorGraph:
+        """All factors: projections, bodies, user factors, and the corrections. Coupled people
+        (`together`) are one graph, with the keys of all of them.
+        """
+        graph = gtsam.NonlinearFactorGraph(self.window.graph)
+        for person in self._members:
+            known = person._known
+            more = np.where(
+                known[..., None, None], person.covariance - person.solved_covariance, np.eye(3)
+            )
+            parts = zip(
+                person.window.keys[known].tolist(), person.keys[known].tolist(),
+                (person.joints - person.solved)[known],
+                raise_eigenvalues(more, LEAST_M**2)[known], strict=True,
+            )  # fmt: skip
+            for solved, reported, away, covariance in parts:
+                noise = gaussian(covariance)
+                graph.push_back(gtsam.BetweenFactorPoint3(solved, reported, away, noise))
+        return graph
+
+    @cached_property
+    def values(self) -> gtsam.Values:
+        """The solution: the solver's variables, and the reported positions."""
+        values = gtsam.Values(self.window.values)
+        for person in self._members:
+            known = person._known
+            for key, place in zip(person.keys[known].tolist(), person.joints[known], strict=True):
+                values.insert(key, place)
+        return values
+
+    def coupled(self, one: tuple[int, int, int], other: tuple[int, int, int]) -> bool:
+        """Whether to take the correlation of two joints (person, joint, frame) from the graph."""
+        return any({one[:2], other[:2]} <= part for part in self.window.ties.parts)
+
+    def sources(self, t: int, joint: int) -> Sources | None:
+        """What a joint in row `t` is known from; None if it is unknown."""
+        if not np.isfinite(self.solved_covariance[t, joint]).all():
+            return None
+        whole = np.asarray(np.linalg.inv(self.solved_covariance[t, joint]), dtype=np.float64)
+        of_body = self.window.config.weight_shape * self.body.information[t, joint]
+        return Sources(self.solved[t, joint], whole, of_body, 1.0)
+
+    @property
+    def _variables(self) -> NDArray[np.int64]:
+        return np.concatenate([self.window.state_keys, self.keys[..., None]], axis=-1)
+
+    def _body_says(self, t: int, joint: int) -> bool:
+        return bool(self.body.known[t, joint])
+
+    @property
+    def _members(self) -> "list[CorrectedGraph]":
+        return [each for each in self.together or [self] if isinstance(each, CorrectedGraph)]
 
     @property
     def _known(self) -> Mask:
-        """(T, J) joints that are reported with covariance."""
+        """(1, J) joints that are reported with covariance."""
         finite = np.isfinite(self.covariance).all(axis=(2, 3)) & np.isfinite(
             self.solved_covariance
         ).all(axis=(2, 3))
         return np.asarray(finite & np.isfinite(self.joints).all(axis=2) & self.window.present)
-
-    @property
-    def _more(self) -> Array:
-        """(T, J, 3, 3) reported minus solver's covariance, m²: positive definite."""
-        more = np.where(
-            self._known[..., None, None], self.covariance - self.solved_covariance, np.eye(3)
-        )
-        return raise_eigenvalues(more, LEAST_M**2)
 
 
 def tied(people: Sequence[PersonGraph]) -> tuple[PersonGraph, ...]:

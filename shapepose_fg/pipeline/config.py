@@ -96,16 +96,17 @@ class SolvingConfig(Settings):
     alternations: Repeats = 3
     """N of Algorithm 1 frame by frame: maximum number of times that the body is fitted and the
     joints are solved. Most frames converge after one or two; the paper has 10."""
-    window_alternations: Repeats = 1
-    """N of Algorithm 1 over time, where a window starts from initial estimates: a second round
-    takes twice the time and changed the mean error by 0.1 to 0.2 mm. Windows with factors of your
-    own take `alternations`."""
     weight_shape: Factor = 1.0
     """w_shape of Eq. 5, multiplies the squared distances to the body model: decrease it for people
     whom it does not fit, in wide clothes or with a load."""
     motion: str = "constant velocity"
     """Motion model of joints, a name in `factors.MOTIONS`: "constant velocity" (white noise on
     acceleration), or "constant acceleration" (on jerk)."""
+
+    replaced: ClassVar[dict[str, str]] = {
+        "window_alternations": "was removed: over time bodies and joints are one problem"
+    }
+    """Settings of earlier versions, and their replacements."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -160,7 +161,7 @@ class PipelineConfig(Settings):
         "association": _CONSTANT,
         "tracking": f"{_CONSTANT}; min_new_joints and patience_s are in [people]",
         "window_graph": f"{_CONSTANT}; weight_shape is in [solving]",
-        "refine": f"{_CONSTANT}; alternations and window_alternations are in [solving]",
+        "refine": f"{_CONSTANT}; alternations is in [solving]",
     }
     """Tables of earlier versions, and their replacements."""
 
@@ -222,9 +223,7 @@ class PipelineConfig(Settings):
     @property
     def refine(self) -> RefineConfig:
         """Stage II: the alternation."""
-        own = self.solving
-        counts = {"alternations": own.alternations, "window_alternations": own.window_alternations}
-        return replace(self._rules(RefineConfig), **counts)
+        return replace(self._rules(RefineConfig), alternations=self.solving.alternations)
 
     @property
     def estimator(self) -> EstimatorConfig:

@@ -18,9 +18,8 @@ from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Known, Reconstruction, sigma_m
 from shapepose_fg.estimation.factor_shares import FactorEvidence, factor_evidence
-from shapepose_fg.estimation.linearisation import inverses, observation_sigmas, weakest_sigma
-from shapepose_fg.estimation.motion_model import LOST_M
-from shapepose_fg.estimation.window_graph import ExtraFactors, functions_of, name_of
+from shapepose_fg.estimation.linearisation import inverses, observation_sigmas
+from shapepose_fg.estimation.user_factors import ExtraFactors, functions_of, name_of
 from shapepose_fg.estimation.window_solution import PersonGraph
 from shapepose_fg.estimation.wrong_views import Seen, WrongView, wrong_view
 from shapepose_fg.io.validation import validated
@@ -299,18 +298,11 @@ def _view_reasons(
     people, table = all_of_it.people, all_of_it.table
     rows, gates = all_of_it.views.rows(np.array([row])), table.gate[row, joint]
     sigma, seen = all_of_it.seen.sigmas_px[row, joint], gates != Gate.NOT_SEEN
-    place, whole, of_body = people.joints[row, joint], None, np.zeros((3, 3))
-    evidence = list[FactorEvidence]()
+    place, evidence = people.joints[row, joint], list[FactorEvidence]()
     solved = [] if graph is None else np.flatnonzero(graph.frames == people.frame[row]).tolist()
-    if (
-        graph is not None
-        and solved
-        and np.isfinite(graph.solved_covariance[solved[0], joint]).all()
-    ):
-        t, estimator = solved[0], config.estimator
-        place, whole = graph.solved[t, joint], np.linalg.inv(graph.solved_covariance[t, joint])
-        of_body = estimator.graph.weight_shape * graph.body.information[t, joint]
-        evidence = factor_evidence(graph.window, t, joint)
+    known = None if graph is None or not solved else graph.sources(solved[0], joint)
+    if graph is not None and known is not None:
+        place, evidence = known.place, factor_evidence(graph.window, solved[0], joint)
     xy, _, slope = (each[0, 0] for each in rows.project(place[None, None]))
     residual = xy - table.xy[row, joint]
     information, gradient = np.zeros((len(gates), 3, 3)), np.zeros((len(gates), 3))
@@ -325,23 +317,16 @@ def _view_reasons(
             weight * slope[v].T @ slope[v],
             weight * slope[v].T @ residual[v],
         )
-    if (
-        whole is not None
-        and graph is not None
-        and graph.window.temporal
-        and not graph.window.touched[joint]
-    ):
-        # In the solver's graph, detections have only the white share of their variance.
-        seen_well = weakest_sigma(information.sum(axis=0)) <= LOST_M
-        whole *= graph.lasting.white_share if seen_well else 1.0
-    if whole is None:
-        whole = information.sum(axis=0) + of_body + np.eye(3)
+    whole, of_body = information.sum(axis=0) + np.eye(3), np.zeros((3, 3))
+    if known is not None:
+        whole, of_body = known.whole, known.of_body
+        information, gradient = information / known.widen, gradient / known.widen
     of_factors = [each.information for each in evidence]
     rest = np.trace(whole - information.sum(axis=0) - of_body - sum(of_factors))
     parts = [*information, *of_factors, of_body]
-    known = [float(np.trace(np.linalg.solve(whole, part))) / 3 for part in parts]
-    known.append(max(1.0 - sum(known), 0.0) if rest > 0 else 0.0)
-    known = [each / max(sum(known), 1e-9) for each in known]
+    shares = [float(np.trace(np.linalg.solve(whole, part))) / 3 for part in parts]
+    shares.append(max(1.0 - sum(shares), 0.0) if rest > 0 else 0.0)
+    shares = [each / max(sum(shares), 1e-9) for each in shares]
     reasons = []
     for v, name in enumerate(table.view_names.tolist()):
         off_px = off_sigma = None
@@ -367,12 +352,12 @@ def _view_reasons(
             residual_px=_pair(table.residual_px[row, joint, v]),
             off_px=off_px,
             off_sigma=off_sigma,
-            share=known[v],
+            share=shares[v],
             looks_like=like,
         )
         reasons.append(reason)
     told = dict[tuple[str, tuple[str, ...]], float]()
-    for each, share in zip(evidence, known[len(gates) :], strict=False):
+    for each, share in zip(evidence, shares[len(gates) :], strict=False):
         tied = ((who, people.joint_names[number]) for who, number, _ in each.others)
         mine = int(people.person[row])
         others = tuple(
@@ -382,7 +367,7 @@ def _view_reasons(
         )
         told[each.name, others] = told.get((each.name, others), 0.0) + share
     factors = tuple(FactorReason(*which, share) for which, share in told.items())
-    return tuple(reasons), factors, (known[-2], known[-1])
+    return tuple(reasons), factors, (shares[-2], shares[-1])
 
 
 def _looks_like(

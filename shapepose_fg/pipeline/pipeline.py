@@ -26,7 +26,7 @@ from shapepose_fg.core.storage.kept_arrays import InMemory, KeptArrays
 from shapepose_fg.core.trust import with_poses
 from shapepose_fg.estimation.floor import Floor
 from shapepose_fg.estimation.trajectory_graph import CameraFactors
-from shapepose_fg.estimation.window_graph import ExtraFactors, functions_of, name_of
+from shapepose_fg.estimation.user_factors import ExtraFactors, functions_of, name_of
 from shapepose_fg.pipeline.bodies_over_time import Person, fit_everybody
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.execution import Execution

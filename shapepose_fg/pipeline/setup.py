@@ -19,7 +19,7 @@ from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.noise_law import NoiseLaw
-from shapepose_fg.estimation.window_graph import ExtraFactors
+from shapepose_fg.estimation.user_factors import ExtraFactors
 from shapepose_fg.estimation.window_solution import WindowSolution
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.keyframes import with_rows_between

@@ -10,11 +10,13 @@ import numpy as np
 
 from shapepose_fg.body.fitting.evidence import LEAST_JOINTS
 from shapepose_fg.body.fitting.fitter import BodyFitter
+from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.detections import Input
 from shapepose_fg.core.observations import Observations, rows_in
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.asynchronous_views import carried_to_frames, velocities_of, widened
+from shapepose_fg.estimation.body_solution import solve_bodies
 from shapepose_fg.estimation.body_step import BodyStep, disagreement
 from shapepose_fg.estimation.draft import Draft, redraft
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
@@ -23,8 +25,9 @@ from shapepose_fg.estimation.linearisation import linearise, mean_confidence
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.reported_covariance import outcome
 from shapepose_fg.estimation.smoothing import smoothed
-from shapepose_fg.estimation.state import State, parts_of
-from shapepose_fg.estimation.window_graph import ExtraFactors, WindowGraph, functions_of
+from shapepose_fg.estimation.state import State
+from shapepose_fg.estimation.user_factors import ExtraFactors, functions_of
+from shapepose_fg.estimation.window_graph import WindowGraph
 from shapepose_fg.estimation.window_solution import WindowSolution
 from shapepose_fg.tracking.reassociation import LEAST_PROBABILITY, changed, reassociate
 
@@ -59,15 +62,15 @@ def solve_window(
 ) -> WindowSolution:
     """Joints, covariances, bodies and graphs of N rows in any order; (track, frame) must be unique.
 
-    Rows of one track at several frames are a window, one factor graph; a single row of a track is
-    solved by the frame-by-frame method, which with the paper's `EstimatorConfig` is its Algorithm
-    1. `views` are the cameras, by row if they move. `extra_factors`, one function or several, add
+    Rows of one track at several frames are a window, one factor graph with a body in every frame.
+    A single row of a track is solved by the frame-by-frame method, which with the paper's
+    `EstimatorConfig` is its Algorithm 1, and so are all rows where the fitter has no body model.
+    `views` are the cameras, by row if they move. `extra_factors`, one function or several, add
     factors of your own to every window. Without `assigning` detections keep their people.
 
-    In each round the body is fitted to estimates of all joints from the views only, and then
-    constrains the joints. Its constraint on a joint excludes that joint's own views
-    (`BodyFit.prior_xyz`), so that no measurement counts twice. Motion constrains the joints, never
-    the targets of the body.
+    Frame by frame, in each round the body is fitted to estimates of all joints from the views only,
+    and then constrains the joints. Its constraint on a joint excludes that joint's own views
+    (`BodyFit.prior_xyz`), so that no measurement counts twice.
     """
     if len(views) != observations.confidence.shape[2] or views.rows_known not in (
         None,
@@ -102,8 +105,17 @@ def solve_window(
             break
     assigned = time.perf_counter()
 
+    over_time = len(np.unique(observations.track)) < len(observations)
+    functions = functions_of(extra_factors)
+    if config.refine.with_body and over_time and fitter.model is not None:
+        solution = solve_bodies(observations, views, fitter, config, motion, functions)
+        solution.seconds.update(
+            {"associate again": assigned - began, "solve": time.perf_counter() - assigned}
+        )
+        return solution
+
     # Initial estimate: X_0, standard deviations of the observations there, and all graphs.
-    state = State.start(observations, views, fitter, config, motion, functions_of(extra_factors))
+    state = State.start(observations, views, fitter, config, functions)
     moving, velocity = state.people, velocities_of(observations, state.joints)
     for n in range(config.refine.alternations if len(moving) > 0 else 0):  # Algorithm 1
         rows = np.concatenate([person.rows for person in moving])
@@ -140,37 +152,26 @@ def solve_window(
         pulled |= evidence.sigma_m > config.refine.max_sigma_m
         of_body = step.message(body, targets, pulled)
 
-        # Joints: the X step. Single-frame graphs are solved by GTSAM only after convergence.
-        parts = parts_of(moving)
-        near = X
-        if any(map(_waits, moving)):
-            near = solve_between(observed, sigma, cameras, evidence, of_body, config)
-        now = [(person, part) for person, part in parts if not _waits(person)]
+        # Joints: the X step. Graphs are solved by GTSAM only after convergence, but for those with
+        # user factors.
+        parts = [(person, slice(k, k + 1)) for k, person in enumerate(moving)]
+        near = solve_between(observed, sigma, cameras, evidence, of_body, config)
+        now = [(person, part) for person, part in parts if len(person.ties.factors) > 0]
         solve_joints(now, evidence, of_body, config)
-        X_new = near.copy()
-        for person, part in now:
-            X_new[part] = person.positions
+        X_new = _solved(near, now)
 
         # Convergence: the body was fitted to the current joints, and joints constrained by it did
         # not move.
         before = np.where((of_body.known | wrong)[..., None], X, fitted)
         still = np.linalg.norm(X_new - before, axis=-1) < config.refine.settled_m
         settled = (still | np.isnan(X_new).any(axis=-1)).all(axis=1)
-        last, more = n + 1 == config.refine.alternations, n + 1 < config.refine.window_alternations
+        last = n + 1 == config.refine.alternations
         unsettled = {id(person.ties) for person, part in parts if not settled[part].all()}
-        moving, done = list[WindowGraph](), list[tuple[WindowGraph, slice]]()
-        for person, part in parts:
-            goes_on = more or not person.temporal or len(person.ties.factors) > 0
-            if not last and goes_on and id(person.ties) in unsettled:
-                moving.append(person)
-            elif _waits(person):
-                done.append((person, part))
+        done = [each for each in parts if last or id(each[0].ties) not in unsettled]
+        moving = [] if last else [person for person, _ in parts if id(person.ties) in unsettled]
+        done = [each for each in done if len(each[0].ties.factors) == 0]
         solve_joints(done, evidence, of_body, config, near)
-        for person, part in done:
-            X_new[part] = person.positions
-        for person, _ in parts:
-            velocity[person.rows] = np.nan_to_num(person.velocity)
-        state.put(rows, X_new, evidence, wrong, of_body, body)
+        state.put(rows, _solved(X_new, done), evidence, wrong, of_body, body)
         if len(moving) == 0:
             break
     solution = outcome(state, fitter)
@@ -180,6 +181,9 @@ def solve_window(
     return solution
 
 
-def _waits(person: WindowGraph) -> bool:
-    """Whether a person's graph is solved only in the last round."""
-    return not person.temporal and len(person.ties.factors) == 0
+def _solved(joints: Array, parts: Sequence[tuple[WindowGraph, slice]]) -> Array:
+    """Joints (R, J, 3), with those of some people as their graphs have them."""
+    found = joints.copy()
+    for person, part in parts:
+        found[part] = person.positions
+    return found

@@ -22,7 +22,7 @@ from shapepose_fg.core.run_summary import covered_frames
 from shapepose_fg.estimation.floor import Floor
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.noise_law import NoiseLaw
-from shapepose_fg.estimation.window_graph import ExtraFactors
+from shapepose_fg.estimation.user_factors import ExtraFactors
 from shapepose_fg.estimation.window_solution import PersonGraph, WindowSolution
 from shapepose_fg.io.config import ANOTHER_VERSION, config_from
 from shapepose_fg.io.solved_setup import CAMERAS, cameras_of
@@ -31,6 +31,9 @@ from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.keyframes import looked_at, with_rows_like
 from shapepose_fg.pipeline.solve_window import solve_window
 from shapepose_fg.pipeline.windows import near_border, window_stop
+
+_OUTSIDE_PX = 1e6
+"""Coordinate of a detection that the result did not use, outside of all gates, px."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +118,7 @@ def window_solutions(
     ValueError if there are no observations.
     """
     solver = Solver.of(people, rig)
-    for _, part, solution in _solved(people, solver, extra_factors):
+    for _, part, solution in _solved(people, solver, extra_factors, again=True):
         for person in solution.people:
             as_reported = {
                 "joints": part.joints[person.rows],
@@ -139,7 +142,9 @@ def solved_around(
         people = people.rows(
             people.person == person if solver.config.temporal else people.frame == frame
         )
-    found = [solution for _, _, solution in _solved(people, solver, extra_factors, frame)]
+    found = [
+        solution for _, _, solution in _solved(people, solver, extra_factors, frame, again=True)
+    ]
     return next(
         (each for solution in found for each in solution.people if each.person == person), None
     )
@@ -150,9 +155,12 @@ def _solved(
     solver: Solver,
     extra_factors: ExtraFactors | None,
     frame: int | None = None,
+    *,
+    again: bool = False,
 ) -> Iterator[tuple[range, Reconstruction, WindowSolution]]:
     """Solve all windows, or that of one `frame`; yields its own frames, the rows including the
-    overlap, and the solution.
+    overlap, and the solution: with `again` that of the result, from its joints and, without user
+    factors, the detections that it used.
     """
     if rows.observations is None:
         raise ValueError(
@@ -170,10 +178,13 @@ def _solved(
         if config.windows.keyframe_s > 0:
             part = part.rows(looked_at(part))
         assert part.observations is not None
-        # Initialised from the views: the current joints may be another person's.
-        observations = part.observations.observations(
-            np.full_like(part.joints, np.nan), part.time_s
-        )
+        # Initialised from the views, as the current joints may be another person's, unless they are
+        # to be found again.
+        start = part.joints if again else np.full_like(part.joints, np.nan)
+        observations = part.observations.observations(start, part.time_s)
+        if again and extra_factors is None:
+            used = part.observations.used[..., None] | ~observations.seen[..., None]
+            observations = replace(observations, xy=np.where(used, observations.xy, _OUTSIDE_PX))
         views = Views.of(rig, observations.time_s)
         found = solve_window(
             observations, views, solver.fitter, settings, extra_factors=extra_factors

@@ -10,7 +10,6 @@ from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.estimator_config import EstimatorConfig, WindowGraphConfig
 from shapepose_fg.estimation.joint_step import solve_between, solve_joints
 from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, observation_sigmas
-from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.window_graph import WindowGraph
 
 BODY_ONLY, NOWHERE = 4, 7
@@ -38,10 +37,9 @@ def test_the_kernel_and_the_graph_agree(five_cameras, two_people, kernel, moving
     body = JointTargets(two_people + rng.normal(0, 0.05, two_people.shape), pulled)
 
     between = solve_between(seen, sigmas, views, evidence, body, config)
-    motion = MotionModel.load(BODY_25.joints, config.motion, config.law)
     for row in range(2):
         rows = np.array([row])
-        person = WindowGraph(seen.rows(rows), sigmas[rows], views.rows(rows), config, motion, rows)
+        person = WindowGraph(seen.rows(rows), sigmas[rows], views.rows(rows), config, rows)
         solve_joints([(person, slice(row, row + 1))], evidence, body, config)
         alone = person.positions
         # Detections and bodies are centimetres off; under the robust kernel the last steps are

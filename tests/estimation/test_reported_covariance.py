@@ -7,14 +7,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter
+from shapepose_fg.body.fitting.fitter import BodyFit
 from shapepose_fg.core.reconstruction import Known
 from shapepose_fg.estimation.draft import drafted
 from shapepose_fg.estimation.in_time import smoothed_in_time
-from shapepose_fg.estimation.limbs import limb_steps, with_lengths
 from shapepose_fg.estimation.linearisation import ViewEvidence
-from shapepose_fg.estimation.motion_model import CorrelatedError
-from shapepose_fg.estimation.reported_covariance import how_known, problems, with_lasting
+from shapepose_fg.estimation.reported_covariance import how_known, problems
 
 I3 = np.eye(3)
 
@@ -50,59 +48,8 @@ def test_a_joint_is_seen_or_the_body_s_or_carried_by_motion():
     assert found.dtype == np.uint8
 
 
-def window(times_s, with_offsets):
-    return SimpleNamespace(
-        times_s=np.asarray(times_s),
-        with_offsets=np.asarray(with_offsets),
-        touched=np.zeros(len(with_offsets), bool),
-        rows=np.arange(len(times_s)),
-        failure="",
-    )
-
-
-def test_errors_that_last_are_added_to_what_the_graph_knows():
-    """Joint 0 is seen in all four frames; joint 1 in the second and the last; joint 2 is solved
-    with offsets.
-
-    Of a share f of the views' error that is new in every frame, the graph's marginal holds all, of
-    which motion takes too much by `kept`; what lasts is that of the nearest frame in which the
-    joint was seen. What sees little of it is solved with an offset, whose error the marginal has.
-    """
-    f, kept = 0.3, 0.2
-    sigma = np.full((4, 3), 0.02)
-    sigma[[0, 2], 1] = 0.15  # over 10 cm: not seen, but a little
-    body = np.full((4, 3), 0.05)
-    motion = SimpleNamespace(views=CorrelatedError(f, 1.0, kept))
-    state = SimpleNamespace(of_views=message(sigma), of_body=message(body), motion=motion)
-    rng = np.random.default_rng(0)
-    root = rng.normal(0, 0.01, (4, 3, 3, 3))
-    marginal = root @ root.swapaxes(2, 3) + 1e-4 * I3
-    here = window([0.0, 0.1, 0.4, 0.5], [False, False, True])
-    found = with_lasting(state, here, marginal)
-    left = I3 / (0.02**-2 + 0.05**-2)
-    for frame in range(4):
-        lasting = (1 - f + kept * f) * left
-        np.testing.assert_allclose(found[frame, 0], (1 - kept) * marginal[frame, 0] + lasting)
-        if frame in (1, 3):
-            np.testing.assert_allclose(found[frame, 1], (1 - kept) * marginal[frame, 1] + lasting)
-        else:
-            np.testing.assert_allclose(found[frame, 1], marginal[frame, 1] + lasting)
-        np.testing.assert_allclose(found[frame, 2], marginal[frame, 2])
-
-
-def test_the_nearest_frame_in_which_it_was_seen_is_carried_along():
-    """Seen in the first frame to 1 cm and in the last to 8: between them by the clock, not by the
-    count.
-    """
-    sigma = np.array([[0.01], [np.inf], [np.inf], [0.08]])
-    nobody = message(np.full((4, 1), np.inf))
-    marginal = np.broadcast_to(0.03**2 * I3, (4, 1, 3, 3))
-    here = window([0.0, 0.1, 0.2, 1.0], [False])
-    motion = SimpleNamespace(views=CorrelatedError(0.5, 1.0))
-    state = SimpleNamespace(of_views=message(sigma), of_body=nobody, motion=motion)
-    found = with_lasting(state, here, marginal)
-    extra = np.sqrt(np.diagonal(found - marginal, axis1=2, axis2=3))[:, 0, 0]
-    np.testing.assert_allclose(extra, np.sqrt(0.5) * np.array([0.01, 0.01, 0.01, 0.08]), rtol=1e-6)
+def window(joints):
+    return SimpleNamespace(touched=np.zeros(joints, bool), rows=np.arange(1), failure="")
 
 
 def solved(away_m, sigma_m=0.02, body_sigma_m=np.inf):
@@ -131,7 +78,7 @@ def test_a_joint_far_from_all_that_is_said_of_it_ran_away():
     """Half a metre and 20 standard deviations, both: 0.49 m is 24 of 2 cm, 0.6 m only 15 of 4
     cm.
     """
-    here = window([0.0], [False, False])
+    here = window(2)
     assert set(reasons(solved([0.51, 0.49]), here)) == {0}
     assert reasons(solved([0.6, 0.0], sigma_m=0.04), here) == {}
     assert set(reasons(solved([0.9, 0.0], sigma_m=0.04), here)) == {0}
@@ -141,14 +88,14 @@ def test_a_joint_far_from_all_that_is_said_of_it_ran_away():
 
 
 def test_a_joint_with_a_factor_of_one_s_own_ran_away_after_a_metre():
-    here = window([0.0], [False, False, False])
+    here = window(3)
     here.touched = np.array([True, True, False])
     first = np.array([[[1.01, 0, 0], [0.99, 0, 0], [5.0, 0, 0]]])
     assert reasons(solved([0.0, 0.0, 0.0]), here, first=first) == {0: "diverged from its views"}
 
 
 def test_what_nothing_determines_and_what_the_solver_says():
-    here = window([0.0], [False, False])
+    here = window(2)
     covariance = np.full((1, 2, 3, 3), np.nan)
     covariance[0, 1] = I3
     assert reasons(solved([0.0, 0.0]), here, covariance) == {
@@ -208,60 +155,8 @@ def test_a_draft_without_a_body_is_the_views_and_without_both_nothing():
     )
 
 
-class Beside(BodyFitter):
-    """A fitter whose body has every joint 30 cm higher; remembers what it was given."""
-
-    def fit(self, targets, initial=None, groups=None):
-        self.targets = targets
-        return SimpleNamespace(joints=targets.xyz + np.array([0.0, 0.0, 0.3]))
-
-
-def test_unseen_joints_go_towards_the_body_the_more_the_less_they_are_known():
-    """C / (C + (3 cm)²) of 30 cm: half at 3 cm, nine tenths at 9; seen joints and those not placed
-    stay.
-    """
-    joints = np.zeros((2, 4, 3))
-    joints[0, 3] = np.nan
-    sigma = np.array([[0.03, 0.09, 0.09, 0.09], [0.03] * 4])
-    unseen = np.array([[True, True, False, True], [False] * 4])
-    fitter = Beside()
-    steps = limb_steps(joints, sigma[..., None, None] ** 2 * I3, unseen, fitter)  # type: ignore[arg-type]
-    np.testing.assert_allclose(steps[0, :, 2], [0.15, 0.27, 0.0, 0.0])
-    assert (steps[1] == 0).all() and (steps[..., :2] == 0).all()
-    assert fitter.targets.xyz.shape == (1, 4, 3), "only people with such a joint are fitted"
-    np.testing.assert_allclose(
-        fitter.targets.information[0, :3], sigma[0, :3, None, None] ** -2.0 * I3
-    )
-    assert (fitter.targets.information[0, 3] == 0).all()
-    assert (limb_steps(joints, sigma[..., None, None] ** 2 * I3, unseen & False, fitter) == 0).all()  # type: ignore[arg-type]
-
-
 def test_smoothing_in_time_is_a_gaussian_mean():
     values, times = np.array([[0.0], [1.0], [4.0]]), np.array([0.0, 0.07, 0.24])
     weight = np.exp([0.0, -0.5 * 0.7**2, -0.5 * 2.4**2])  # 0, 0.7 and 2.4 widths off
     smooth = smoothed_in_time(values, times, 0.1)
     assert smooth[0, 0] == pytest.approx((weight[1] + 4 * weight[2]) / weight.sum())
-
-
-@pytest.mark.parametrize(("first_sigma", "second_sigma"), [(0.3, 0.3), (0.1, 0.5), (0.0, 0.3)])
-def test_the_ends_of_a_limb_share_what_is_missing_by_what_is_not_known(first_sigma, second_sigma):
-    """One limb of 50 cm that should be 30: in each of four sweeps v / (v + (10 cm)²) of what is
-    left goes.
-    """
-    joints = np.array([[[0.0, 0, 0], [0.5, 0, 0]]])
-    sigma = np.array([[max(first_sigma, 1e-9), second_sigma]])
-    covariance = sigma[..., None, None] ** 2 * I3
-    moved = np.array([[first_sigma > 0, True]])
-    found = with_lengths(joints, covariance, moved, np.array([0.3]), [(0, 1)])
-    variance = first_sigma**2 + second_sigma**2
-    missing = 0.2 * (1 - (0.1**2 / (variance + 0.1**2)) ** 4)
-    np.testing.assert_allclose(
-        found[0, :, 0],
-        [missing * first_sigma**2 / variance, 0.5 - missing * second_sigma**2 / variance],
-    )
-    unknown = with_lengths(joints, covariance, moved, np.array([np.nan]), [(0, 1)])
-    np.testing.assert_array_equal(unknown, joints)
-    lost = with_lengths(
-        np.where(joints == 0.5, np.nan, joints), covariance, moved, np.array([0.3]), [(0, 1)]
-    )
-    np.testing.assert_array_equal(lost[0, 0], joints[0, 0])

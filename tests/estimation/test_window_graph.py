@@ -1,4 +1,4 @@
-"""The X step: one person's graph of one frame and of many, against closed forms and against
+"""The X step: one person's graph of a frame, against closed forms and against
 SciPy.
 """
 
@@ -12,17 +12,14 @@ from factors import DEFAULT_WIDTH_SIGMA, split_key
 from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.observations import Observations
-from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.estimator_config import EstimatorConfig, WindowGraphConfig
 from shapepose_fg.estimation.linearisation import ObservationConfig
-from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.state_covariances import state_covariances
 from shapepose_fg.estimation.window_graph import WindowGraph
 
 EXACT = WindowGraphConfig(max_iterations=100, tolerance=1e-12)
 """Solved to the end, so that the comparison is with the minimum and not with the stopping rule."""
 NO_PRIOR = np.zeros(25, dtype=bool)
-MOTION = MotionModel.load(BODY_25.joints)
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +51,7 @@ def window_of(rig: Rig, xy, sigmas, config, kernel, frames, person=0) -> WindowG
         np.repeat(0.1 * np.arange(len(frame))[:, None], V, axis=1),
     )
     settings = EstimatorConfig(ObservationConfig(kernel=kernel or "none"), config)
-    return WindowGraph(seen, sigmas, Views.of(rig), settings, MOTION)
+    return WindowGraph(seen, sigmas, Views.of(rig), settings)
 
 
 class OneFrame:
@@ -76,10 +73,10 @@ class OneFrame:
         self.body = message(pulled, mean, covariance)
 
     def solve(self, initial):
-        return self.window.solve(self.inlier[None], self.body, self.body, initial[None])[0]
+        return self.window.solve(self.inlier[None], self.body, initial[None])[0]
 
     def covariance(self):
-        return state_covariances([self.window])[0][0][0]
+        return state_covariances([self.window])[0][0]
 
     @property
     def graph(self):
@@ -281,10 +278,7 @@ def test_weights_divide_the_covariances(five_cameras, person):
 
 
 @pytest.mark.parametrize("kernel", ["huber", "cauchy", "geman_mcclure", "tukey"])
-@pytest.mark.parametrize("frames", [1, 2])
-def test_the_weight_of_the_views_multiplies_their_cost_kernel_and_all(
-    five_cameras, person, kernel, frames
-):
+def test_the_weight_of_the_views_multiplies_their_cost_kernel_and_all(five_cameras, person, kernel):
     """One view is 60 px off, where every kernel bends: four times the weight is four times the
     cost.
     """
@@ -293,11 +287,11 @@ def test_the_weight_of_the_views_multiplies_their_cost_kernel_and_all(
     xy[:, 2, 0] += 60.0
     costs = []
     for weight in (1.0, 4.0):
-        observed = np.tile(xy, (frames, 1, 1, 1)), np.tile(sigmas, (frames, 1, 1))
+        observed = xy[None], sigmas[None]
         config = WindowGraphConfig(weight_2d=weight, max_iterations=1)
-        window = window_of(five_cameras, *observed, config, kernel, range(frames))
-        none = JointTargets(np.zeros((frames, 25, 3)), np.zeros((frames, 25, 3, 3)))
-        window.solve(observed[1] > 0, none, none, np.tile(truth, (frames, 1, 1)))
+        window = window_of(five_cameras, *observed, config, kernel, [0])
+        none = JointTargets(np.zeros((1, 25, 3)), np.zeros((1, 25, 3, 3)))
+        window.solve(observed[1] > 0, none, truth[None])
         values = gtsam.Values()
         for key in window.values.keys():  # noqa: SIM118 - GTSAM's, not a dictionary's
             values.insert(key, truth[split_key(key).joint] if key in window.keys else np.zeros(3))
@@ -305,28 +299,15 @@ def test_the_weight_of_the_views_multiplies_their_cost_kernel_and_all(
     assert costs[1] == pytest.approx(4.0 * costs[0], rel=1e-9)
 
 
-@pytest.mark.parametrize(
-    "frames",
-    [[1, 0], [3, 3]],
-)
-def test_frames_that_do_not_rise_are_refused(five_cameras, person, frames):
-    _, xy, sigmas = person
-    with pytest.raises(ValueError, match="frames of a person must increase"):
-        window_of(five_cameras, np.stack([xy, xy]), np.stack([sigmas, sigmas]), EXACT, None, frames)
-
-
 def test_a_factor_added_late_counts(five_cameras, person):
     """What was asked of the graph before does not matter."""
     _, xy, sigmas = person
-    both = np.stack([xy, xy]), np.stack([sigmas, sigmas])
-    window = window_of(five_cameras, *both, EXACT, None, [0, 1])
-    assert not window.touched.any() and not window.with_offsets.any() and window.coupled == []
+    window = window_of(five_cameras, xy[None], sigmas[None], EXACT, None, [0])
+    assert not window.touched.any() and window.coupled == []
     noise = gtsam.noiseModel.Isotropic.Sigma(1, 0.01)
-    for frame in range(2):
-        for one, other in ((3, 4), (6, 7), (4, 2)):
-            window.add(gtsam.RangeFactor3(*window.keys[frame, [one, other]].tolist(), 0.3, noise))
+    for one, other in ((3, 4), (6, 7), (4, 2)):
+        window.add(gtsam.RangeFactor3(*window.keys[0, [one, other]].tolist(), 0.3, noise))
     assert np.flatnonzero(window.touched).tolist() == [2, 3, 4, 6, 7]
-    np.testing.assert_array_equal(window.with_offsets, window.touched)
     assert sorted(window.coupled, key=sorted) == [{2, 3, 4}, {6, 7}]
 
 
@@ -491,17 +472,3 @@ def test_what_is_known_to_more_than_ten_metres_is_not_determined(five_cameras, p
         graph.solve(start)
         determined = np.isfinite(graph.covariance()).all(axis=(1, 2))
         assert np.flatnonzero(determined).tolist() == [3, 5] + [6] * (not whole_system_is_singular)
-
-
-def test_in_a_frame_alone_a_joint_lost_from_sight_is_pulled_as_any_other(five_cameras, person):
-    """Offsets are for windows of several frames: here the body's pull counts, whatever is said to
-    be lost.
-    """
-    truth, xy, sigmas = person
-    graph = OneFrame(five_cameras, xy, sigmas, EXACT, None, 0, 0)
-    pulled = np.arange(25) == 4
-    body = message(pulled, truth + 0.1, np.tile(0.01**2 * np.eye(3), (25, 1, 1)))
-    asked = np.ones((1, *sigmas.shape), dtype=bool), body, body, truth[None]
-    plain = graph.window.solve(*asked).copy()
-    np.testing.assert_array_equal(graph.window.solve(*asked, pulled[None]), plain)
-    assert np.linalg.norm(plain[0, 4] - truth[4]) > 0.02, "it is pulled"

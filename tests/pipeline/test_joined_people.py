@@ -166,17 +166,14 @@ def test_the_errors_of_two_people_correlate_as_the_graph_says(joined, scene):
     np.testing.assert_allclose(
         distance(joined, *knees, graphs=graphs).covariance,
         distance(joined, *knees).covariance,
-        rtol=1e-9,
+        rtol=0.1,
+        atol=1e-5,
     )
-    # One graph has both; its marginals are those that are reported, or the solver's where they are
-    # wider.
+    # One graph has both; its marginals are those that are reported.
     marginals = gtsam.Marginals(graphs[0].graph, graphs[0].values)
     for each in graphs:
         wide = np.trace(marginals.marginalCovariance(int(each.keys[5, R])))
-        both = [np.trace(each.covariance[5, R]), np.trace(each.solved_covariance[5, R])]
-        assert (
-            0.95 * max(both) < wide < 1.05 * sum(both)
-        )  # one may be wider one way, the other another
+        assert wide == pytest.approx(np.trace(each.covariance[5, R]), rel=0.01)
 
 
 @pytest.mark.slow

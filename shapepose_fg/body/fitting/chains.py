@@ -126,6 +126,37 @@ class Links:
         edge = np.zeros_like(v[:1])
         return energy, np.concatenate((edge, after)) - np.concatenate((before, edge))
 
+    def linear(self, root: Array, others: Array) -> list[tuple[list[Array], Array]]:
+        """Whitened parts of the prior around rotations of the root (T, 3, 3) and the other
+        parameters (T, N - 3).
+
+        A part is its K matrices, (S, N, N) each, of rows that follow each other, and its residuals
+        (S, N).
+        """
+        turn, N = log_so3(root[1:] @ root[:-1].swapaxes(1, 2)), self._slow.shape[1]
+        count = len(turn)
+        rate, slow = self._rate[:count], self._slow[:count]
+        v = rate * np.concatenate((turn, others[1:] - others[:-1]), -1)
+        to, of = (np.tile(np.eye(N), (count, 1, 1)) for _ in range(2))
+        inverse = right_jacobian_inverse(turn)
+        to[:, :3, :3], of[:, :3, :3] = inverse.swapaxes(1, 2), inverse
+        to, of = to * rate[..., None], -of * rate[..., None]
+        found = [
+            ([np.sqrt(slow)[..., None] * of, np.sqrt(slow)[..., None] * to], np.sqrt(slow) * v)
+        ]
+        K = count - len(self._weights) + 1
+        if K <= 0:
+            return found
+        wide = np.sqrt(self._smooth[:K])[..., None]
+        matrices = [np.zeros((K, N, N)) for _ in range(len(self._weights) + 1)]
+        change = np.zeros((K, N))
+        for i, weight in enumerate(self._weights):
+            w = wide * weight[:K, :, None]
+            matrices[i] += w * of[i : i + K]
+            matrices[i + 1] += w * to[i : i + K]
+            change += wide[..., 0] * weight[:K] * v[i : i + K]
+        return [*found, (matrices, change)]
+
     def _couplings(self) -> list[Array]:
         """H = V^T M V with difference operator V and banded M; returns the diagonals (T, N), main
         diagonal first.

@@ -1,0 +1,515 @@
+"""A person over a window as one model: a body in every frame, one shape, and joints that lie near
+the body's.
+
+    E(X, Theta) = sum rho(|Pi_v X_tj - x_tjv|² / sigma²) + sum |X_tj - J_j(theta_t, beta)|² / s²
+                + |beta|² - 2 (dt / 1 s) log p(theta_t) + motion(theta_t, theta_t+1, theta_t+2)
+
+The first sum is Eq. 1 with the gates of Eq. 2, the second Eq. 3 with a measured `s` and without a
+threshold. Joints X are eliminated from every step in closed form: three unknowns each that only
+their body is connected to.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from factors import DEFAULT_WIDTH_SIGMA, Motion
+from shapepose_fg.body.fitting.chains import Links
+from shapepose_fg.body.fitting.energy import BodyEnergy, EnergyTargets, Held, nothing
+from shapepose_fg.body.fitting.fitter import JointTargets
+from shapepose_fg.body.fitting.priors import MotionPrior, PosePrior
+from shapepose_fg.body.kernels.solving import eliminated, put_back
+from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
+from shapepose_fg.body.model.rotation import exp_so3, log_so3
+from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.core.camera import Views
+from shapepose_fg.core.observations import Observations
+from shapepose_fg.estimation.asynchronous_views import carried_to_frames, leads, velocities_of
+from shapepose_fg.estimation.contact import (
+    FREE_M2_S,
+    UNSEEN_S,
+    held_in_place,
+    standing_density,
+)
+from shapepose_fg.estimation.in_time import moments, motion_of, near_in_time, velocities
+from shapepose_fg.estimation.linearisation import (
+    ObservationConfig,
+    ViewEvidence,
+    inverses,
+    linearise,
+)
+from shapepose_fg.estimation.motion_model import MotionModel
+
+DEVIATION_M = 0.007
+"""Standard deviation of a detector's joint from the body's, metres per axis."""
+POSE_LASTS_S = 1.0
+"""A pose is as good as independent of the one before after so long, seconds: the pose prior counts
+once in it."""
+_LEVER_M = 0.05
+"""A rotation that moves a keypoint by less per radian, metres, does not decide how fast that
+keypoint is."""
+_STRAYS_M = 0.07
+"""Standard deviation, m, of an unseen joint of the body at which its own deviation is as large:
+errors of poses that nothing shows are larger than their Gaussian when they are large."""
+_STEPS, _SETTLED_M = 8, 5e-4
+"""Most steps of the solver; it ends when joints move by less on average, metres."""
+HELD = 1e-6
+"""Information on every unknown, so that what nothing determines stays where it is."""
+_DAMPING = 1e-3
+
+
+@dataclass(frozen=True)
+class BodyState:
+    """The variables of a window."""
+
+    betas: Array
+    """(10,) shape."""
+    root: Array
+    """(T, 3, 3) rotation of the root."""
+    others: Array
+    """(T, N - 3) visible angles, rad, and place, metres around the window's origin."""
+    deviation: Array
+    """(T, J, 3) X - J(theta, beta), metres."""
+
+    def moved(self, shape: Array, pose: Array) -> "BodyState":
+        """After a step of betas and poses (T, N), the root's in tangents of the world."""
+        return replace(
+            self,
+            betas=self.betas + shape,
+            root=exp_so3(pose[:, :3]) @ self.root,
+            others=self.others + pose[:, 3:],
+        )
+
+    @property
+    def free(self) -> Array:
+        """(T, P) parameters of `BodyEnergy`."""
+        betas = np.broadcast_to(self.betas, (len(self.root), 10))
+        return np.concatenate((betas, log_so3(self.root), self.others), 1)
+
+
+@dataclass(frozen=True)
+class _Around:
+    """What the model says around a state."""
+
+    cost: float
+    """E, in squared standard deviations."""
+    system: Array
+    """(T, M, P) normal equations of each row, joints eliminated (`body/kernels/solving.py`)."""
+    pull: Array
+    """(T, N) half the gradient of the motion."""
+    bodies: Array
+    """(T, J, 3) joints of the body, metres around the origin."""
+    evidence: ViewEvidence
+    """What the views say around the joints X."""
+    gain: Array
+    """(T, J, 3, 3) (1 + s² L)^-1 s² L: what share of the way from the body's joint to the views' X
+    goes."""
+    target: Array
+    """(T, J, 3) where the views have the joints, metres around the origin; anything where they say
+    nothing."""
+
+
+class BodyWindow:
+    """The model of one person in T frames; T = 1 is a frame by itself, without motion."""
+
+    def __init__(
+        self,
+        observations: Observations,
+        sigmas_px: Array,
+        views: Views,
+        model: BodyModel,
+        config: ObservationConfig,
+        motion: MotionModel,
+        law: Motion,
+        *,
+        deviation_m: float = DEVIATION_M,
+    ):
+        """Make the model of T rows of one person, times rising; `sigmas_px` (T, J, V) as
+        `observation_sigmas`.
+        """
+        self.observations, self.sigmas_px, self.views, self.config = (
+            observations,
+            sigmas_px,
+            views,
+            config,
+        )
+        self.times_s = observations.time_s.mean(axis=1)
+        steps = np.diff(self.times_s)
+        share = min(1.0, float(np.median(steps)) / POSE_LASTS_S) if len(steps) > 0 else 1.0
+        self.energy = BodyEnergy(model, PosePrior.default().widened(share**-0.5))
+        self.variance = np.full(self.sigmas_px.shape[:2], deviation_m**2)
+        self.origin = np.zeros(3)
+        self._motion, self._law, self._kernel = motion, law, config.robust_kernel
+        self._held = self.energy.held_by_priors(len(self.times_s))
+        # The betas have their prior once, not in every row.
+        self._held = Held(self._held.betas, np.zeros(len(self.times_s)), self._held.angles)
+        self.standing = JointTargets(
+            np.zeros(shape := (*self.variance.shape, 3)), np.zeros((*shape, 3))
+        )
+        """Constraint on the joints of standing feet by other frames, metres in the world."""
+        self.links: Links | None = None
+        self._asynchronous = bool(leads(observations, views).any())
+
+    def __len__(self) -> int:
+        return len(self.times_s)
+
+    def solve(self, start: Array) -> BodyState:
+        """The state of least cost, from bodies (T, P) in the world on, parameters as `BodyEnergy`
+        has them.
+        """
+        self.origin = start[:, -3:].mean(axis=0)
+        free = start.copy()
+        free[:, -3:] -= self.origin
+        J = self.sigmas_px.shape[1]
+        zero = np.zeros((len(free), J, 3))
+        state = BodyState(
+            np.median(free[:, :10], axis=0), exp_so3(free[:, 10:13]), free[:, 13:], zero
+        )
+        bodies = self._bodies(state)
+        if self.links is None and len(self) > 1:
+            self.links = self._linked(bodies)
+        self.last = self.around(state, bodies)
+        return self._descended(state)
+
+    def _descended(self, state: BodyState) -> BodyState:
+        """The state of least cost, from one with `last` around it."""
+        here, damping, done = self.last, _DAMPING, False
+        for _ in range(_STEPS):
+            if done:
+                break
+            there, new = self._after(state, here, *self._step(state, here, damping))
+            if not new.cost <= here.cost + 1e-3 * abs(here.cost):
+                damping = max(10 * damping, 1e-2)
+                if damping > 1e3:
+                    break
+                continue
+            off = new.bodies + there.deviation - here.bodies - state.deviation
+            moved = np.linalg.norm(off, axis=-1).mean()
+            state, here, damping, done = (
+                there,
+                new,
+                max(damping / 5, 1e-6),
+                bool(moved < _SETTLED_M),
+            )
+        self.last = here
+        return state
+
+    def hold(self, state: BodyState, feet: Index) -> BodyState:
+        """The solution in which the joints `feet` (F,) stay in place between frames where they
+        stand; the state itself if none does.
+        """
+        velocity = velocities(self.joints(state), self.times_s)[:, feet]
+        covariance = self.covariances(state).velocities()[:, feet]
+        seen = np.asarray(self.last.evidence.inlier[:, feet].any(axis=-1))
+        seen = near_in_time(seen, self.times_s, UNSEEN_S)
+        velocity = np.where(seen[..., None], velocity, np.nan)
+        density = standing_density(velocity, covariance, self.times_s)
+        density = np.where(density > FREE_M2_S, np.inf, density)
+        if not np.isfinite(density).any():
+            return state
+        evidence = self.last.evidence
+        told = JointTargets(evidence.target[:, feet], evidence.information[:, feet])
+        information, pull = held_in_place(told, density, self.times_s)
+        scale = np.trace(information, axis1=-2, axis2=-1)[..., None, None]
+        known = np.where(scale > 0, information + 1e-9 * scale * np.eye(3), np.eye(3))
+        self.standing.information[:, feet] = information
+        self.standing.xyz[:, feet] = (inverses(known) @ pull[..., None])[..., 0]
+        self.last = self.around(state, self.last.bodies)
+        return self._descended(state)
+
+    def take(self, state: BodyState, shape: Array, pose: Array) -> BodyState:
+        """The state after another step of betas (10,) and poses (T, N) from the solution; the
+        solution itself if the step makes it worse.
+        """
+        there, new = self._after(state, self.last, shape, pose)
+        if not new.cost <= self.last.cost + 1e-3 * abs(self.last.cost):
+            return state
+        self.last = new
+        return there
+
+    def _after(
+        self, state: BodyState, here: _Around, shape: Array, pose: Array
+    ) -> tuple[BodyState, _Around]:
+        """State after a step, with the best deviations, and the model around it."""
+        there = state.moved(shape, pose)
+        bodies = self._bodies(there)
+        there = replace(there, deviation=self._deviation(here, bodies))
+        return there, self.around(there, bodies)
+
+    def joints(self, state: BodyState) -> Array:
+        """(T, J, 3) X, metres in the world."""
+        return self._bodies(state) + state.deviation + self.origin
+
+    def parameters(self, state: BodyState) -> BodyParameters:
+        """The bodies in the world."""
+        body = self.energy.complete(state.free)
+        return replace(body, transl=body.transl + self.origin.reshape(-1, 3))
+
+    def widen_unseen(self, of_bodies: Array, elsewhere: Array) -> None:
+        """Widen the deviation of joints without a used detection. No solution changes, and no other
+        joint.
+
+        `of_bodies` (T, J, 3, 3) are the covariances of the bodies' joints, and `elsewhere` (T, J)
+        the variance along an axis of joints that cameras should see but do not, m².
+        """
+        variance = np.trace(of_bodies, axis1=-2, axis2=-1) / 3
+        unseen = ~self.last.evidence.inlier.any(axis=-1)
+        wider = self.variance + variance * np.sqrt(variance) / _STRAYS_M + elsewhere
+        self.variance = np.where(unseen, wider, self.variance)
+
+    def of_joints(self, of_body: Array) -> Array:
+        """(T, J, 3, 3) covariances of X for those of the body's joints, m², around the last
+        solution.
+        """
+        kept = np.eye(3) - self.last.gain
+        found = kept @ of_body @ kept.mT + self.variance[..., None, None] * kept
+        return (found + found.mT) / 2
+
+    def carried(self, X: Array) -> Observations:
+        """The detections as if all cameras exposed at the frames' times, for joints X (T, J, 3)."""
+        observed = self.observations
+        if self._asynchronous:
+            observed = carried_to_frames(observed, X, velocities_of(observed, X), self.views)
+        return observed
+
+    def around(self, state: BodyState, bodies: Array) -> _Around:
+        """Cost and normal equations, joints eliminated, around a state with these `bodies` (T, J,
+        3).
+        """
+        X = bodies + state.deviation + self.origin
+        observed = self.carried(X)
+        evidence = linearise(observed, self.sigmas_px, X, self.views, self.config)
+        held = self.standing
+        information = evidence.information + held.information
+        pull = evidence.gradient + (held.information @ (X - held.xyz)[..., None])[..., 0]
+        both = replace(evidence, information=information, gradient=pull)
+        target = both.target - self.origin
+        variance = self.variance[..., None, None]
+        share = inverses(np.eye(3) + variance * information)
+        weighed = information @ share  # (L^-1 + s²)^-1, of information that may be singular
+        weighed = (weighed + weighed.mT) / 2
+        targets = EnergyTargets(target, weighed)
+        linear = self.energy.linearise(state.free, targets, 1e9, self._held, nothing(len(self)))
+        cost = self._seen_cost(evidence)
+        off = (X - held.xyz)[..., None]
+        cost += (off.mT @ held.information @ off).sum(axis=(1, 2, 3))
+        cost += (np.square(state.deviation).sum(axis=-1) / self.variance).sum(axis=-1)
+        angles = state.others[:, :-3] - self._held.angles
+        cost += np.einsum(
+            "ti,ij,tj->t", angles, self.energy.priors.precision, angles, optimize=True
+        )
+        cost = float(cost.sum() + np.square(state.betas).sum())
+        pull = np.zeros((len(self), self.energy.num_free - 10))
+        if self.links is not None:
+            moved, pull = self._moved(state)
+            cost += moved
+        return _Around(cost, linear.system, pull, bodies, evidence, variance * weighed, target)
+
+    def _seen_cost(self, evidence: ViewEvidence) -> Array:
+        """(T,) robust cost of the detections; a rejected one costs as much as at its gate."""
+        seen = np.asarray(self.observations.seen & (self.sigmas_px > 0))
+        sigma = np.where(seen, self.sigmas_px, 1.0)
+        ratio = (np.nan_to_num(evidence.residual_px) ** 2).sum(axis=-1) / sigma**2
+        ahead = self.views.cTw[..., 2, :]
+        depth = evidence.points @ ahead[..., :3].mT + ahead[..., None, :, 3]
+        gate = (self.config.rho_2d_m * self.views.focal / np.maximum(depth, 0.2) / sigma) ** 2
+        squared = np.where(evidence.inlier, np.minimum(ratio, gate), gate)
+        if self._kernel == "cauchy":
+            c2 = DEFAULT_WIDTH_SIGMA["cauchy"] ** 2
+            squared = c2 * np.log1p(squared / c2)
+        elif self._kernel == "geman_mcclure":
+            c2 = DEFAULT_WIDTH_SIGMA["geman_mcclure"] ** 2
+            squared = c2 * squared / (c2 + squared)
+        return np.where(seen, squared, 0.0).sum(axis=(1, 2))
+
+    def _bodies(self, state: BodyState) -> Array:
+        return self.energy.model.keypoints(self.energy.complete(state.free))
+
+    def _deviation(self, here: _Around, bodies: Array) -> Array:
+        """X - J that is best for bodies that have moved."""
+        seen = np.asarray(here.gain.any(axis=(-1, -2)))
+        away = np.where(seen[..., None], here.target - bodies, 0.0)
+        return (here.gain @ away[..., None])[..., 0]
+
+    def _linked(self, bodies: Array) -> Links:
+        """The motion prior, where joints are faster than people on average as much wider as they
+        are.
+        """
+        acceleration, velocity = MotionPrior.default().part(self.energy.angles)
+        T, n = len(self), self._law.order
+        step = np.full(max(n, T) - 1, np.inf)
+        step[: T - 1] = np.diff(self.times_s)
+        times = np.ones((max(n, T) - n, len(acceleration)))
+        if n < T:
+            faster = self._faster(bodies)
+            own = np.maximum(faster[:-1], faster[1:]) if len(faster) > 1 else faster
+            times[: len(own)] = own
+        return Links(self._law, acceleration * times, velocity, step)
+
+    def _faster(self, bodies: Array) -> Array:
+        """(T - 1, N) how many times the usual density of acceleration each unknown has, at least
+        1.
+        """
+        X = bodies + self.origin
+        evidence = linearise(self.observations, self.sigmas_px, X, self.views, self.config)
+        points = np.where(np.isfinite(evidence.target).all(-1, keepdims=True), evidence.target, X)
+        variance = np.minimum(evidence.sigma_m, 1e3) ** 2
+        speed, turning = motion_of(points, variance, self.times_s)
+        density = np.maximum(self._motion.acceleration(speed), turning)
+        ratio = np.maximum(density / self._motion.psd_lost, 1.0)
+        return ratio[:, nearest_keypoint(self.energy)]
+
+    def _moved(self, state: BodyState) -> tuple[float, Array]:
+        assert self.links is not None
+        T, ends = len(self), max(len(self.links.diagonal) - len(self), 0)
+        root, others = (
+            np.concatenate((each, each[-1:].repeat(ends, axis=0)))
+            for each in (state.root, state.others)
+        )
+        energy, pull = self.links.at(root, others)
+        return energy, pull[:T]
+
+    def _eliminated(self, root: Array, here: _Around, damping: float) -> tuple[Array, Array]:
+        """The factor of the poses and what is left of the betas
+        (`body/kernels/solving.eliminated`).
+        """
+        T, N = here.pull.shape
+        if self.links is None:
+            diagonal, beyond = np.zeros((T, N)), np.zeros((T, N, 1))
+        else:
+            diagonal, beyond = (
+                np.ascontiguousarray(each[:T]) for each in (self.links.diagonal, self.links.beyond)
+            )
+        M = (beyond.shape[-1] + 1) * N + 11
+        kept, front = np.zeros((T, M, -(-N // 16) * 16)), np.zeros((M, M))
+        eliminated(here.system, root, diagonal + HELD, beyond, here.pull, damping, kept, front)
+        return kept, front
+
+    def _step(self, state: BodyState, here: _Around, damping: float) -> tuple[Array, Array]:
+        """Steps of betas (10,) and poses (T, N)."""
+        kept, front = self._eliminated(state.root, here, damping)
+        whole = _symmetric(front[-10:, -10:]) + np.eye(10)
+        whole += damping * np.diag(np.diag(whole))
+        coefficients = np.append(1.0, -np.linalg.solve(whole, front[-10:, -11] + state.betas))
+        pose = np.empty(here.pull.shape)
+        put_back(kept, coefficients, pose)
+        return coefficients[1:], pose
+
+    def covariances(self, state: BodyState) -> "Marginals":
+        """Marginal covariances of every frame's variables, around the last solution."""
+        here = self.last
+        kept, front = self._eliminated(state.root, here, 0.0)
+        T, N = here.pull.shape
+        n = (kept.shape[1] - 11 - N) // N
+        shape = np.asarray(
+            np.linalg.inv(_symmetric(front[-10:, -10:]) + np.eye(10)), dtype=np.float64
+        )
+        poses, arrow, steps = np.empty((T, N, N)), np.empty((T, N, 10)), np.zeros((T, N, N))
+        after, arrows = np.zeros((n * N, n * N)), np.zeros((n * N, 10))
+        for t in range(T - 1, -1, -1):
+            L, ahead = kept[t, :N, :N], kept[t, N : N + n * N, :N]
+            inverse = np.linalg.inv(np.tril(L))
+            W = ahead @ inverse
+            across = -after @ W  # of those after it with this one
+            own = inverse.T @ inverse - W.T @ across
+            own = (own + own.T) / 2
+            arrow[t] = inverse.T @ kept[t, -10:, :N].T - W.T @ arrows
+            poses[t], steps[t] = own, across[:N]
+            after[N:, N:] = after[:-N, :-N].copy() if n > 1 else 0
+            after[:N, N:], after[N:, :N] = (
+                across[:-N].T if n > 1 else 0,
+                across[:-N] if n > 1 else 0,
+            )
+            after[:N, :N] = own
+            arrows = np.concatenate((arrow[t], arrows[:-N])) if n > 1 else arrow[t]
+        steps[:-1] += arrow[1:] @ shape @ arrow[:-1].mT
+        return Marginals(
+            self, state, poses + arrow @ shape @ arrow.mT, steps, shape, -arrow @ shape
+        )
+
+
+@dataclass(frozen=True)
+class Marginals:
+    """Marginal covariances of a solved window."""
+
+    window: BodyWindow
+    state: BodyState
+    poses: Array
+    """(T, N, N) covariances of each frame's root (tangents of the world), angles and place."""
+    steps: Array
+    """(T, N, N) covariances of the next frame's pose, rows, with this one's, columns; zero in
+    the last."""
+    shape: Array
+    """(10, 10) covariance of the betas."""
+    across: Array
+    """(T, N, 10) covariances of poses with the betas."""
+
+    @cached_property
+    def slopes(self) -> Array:
+        """(T, J, 3, 10 + N) derivatives of the body's joints by betas and pose."""
+        window, state = self.window, self.state
+        T, J = window.sigmas_px.shape[:2]
+        none = EnergyTargets(np.zeros((T, J, 3)), np.zeros((T, J, 3, 3)))
+        linear = window.energy.linearise(state.free, none, 1.0, window._held)
+        slopes = linear.jacobian.reshape(T, J, 3, -1).copy()
+        slopes[..., 10:13] = slopes[..., 10:13] @ state.root.mT[:, None]
+        return slopes
+
+    def joints(self) -> Array:
+        """(T, J, 3, 3) covariances of X, m²."""
+        return self.window.of_joints(self.of_bodies)
+
+    @cached_property
+    def of_bodies(self) -> Array:
+        """(T, J, 3, 3) covariances of the bodies' joints, m²."""
+        slope = self.slopes
+        T, J = slope.shape[:2]
+        whole = np.empty((T, slope.shape[-1], slope.shape[-1]))
+        whole[:, :10, :10], whole[:, 10:, 10:] = self.shape, self.poses
+        whole[:, 10:, :10], whole[:, :10, 10:] = self.across, self.across.mT
+        flat = slope.reshape(T, 3 * J, -1)
+        return (flat @ whole).reshape(slope.shape) @ slope.mT
+
+    def velocities(self) -> Array:
+        """(T, J, 3, 3) covariances of velocities as in `in_time.velocities`, m²/s²; NaN for a
+        single frame.
+
+        Errors between distant frames are a Markov chain of those of consecutive ones, joint by
+        joint, which is less correlated than they are.
+        """
+        slope = self.slopes[..., 10:]
+        T, J = slope.shape[:2]
+        flat = slope.reshape(T, 3 * J, -1)
+        own = (flat @ self.poses).reshape(slope.shape) @ slope.mT
+        both = (flat[1:] @ self.steps[:-1]).reshape(slope[1:].shape) @ slope[:-1].mT
+        goes = both @ inverses(own[:-1] + HELD * np.eye(3))
+        first, last, lasts = moments(self.window.times_s)
+        across = own[first]
+        for k in range(int((last - first).max(initial=0))):
+            there = np.minimum(first + k, T - 2)
+            across = np.where((first + k < last)[:, None, None, None], goes[there] @ across, across)
+        found = own[first] + own[last] - across - across.mT
+        return found / lasts[:, None, None, None] ** 2
+
+
+def nearest_keypoint(energy: BodyEnergy) -> Index:
+    """(N,) for every unknown of a pose the keypoint that it moves with the shortest lever, but for
+    tiny ones.
+    """
+    still = BodyParameters(
+        np.zeros((1, 10)), np.zeros((1, 3)), np.zeros((1, 23, 3)), np.zeros((1, 3))
+    )
+    _, slopes = energy.model.keypoints_with_jacobian(still)
+    turns = slopes[0, :, :, 10:82].reshape(slopes.shape[1], 3, 24, 3)
+    lever = np.sqrt((turns**2).sum(axis=(1, 3)) / 2)
+    lever = np.where(lever > _LEVER_M, lever, np.inf)
+    nearest = np.where(np.isfinite(lever).any(axis=0), lever.argmin(axis=0), lever[:, 0].argmin())
+    return np.concatenate(
+        [nearest[:1].repeat(3), (nearest[1:].repeat(3))[energy.angles], nearest[:1].repeat(3)]
+    )
+
+
+def _symmetric(lower: Array) -> Array:
+    whole = np.tril(lower)
+    return whole + np.tril(whole, -1).T

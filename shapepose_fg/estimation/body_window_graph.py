@@ -1,0 +1,250 @@
+"""The GTSAM graph of a solved `BodyWindow`: native projections on joints, which hang on bodies."""
+
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from factors import (
+    DEFAULT_WIDTH_SIGMA,
+    body_keys,
+    linear_factor,
+    projection_factors,
+    robust_kernel,
+    shape_factors,
+    shape_key,
+    state_keys,
+)
+from factors.body_shape import pose_factors
+from factors.keys import MAX_FRAME
+from shapepose_fg.body.model.rotation import exp_so3, log_so3, right_jacobian_inverse
+from shapepose_fg.core.arrays import Array, Index, Mask
+from shapepose_fg.core.decompositions import symmetric_root
+from shapepose_fg.estimation.body_window import BodyState, BodyWindow, Marginals
+from shapepose_fg.estimation.graph_covariances import graph_covariances
+from shapepose_fg.estimation.in_time import moments
+from shapepose_fg.estimation.user_factors import PersonWindow
+from shapepose_fg.estimation.window_graph import cameras_of
+
+_DEFINED_M_S = 1e-3
+"""Standard deviation with which a velocity is that of its joint's positions, m/s: it is a
+definition, but GTSAM's solver wants a finite one."""
+
+
+class BodyGraph(PersonWindow):
+    """A person's window as a GTSAM graph around a solution; made when it is asked for.
+
+    Variables are the joints (`keys`), the body of each frame (`body_keys`): a vector of the root's
+    turn since the first solution (axis times angle, rad, axes of the world), the visible angles,
+    rad, and the place, metres in the world; and the body's shape (`shape_key`): the 10 betas.
+    Velocities (`velocity_keys`) are variables where a factor is on them.
+    """
+
+    def __init__(
+        self,
+        window: BodyWindow,
+        state: BodyState,
+        person: int,
+        frames: NDArray[np.int64],
+        widen: float = 1.0,
+        rows: Index | None = None,
+    ) -> None:
+        """Take a solved window of T `frames`; all covariances of the graph are `widen` times those
+        of the model: neither solution nor kernels change.
+        """
+        joints = np.arange(window.sigmas_px.shape[1])
+        keys = state_keys(person, joints, frames[:, None], 2)
+        super().__init__(person, frames, window.times_s, keys, rows, window.joints(state))
+        self.body_keys, self.shape_key = body_keys(person, frames), shape_key(person)
+        self.window, self.state, self.widen = window, state, widen
+        self._upright = state.root
+
+    @property
+    def seen(self) -> Mask:
+        """(T, J, V) whether there is a detection of the joint."""
+        return self.window.observations.seen
+
+    def build(self) -> "BodyGraph":
+        """Make the factors of the person alone, linear ones around the state, and the values."""
+        window, state = self.window, self.state
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        self.set_graph(graph, values)
+        scale, J, T = np.sqrt(self.widen), self.keys.shape[1], len(window)
+        turns = self.turns()
+        slopes, betas = Marginals(window, state, *(np.empty(0),) * 4).slopes, state.betas.ravel()
+        slopes[..., 10:13] = slopes[..., 10:13] @ turns[:, None]
+        bodies, joints = self._bodies(), window.joints(state)
+        for key, x in zip(self.keys.ravel().tolist(), joints.reshape(-1, 3), strict=True):
+            values.insert(key, x)
+        for key, body in zip(self.body_keys.tolist(), bodies, strict=True):
+            values.insert(key, body)
+        values.insert(self.shape_key, betas)
+        factors: list[gtsam.NonlinearFactor] = [*self._seen(scale, joints)]
+        at_zero = joints - state.deviation - (slopes[..., 10:] @ bodies[:, None, :, None])[..., 0]
+        at_zero -= slopes[..., :10] @ betas
+        flat = slopes.reshape(T * J, 3, -1)
+        sigma = np.broadcast_to(scale * np.sqrt(window.variance), (T, J))
+        factors += shape_factors(
+            self.keys.ravel(), self.body_keys.repeat(J), self.shape_key, at_zero.reshape(-1, 3),
+            flat[..., 10:], flat[..., :10], sigma.ravel(),
+        )  # fmt: skip
+        factors += pose_factors([self.shape_key], [np.eye(10)[None] / scale], np.zeros((1, 10)), 10)
+        factors += self._poses(scale, bodies, turns)
+        factors += [*self._velocities(), *self._standing(scale)]
+        deque(map(graph.push_back, factors), maxlen=0)
+        return self
+
+    def of_body(self, t: int, joint: int) -> Array:
+        """(3, 3) information on a joint in row `t` from its body in the same frame: from the other
+        joints' views and the priors of pose and shape, without user factors, 1/m².
+        """
+        key, graph, part = int(self.keys[t, joint]), self.graph, gtsam.NonlinearFactorGraph()
+        order = [*self.keys[t].tolist(), int(self.body_keys[t]), self.shape_key]
+        users = 0 if self.failure else len(self.ties.active)
+        for n in range(graph.size() - users):
+            keys = graph.at(n).keys()
+            if keys != [key] and all(each in order for each in keys):
+                part.push_back(graph.at(n))
+        found = graph_covariances(part, self.values, gtsam.Ordering(order))[key, key]
+        return np.asarray(np.linalg.inv(found), dtype=np.float64)
+
+    def take(self, values: gtsam.Values) -> float:
+        """Take the person's variables from a solution of a graph around the state before, and gate
+        the detections there. Returns the mean motion of the joints, metres.
+        """
+        bodies = np.array([values.atVector(key) for key in self.body_keys.tolist()])
+        joints = np.array([values.atPoint3(key) for key in self.keys.ravel().tolist()])
+        others = bodies[:, 3:].copy()
+        others[:, -3:] -= self.window.origin.reshape(-1, 3)
+        zero = np.zeros((*self.keys.shape, 3))
+        root = exp_so3(bodies[:, :3]) @ self._upright
+        betas = values.atVector(self.shape_key).reshape(self.state.betas.shape)
+        state = BodyState(betas, root, others, zero)
+        joints, before = joints.reshape(zero.shape), self.window.joints(self.state)
+        self.state = replace(state, deviation=joints - self.window.joints(state))
+        of_body = self.window.joints(state) - self.window.origin
+        self.window.last = self.window.around(self.state, of_body)
+        return float(np.linalg.norm(joints - before, axis=-1).mean())
+
+    def marginals(self, every: dict[tuple[int, int], Array]) -> Marginals:
+        """Marginals of the model from the covariances of every variable (`graph_covariances`) of a
+        graph around the state, such as one with user factors.
+        """
+        keys, turns = self.body_keys.tolist(), self.turns()
+        poses = np.array([every[key, key] for key in keys]) / self.widen
+        across = np.array([every[key, self.shape_key] for key in keys]) / self.widen
+        steps = np.zeros_like(poses)
+        for t, (key, after) in enumerate(pairwise(keys)):
+            steps[t] = every[after, key] / self.widen
+        for part, rows in ((poses, turns), (across, turns), (steps[:-1], turns[1:])):
+            part[:, :3] = rows @ part[:, :3]
+        for part in (poses, steps):
+            part[..., :3] = part[..., :3] @ turns.mT
+        shape = every[self.shape_key, self.shape_key] / self.widen
+        return Marginals(self.window, self.state, poses, steps, shape, across)
+
+    def _bodies(self) -> Array:
+        """(T, N) values of the bodies."""
+        turn, others = log_so3(self.state.root @ self._upright.mT), self.state.others.copy()
+        others[:, -3:] += self.window.origin.reshape(-1, 3)
+        return np.concatenate([turn, others], axis=1)
+
+    def turns(self) -> Array:
+        """(T, 3, 3) how the root turns, in tangents of the world, where a body's first numbers
+        change.
+        """
+        found = np.linalg.inv(right_jacobian_inverse(-self._bodies()[:, :3]))
+        return np.asarray(found, dtype=np.float64)
+
+    def order(self) -> Iterator[tuple[int, int, int]]:
+        """Rank, within its frame, and frame of each variable, for elimination without much
+        fill-in.
+        """
+        for kind, keys in enumerate((self.velocity_keys, self.keys, self.body_keys[:, None])):
+            for frame, row in zip(self.frames.tolist(), keys.tolist(), strict=True):
+                yield from ((frame, kind, key) for key in row if self.values.exists(key))
+
+    def _velocities(self) -> list[gtsam.NonlinearFactor]:
+        """Make v = (x' - x) / dt of the velocities that user factors are on, for x as in
+        `in_time.velocities`.
+        """
+        if not self.temporal or len(self.ties.factors) == 0:
+            return []
+        asked = {key for each in self.ties.factors for key in each.keys}
+        found, x = list[gtsam.NonlinearFactor](), self.keys
+        for t, (first, last, lasts) in enumerate(zip(*moments(self.times_s), strict=True)):
+            for joint, key in enumerate(self.velocity_keys[t].tolist()):
+                if key in asked:
+                    ends = (
+                        self.values.atPoint3(x[last, joint]),
+                        self.values.atPoint3(x[first, joint]),
+                    )
+                    self.values.insert(key, (ends[0] - ends[1]) / lasts)
+                    names = [key, x[last, joint], x[first, joint]]
+                    parts = [1.0, -1.0 / lasts, 1.0 / lasts]
+                    found.append(linear_factor(names, parts, sigma=_DEFINED_M_S))
+        return found
+
+    def _standing(self, scale: float) -> list[gtsam.NonlinearFactor]:
+        """What other frames of a stance say of joints of feet."""
+        held = self.window.standing
+        frame, joint = np.nonzero(held.information.any(axis=(-1, -2)))
+        roots = symmetric_root(held.information[frame, joint]) / scale
+        right = (roots @ held.xyz[frame, joint][..., None])[..., 0]
+        names = self.keys[frame, joint].tolist()
+        return [linear_factor([key], [A], b) for key, A, b in zip(names, roots, right, strict=True)]
+
+    def _seen(self, scale: float, joints: Array) -> list[gtsam.NoiseModelFactor]:
+        window, evidence = self.window, self.window.last.evidence
+        xy = window.carried(joints).xy
+        frame, joint, view = chosen = np.nonzero(evidence.inlier & (window.sigmas_px > 0))
+        kernel, views = window.config.robust_kernel, window.views
+        width = None if kernel is None else DEFAULT_WIDTH_SIGMA[kernel] / scale
+        return projection_factors(
+            cameras_of(views), view if views.rows_known is None else frame * len(views) + view,
+            self.keys[frame, joint], xy[chosen], scale * window.sigmas_px[chosen],
+            robust_kernel(kernel, width),
+        )  # fmt: skip
+
+    def _poses(self, scale: float, bodies: Array, turns: Array) -> list[gtsam.NonlinearFactor]:
+        """The pose prior, and motion."""
+        window, state, priors = self.window, self.state, self.window.energy.priors
+        T, N = bodies.shape
+        root = np.linalg.cholesky(priors.precision).T
+        A = np.zeros((N, N))
+        A[3:-3, 3:-3] = root
+        free = [0, 1, 2, -3, -2, -1]
+        A[free, free] = 1e-3
+        right = bodies @ A.T
+        right[:, 3:-3] = priors.mean @ root.T
+        found = pose_factors(
+            self.body_keys, [np.broadcast_to(A / scale, (T, N, N))], right / scale, N
+        )
+        if window.links is None:
+            return found
+        for matrices, residual in window.links.linear(state.root, state.others):
+            count, right = len(residual), -residual
+            for k, each in enumerate(matrices):
+                each[..., :3] = each[..., :3] @ turns[k : k + count]
+                right += (each @ bodies[k : k + count, :, None])[..., 0]
+            found += pose_factors(self.body_keys, [A / scale for A in matrices], right / scale, N)
+        return found
+
+
+def ordering(people: Sequence[BodyGraph], values: gtsam.Values) -> gtsam.Ordering:
+    """Order in which the variables of coupled people are eliminated: frame by frame, joints before
+    bodies, shapes last. User variables come after the last frame of their factors.
+    """
+    ranks = [rank for person in people for rank in person.order()]
+    frame_of = {key: frame for frame, _, key in ranks}
+    shapes = {person.shape_key for person in people}
+    own = [key for key in values.keys() if key not in frame_of and key not in shapes]  # noqa: SIM118
+    for key in own:
+        factors = (each.keys for each in people[0].ties.active if key in each.keys)
+        last = max((frame_of.get(other, -1) for keys in factors for other in keys), default=-1)
+        ranks.append((last if last >= 0 else MAX_FRAME, 3, key))
+    return gtsam.Ordering([*(key for _, _, key in sorted(ranks)), *shapes])

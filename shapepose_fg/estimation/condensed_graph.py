@@ -1,0 +1,48 @@
+"""A person's window as a GTSAM graph of bodies and shape only, from which each joint and its
+projection factors are eliminated: a container factor a frame. GTSAM solves each window with it.
+"""
+
+from collections import deque
+from itertools import chain, repeat
+
+import gtsam
+import numpy as np
+
+from factors import body_keys, shape_key
+from shapepose_fg.core.arrays import Array
+from shapepose_fg.estimation.body_window import HELD, BodyState, BodyWindow
+
+
+def gtsam_step(window: BodyWindow, state: BodyState) -> tuple[Array, Array]:
+    """Gauss-Newton step by GTSAM around a solved window: of the betas (10,), and of the poses (T,
+    N), the root's in tangents of the world. LinAlgError if the system is singular.
+    """
+    T, N = window.last.pull.shape
+    keys, shape = body_keys(0, np.arange(T)), shape_key(0)
+    graph = gtsam.GaussianFactorGraph()
+    system, turn = window.last.system, state.root
+    lower = np.tril(system[:, : N + 10])
+    H = lower + np.tril(lower, -1).mT
+    right = -system[:, N + 10]
+    H[:, 10:13] = turn @ H[:, 10:13]
+    H[..., 10:13] = H[..., 10:13] @ turn.mT
+    right[:, 10:13] = (turn @ right[:, 10:13, None])[..., 0]
+    H[:, 10:, 10:] += HELD * np.eye(N)
+    frames = map(
+        gtsam.HessianFactor, keys.tolist(), repeat(shape), H[:, 10:, 10:], H[:, 10:, :10],
+        right[:, 10:], H[:, :10, :10], right[:, :10], repeat(0.0),
+    )  # fmt: skip
+    unit = gtsam.noiseModel.Unit.Create
+    prior = gtsam.JacobianFactor(shape, np.eye(10), -state.betas, unit(10))
+    motion = list[gtsam.JacobianFactor]()
+    if window.links is not None:
+        for matrices, residual in window.links.linear(state.root, state.others):
+            starts = (keys[k : k + len(residual)].tolist() for k in range(len(matrices)))
+            columns = chain.from_iterable(zip(starts, matrices, strict=True))
+            motion += map(gtsam.JacobianFactor, *columns, -residual, repeat(unit(N)))
+    deque(map(graph.push_back, chain(frames, [prior], motion)), maxlen=0)
+    try:
+        found = graph.optimize(gtsam.Ordering([*keys.tolist(), shape]))
+    except RuntimeError as error:  # gtsam.IndeterminantLinearSystemException
+        raise np.linalg.LinAlgError(str(error)) from None
+    return found.at(shape), np.array([found.at(key) for key in keys.tolist()])

@@ -1,0 +1,112 @@
+"""Solves people whose bodies are in the graph together with the factors that users add to them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from shapepose_fg.core.arrays import Array
+from shapepose_fg.estimation.body_window import Marginals
+from shapepose_fg.estimation.body_window_graph import BodyGraph, ordering
+from shapepose_fg.estimation.estimator_config import WindowGraphConfig
+from shapepose_fg.estimation.graph_covariances import graph_covariances
+from shapepose_fg.estimation.minimise import NotFinite, descend
+from shapepose_fg.estimation.user_factors import CoupledGraph
+
+RUNAWAY_M = 1.0
+"""Distance of a joint with a user factor from its solution without at which it has diverged, m."""
+_ROUNDS, _STEPS = 8, 4
+"""Maximum number of linearisations of the bodies, and of GTSAM's steps around each; detections are
+gated anew in each."""
+_SETTLED_M = 5e-4
+"""Mean motion of joints at which a solution has converged, m."""
+
+
+@dataclass(frozen=True)
+class FactorSolution:
+    """A person solved with user factors."""
+
+    person: BodyGraph
+    """The person, whose state and graph are those of the solution."""
+    covariance: Array
+    """(T, J, 3, 3) covariances of the joints in the graph, m²."""
+    marginals: Marginals
+    """Those of the model."""
+
+
+def solve_with_factors(
+    people: Sequence[BodyGraph], config: WindowGraphConfig
+) -> list[FactorSolution]:
+    """Solve the people of a window who have active user factors; those whom factors couple as one
+    graph.
+
+    A round is a minimum by GTSAM of the graph around the present bodies; then bodies are linearised
+    and detections gated anew. People whose solution fails are as they were, with a `failure`.
+    """
+    found = list[FactorSolution]()
+    for ties in {id(each.ties): each.ties for each in people if each.ties.factors}.values():
+        found += _solved([each for each in people if each.ties is ties], ties, config)
+    return found
+
+
+def _solved(
+    people: list[BodyGraph], ties: CoupledGraph, config: WindowGraphConfig
+) -> list[FactorSolution]:
+    few = replace(config, max_iterations=min(config.max_iterations, _STEPS))
+    before = [(each.state, each.window.last) for each in people]
+    try:
+        for _ in range(_ROUNDS):
+            graph, values = _joined(people, ties)
+            if len(ties.active) == 0:
+                return []
+            order = ordering(people, values)
+            values = descend(graph, values, order, few, over_time=people[0].temporal)
+            moved = [each.take(values) for each in people]
+            _keep_own(ties, values)
+            for each in people:
+                away = np.linalg.norm(each.window.joints(each.state) - each.first, axis=-1)
+                if not away[:, each.touched].max(initial=0.0) < RUNAWAY_M:
+                    raise NotFinite("diverged from its views and the body")
+            if max(moved) < _SETTLED_M:
+                break
+        graph, values = _joined(people, ties)
+        every = graph_covariances(graph, values, ordering(people, values))
+    except RuntimeError as error:
+        singular = "the solver failed: its system is singular"
+        for each, (state, last) in zip(people, before, strict=True):
+            each.state, each.window.last = state, last
+            each.failure = str(error) if isinstance(error, NotFinite) else singular
+            each.build()
+        return []
+    for each in people:
+        each.set_graph(graph, values)
+    return [
+        FactorSolution(
+            each,
+            np.array([[every[key, key] for key in row] for row in each.keys.tolist()]),
+            each.marginals(every),
+        )
+        for each in people
+    ]
+
+
+def _joined(
+    people: list[BodyGraph], ties: CoupledGraph
+) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    """The graph around the present state of the people, and its values."""
+    for each in people:
+        each.build()
+    return ties.joined()
+
+
+def _keep_own(ties: CoupledGraph, values: gtsam.Values) -> None:
+    """Start the next round at the present values of the user's variables."""
+    solved, idle = gtsam.Values(values), gtsam.Values(ties.start)
+    for key in values.keys():  # noqa: SIM118 - GTSAM's, not a dictionary's
+        if ties.start.exists(key):
+            idle.erase(key)
+        else:
+            solved.erase(key)
+    solved.insert(idle)
+    ties.start = solved
