@@ -37,7 +37,7 @@ from factors.lasting import (
     lasting_prior_factors,
     offset_factors,
 )
-from factors.linear import linear_factor
+from factors.linear import jacobian_factor, linear_factor
 from factors.motion import (
     CONSTANT_ACCELERATION,
     CONSTANT_VELOCITY,
@@ -109,6 +109,7 @@ __all__ = [
     "inlier_gate",
     "isotropic",
     "isotropic_models",
+    "jacobian_factor",
     "joint_information",
     "joint_key",
     "joint_keys",

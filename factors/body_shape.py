@@ -11,6 +11,8 @@ import numpy as np
 from gtsam import noiseModel
 from numpy.typing import ArrayLike, NDArray
 
+from factors.linear import jacobian_factor
+
 
 def shape_factors(
     keys: ArrayLike,
@@ -71,16 +73,12 @@ def pose_factors(
     for name in names:
         zeros.insert(name, np.zeros(count))
     unit = noiseModel.Unit.Create(right.shape[1])
-    columns = [
-        part for k, each in enumerate(matrices) for part in (names[k : k + len(right)], each)
-    ]
-    return list(
-        map(
-            gtsam.LinearContainerFactor,
-            map(gtsam.JacobianFactor, *columns, right, repeat(unit)),
-            repeat(zeros),
-        )
-    )
+    found = list[gtsam.NonlinearFactor]()
+    for t, measured in enumerate(right):
+        terms = [(names[t + k], each[t]) for k, each in enumerate(matrices)]
+        linear = jacobian_factor(terms, measured, unit)
+        found.append(gtsam.LinearContainerFactor(linear, zeros))
+    return found
 
 
 def _zeros(

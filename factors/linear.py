@@ -46,12 +46,23 @@ def linear_factor(
     z, deviation = np.broadcast_to(z, rows), np.broadcast_to(deviation, rows)
     whitened = [block / deviation[:, None] for block in blocks]
     terms, unit = list(zip(names, whitened, strict=True)), noiseModel.Unit.Create(rows)
-    # The only constructor in GTSAM's Python interface that takes any number of variables.
-    linear = gtsam.JacobianFactor(gtsam.GaussianConditional(terms, 1, z / deviation, unit))
+    linear = jacobian_factor(terms, z / deviation, unit)
     origin = gtsam.Values()
     for key, block in zip(names, blocks, strict=True):
         origin.insert(key, np.zeros(block.shape[1]))
     return gtsam.LinearContainerFactor(linear, origin)
+
+
+def jacobian_factor(
+    terms: list[tuple[int, NDArray[np.float64]]],
+    right: NDArray[np.float64],
+    model: noiseModel.Diagonal,
+) -> gtsam.JacobianFactor:
+    """The linear factor sum_k A_k x_k = `right` (M,) of `terms` (key, A_k) on any number of
+    variables, for linear graphs.
+    """
+    # The only constructor in GTSAM's Python interface that takes any number of variables.
+    return gtsam.JacobianFactor(gtsam.GaussianConditional(terms, 1, right, model))
 
 
 def _block(matrix: ArrayLike) -> NDArray[np.float64]:

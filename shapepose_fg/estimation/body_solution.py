@@ -52,7 +52,7 @@ Solution and gates do not change: detections, bodies, motion and priors all are 
 certain."""
 GATE_M = 0.1
 """rho_2D of Eq. 2 in windows, as a length at the joint's depth, at the initial estimate and in
-every round."""
+every round; more for detectors with larger errors."""
 RECENT_S = 0.25
 """Time since a view last detected a joint, s, within which its motion determines it."""
 
@@ -69,10 +69,13 @@ def solve_bodies(
     assert fitter.model is not None
     # Gating of the initial estimate; what it rejects stays out, since bodies can be drawn to the
     # other leg's detections.
-    gates = replace(config.observations, rho_2d_m=min(GATE_M, config.observations.rho_2d_m))
+    seen, ratio = observations.seen, config.noise.variances(observations.confidence)[0]
+    noisy = max(1.0, float(np.sqrt(ratio[seen].mean()))) if seen.any() else 1.0
+    rho_2d_m = noisy * min(GATE_M, config.observations.rho_2d_m)
+    gates = replace(config.observations, rho_2d_m=rho_2d_m)
     X = first_places(observations, views, fitter, config)
     sigmas = observation_sigmas(observations, X, views, config.observations, config.joints)
-    sigmas = sigmas * np.sqrt(config.noise.variances(observations.confidence)[0])
+    sigmas = sigmas * np.sqrt(ratio)
     evidence = linearise(observations, sigmas, X, views, gates)
     enough = (evidence.sigma_m <= config.refine.max_sigma_m).sum(axis=1) >= LEAST_JOINTS
     start = fitter.fit_whole(joint_targets(evidence, enough))

@@ -344,8 +344,8 @@ class BodyWindow:
         times = np.ones((max(n, T) - n, len(acceleration)))
         if n < T:
             faster = self._faster(bodies)
-            own = np.maximum(faster[:-1], faster[1:]) if len(faster) > 1 else faster
-            times[: len(own)] = own
+            for k in range(n):  # the fastest step among those that it links
+                times[: T - n] = np.maximum(times[: T - n], faster[k : k + T - n])
         return Links(self._law, acceleration * times, velocity, step)
 
     def _faster(self, bodies: Array) -> Array:

@@ -8,7 +8,7 @@ from itertools import chain, repeat
 import gtsam
 import numpy as np
 
-from factors import body_keys, shape_key
+from factors import body_keys, jacobian_factor, shape_key
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.estimation.body_window import HELD, BodyState, BodyWindow
 
@@ -23,23 +23,23 @@ def gtsam_step(window: BodyWindow, state: BodyState) -> tuple[Array, Array]:
     system, turn = window.last.system, state.root
     lower = np.tril(system[:, : N + 10])
     H = lower + np.tril(lower, -1).mT
-    right = -system[:, N + 10]
+    pull = -system[:, N + 10]
     H[:, 10:13] = turn @ H[:, 10:13]
     H[..., 10:13] = H[..., 10:13] @ turn.mT
-    right[:, 10:13] = (turn @ right[:, 10:13, None])[..., 0]
+    pull[:, 10:13] = (turn @ pull[:, 10:13, None])[..., 0]
     H[:, 10:, 10:] += HELD * np.eye(N)
     frames = map(
         gtsam.HessianFactor, keys.tolist(), repeat(shape), H[:, 10:, 10:], H[:, 10:, :10],
-        right[:, 10:], H[:, :10, :10], right[:, :10], repeat(0.0),
+        pull[:, 10:], H[:, :10, :10], pull[:, :10], repeat(0.0),
     )  # fmt: skip
     unit = gtsam.noiseModel.Unit.Create
     prior = gtsam.JacobianFactor(shape, np.eye(10), -state.betas, unit(10))
     motion = list[gtsam.JacobianFactor]()
     if window.links is not None:
         for matrices, residual in window.links.linear(state.root, state.others):
-            starts = (keys[k : k + len(residual)].tolist() for k in range(len(matrices)))
-            columns = chain.from_iterable(zip(starts, matrices, strict=True))
-            motion += map(gtsam.JacobianFactor, *columns, -residual, repeat(unit(N)))
+            for t, right in enumerate(-residual):
+                terms = [(int(keys[t + k]), each[t]) for k, each in enumerate(matrices)]
+                motion.append(jacobian_factor(terms, right, unit(N)))
     deque(map(graph.push_back, chain(frames, [prior], motion)), maxlen=0)
     try:
         found = graph.optimize(gtsam.Ordering([*keys.tolist(), shape]))
