@@ -46,7 +46,8 @@ from shapepose_fg.estimation.window_solution import PersonGraph, WindowSolution,
 
 LASTS = 2.0
 """Covariances over time are this many times those of errors that are new in every frame: detectors'
-errors last.
+errors last. It grows with the errors of the recording's detector, since those that last are not
+averaged over time.
 
 Solution and gates do not change: detections, bodies, motion and priors all are that much less
 certain."""
@@ -104,7 +105,7 @@ def solve_bodies(
             continue
         frames = observations.frame[rows].astype(np.int64)
         track = int(observations.track[rows[0]])
-        people.append(BodyGraph(window, state, track, frames, LASTS, rows))
+        people.append(BodyGraph(window, state, track, frames, LASTS * noisy, rows))
         spread.append(marginals)
         found.put(people[-1], marginals)
 
@@ -118,8 +119,8 @@ def solve_bodies(
         seen = np.asarray(strong[person.rows].any(axis=-1))
         moved = np.square(SPEED_M_S * waited_s(seen, person.times_s))
         moved = np.minimum(elsewhere[person.rows], moved)
-        person.window.widen_unseen(LASTS * marginals.of_bodies, moved)
-        found.covariance[person.rows] = LASTS * marginals.joints()
+        person.window.widen_unseen(person.widen * marginals.of_bodies, moved)
+        found.covariance[person.rows] = person.widen * marginals.joints()
 
     # User factors: people who have some are solved once more.
     if len(functions) > 0:
@@ -167,7 +168,7 @@ class _Found:
         self.evidence.put(rows, window.last.evidence)
         fit.put_bodies(rows, window.parameters(state), np.zeros((len(rows), 3)))
         fit.joints[rows] = joints - state.deviation
-        fit.covariance[rows] = LASTS * marginals.of_bodies
+        fit.covariance[rows] = person.widen * marginals.of_bodies
         fit.residual_m[rows] = np.sqrt(np.square(state.deviation).sum(axis=-1).mean(axis=-1))
         fit.status[rows] = FitStatus.OK
 

@@ -49,6 +49,8 @@ once in it."""
 _LEVER_M = 0.05
 """A rotation that moves a keypoint by less per radian, metres, does not decide how fast that
 keypoint is."""
+_PLACED_M = 0.05
+"""Standard deviation by the views, m, up to which a foot is held in place where it stands."""
 _STRAYS_M = 0.07
 """Standard deviation, m, of an unseen joint of the body at which its own deviation is as large:
 errors of poses that nothing shows are larger than their Gaussian when they are large."""
@@ -201,16 +203,17 @@ class BodyWindow:
         """
         velocity = velocities(self.joints(state), self.times_s)[:, feet]
         covariance = self.covariances(state).velocities()[:, feet]
-        seen = np.asarray(self.last.evidence.inlier[:, feet].any(axis=-1))
-        seen = near_in_time(seen, self.times_s, UNSEEN_S)
+        seen = np.asarray(self.last.evidence.sigma_m[:, feet] < _PLACED_M)
         velocity = np.where(seen[..., None], velocity, np.nan)
         density = standing_density(velocity, covariance, self.times_s)
         density = np.where(density > FREE_M2_S, np.inf, density)
         if not np.isfinite(density).any():
             return state
         evidence = self.last.evidence
-        told = JointTargets(evidence.target[:, feet], evidence.information[:, feet])
+        told = np.where(seen[..., None, None], evidence.information[:, feet], 0.0)
+        told = JointTargets(evidence.target[:, feet], told)
         information, pull = held_in_place(told, density, self.times_s)
+        information[~seen], pull[~seen] = 0.0, 0.0
         scale = np.trace(information, axis1=-2, axis2=-1)[..., None, None]
         known = np.where(scale > 0, information + 1e-9 * scale * np.eye(3), np.eye(3))
         self.standing.information[:, feet] = information
