@@ -28,11 +28,10 @@ from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.asynchronous_views import carried_to_frames, leads, velocities_of
 from shapepose_fg.estimation.contact import (
     FREE_M2_S,
-    UNSEEN_S,
     held_in_place,
     standing_density,
 )
-from shapepose_fg.estimation.in_time import moments, motion_of, near_in_time, velocities
+from shapepose_fg.estimation.in_time import moments, motion_of, velocities
 from shapepose_fg.estimation.linearisation import (
     ObservationConfig,
     ViewEvidence,
