@@ -35,7 +35,7 @@ def stoppable() -> Iterator[None]:
 
     Signals that the parent process ignores stay ignored; outside the main thread nothing changes.
     If Python cannot propagate the exception (because a finaliser is running), the signal is sent
-    again a moment later.
+    again a moment later, or the exception is raised at the end of the block.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -51,13 +51,21 @@ def stoppable() -> Iterator[None]:
     def again(number: int) -> None:
         nonlocal stopped
         stopped = False
+        missed.clear()
         signal.pthread_kill(threading.main_thread().ident or 0, number)
 
     later: list[threading.Timer] = []
+    missed: list[int] = []
+
+    def settle() -> None:
+        for timer in later:
+            timer.cancel()
+            timer.join()
 
     def lost(unraisable: "sys.UnraisableHookArgs") -> None:
         if not isinstance(unraisable.exc_value, Stopped):
             return report(unraisable)
+        missed.append(unraisable.exc_value.number)
         later.append(threading.Timer(0.01, again, [unraisable.exc_value.number]))
         later[-1].start()
 
@@ -68,10 +76,11 @@ def stoppable() -> Iterator[None]:
         signal.signal(number, stop)
     try:
         yield
+        settle()
+        if missed:
+            raise Stopped(missed[0])
     finally:
-        for timer in later:
-            timer.cancel()
-            timer.join()
+        settle()
         for number in heard:
             signal.signal(number, before[number])
         sys.unraisablehook = report

@@ -34,6 +34,11 @@ def test_a_signal_in_a_finaliser_is_obeyed(times, capsys):
     assert capsys.readouterr().err == "", "nothing is printed of it"
 
 
+def test_a_signal_in_the_last_finaliser_is_obeyed():
+    with pytest.raises(Stopped), stoppable():
+        SignalsAsItGoes()
+
+
 def test_a_second_signal_does_not_disturb_the_clean_up():
     cleaned = False
     with pytest.raises(Stopped), stoppable():

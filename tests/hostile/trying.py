@@ -41,7 +41,7 @@ _READABLE = (
         os.path.realpath(each)
         for each in (sys.prefix, sys.base_prefix, Path(__file__).parents[2], _KERNELS)
     },
-    *("/proc", "/sys", "/dev"),
+    *("/proc", "/sys", "/dev", "/usr/share/zoneinfo"),
 )
 """Where files may be read besides: this project and what it is made of."""
 _allowed: list[tuple[str, ...]] = []

@@ -149,7 +149,7 @@ def results(scene):
 
 @pytest.mark.slow
 def test_fast_finds_the_same_people_as_surely(scene, results):
-    """Everybody in every frame, with a body; as near to the truth but for a tenth, and no surer
+    """Everybody in every frame, with a body; as near to the truth but for a fifth, and no surer
     than right.
     """
     accurate, fast = results
@@ -162,7 +162,7 @@ def test_fast_finds_the_same_people_as_surely(scene, results):
     assert (fast.observations.candidate[~key] == -1).all()
     errors = [joint_metrics(people, scene.keypoints) for people in results]
     assert errors[1].f1 > errors[0].f1 - 0.01
-    assert errors[1].mpjpe_mm < 1.1 * errors[0].mpjpe_mm
+    assert errors[1].mpjpe_mm < 1.2 * errors[0].mpjpe_mm
     matches = match_people(fast.frame, fast.joints, scene.keypoints)
     between = ~key[matches.row]
     error = fast.joints[matches.row] - scene.keypoints[matches.frame, matches.person]
