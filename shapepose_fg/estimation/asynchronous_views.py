@@ -1,9 +1,8 @@
 """Asynchronous views: joints have moved when they are exposed before or after the others of their
 frame.
 
-The window's graph models each joint at the view's own time, from its position and velocity
-(`factors.moving_projection_factors`). Gates and bodies use positions only: for these, detections
-are shifted to the frame's time by the current estimate of the velocity.
+Detections are shifted to the frame's time by the current estimate of the joint's velocity, in each
+step of a window's solution.
 """
 
 from dataclasses import replace

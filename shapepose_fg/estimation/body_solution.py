@@ -14,8 +14,8 @@ from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.notes import Problem
 from shapepose_fg.core.observations import Observations
-from shapepose_fg.core.reconstruction import Known, Status
-from shapepose_fg.estimation.association_uncertainty import DOUBTED, mirrored_spread
+from shapepose_fg.core.reconstruction import Known
+from shapepose_fg.estimation.association_uncertainty import mirrored_spread
 from shapepose_fg.estimation.body_step import joint_targets
 from shapepose_fg.estimation.body_window import BodyWindow, Marginals
 from shapepose_fg.estimation.body_window_graph import BodyGraph
@@ -39,7 +39,7 @@ from shapepose_fg.estimation.missed_detections import (
     limbs_that_hide,
 )
 from shapepose_fg.estimation.motion_model import MotionModel
-from shapepose_fg.estimation.reported_covariance import WEAK_PROBABILITY, WEAK_SCORE
+from shapepose_fg.estimation.reported_covariance import WEAK_PROBABILITY, WEAK_SCORE, statuses
 from shapepose_fg.estimation.state import window_rows
 from shapepose_fg.estimation.user_factors import FactorFunction, add_factors, factors_of
 from shapepose_fg.estimation.window_solution import PersonGraph, WindowSolution, tied
@@ -190,17 +190,12 @@ class _Found:
         known = np.where(inlier.any(axis=-1), Known.WEAK, known)
         known = np.where(strong.sum(axis=-1) >= 2, Known.SEEN, known)
         known = np.where(np.isfinite(self.joints).all(axis=-1), known, Known.UNKNOWN)
-        doubted = np.median(rows.mirrored.max(axis=2, initial=0.0), axis=1) > DOUBTED
-        status = np.where(doubted, Status.CONTRADICTED, Status.OK)
-        failed = np.where(enough, Status.BODY_UNDETERMINED, Status.TOO_FEW_VIEWS)
         wrong = tuple(
             Problem(int(row), each.track, int(rows.frame[row]), joint, each.failure)
             for each in people
             for row in (each.rows if each.failure else ())
             for joint in np.flatnonzero(each.touched).tolist()
         )
-        status = np.where(self.fit.ok, status, failed)
-        status[[problem.row for problem in wrong]] = Status.NOT_SOLVED
         return WindowSolution(
             observations=rows,
             joints=self.joints,
@@ -213,7 +208,7 @@ class _Found:
             residual_px=self.evidence.residual_px,
             known=known.astype(np.uint8),
             fit=self.fit,
-            status=status,
+            status=statuses(rows, self.fit.ok, enough, wrong),
             problems=wrong,
             people=tied(
                 [

@@ -168,7 +168,7 @@ class BodyWindow:
             np.median(free[:, :10], axis=0), exp_so3(free[:, 10:13]), free[:, 13:], zero
         )
         bodies = self._bodies(state)
-        if self.links is None and len(self) > 1:
+        if len(self) > 1:
             self.links = self._linked(bodies)
         self.last = self.around(state, bodies)
         return self._descended(state)
@@ -246,7 +246,7 @@ class BodyWindow:
     def parameters(self, state: BodyState) -> BodyParameters:
         """The bodies in the world."""
         body = self.energy.complete(state.free)
-        return replace(body, transl=body.transl + self.origin.reshape(-1, 3))
+        return replace(body, transl=body.transl + self.origin)
 
     def widen_unseen(self, of_bodies: Array, elsewhere: Array) -> None:
         """Widen the deviation of joints without a used detection. No solution changes, and no other
@@ -284,8 +284,9 @@ class BodyWindow:
         evidence = linearise(observed, self.sigmas_px, X, self.views, self.config)
         held = self.standing
         information = evidence.information + held.information
-        pull = evidence.gradient + (held.information @ (X - held.xyz)[..., None])[..., 0]
-        both = replace(evidence, information=information, gradient=pull)
+        off = (X - held.xyz)[..., None]
+        gradient = evidence.gradient + (held.information @ off)[..., 0]
+        both = replace(evidence, information=information, gradient=gradient)
         target = both.target - self.origin
         variance = self.variance[..., None, None]
         share = inverses(np.eye(3) + variance * information)
@@ -294,7 +295,6 @@ class BodyWindow:
         targets = EnergyTargets(target, weighed)
         linear = self.energy.linearise(state.free, targets, 1e9, self._held, nothing(len(self)))
         cost = self._seen_cost(evidence)
-        off = (X - held.xyz)[..., None]
         cost += (off.mT @ held.information @ off).sum(axis=(1, 2, 3))
         cost += (np.square(state.deviation).sum(axis=-1) / self.variance).sum(axis=-1)
         angles = state.others[:, :-3] - self._held.angles

@@ -119,7 +119,7 @@ class BodyGraph(PersonWindow):
         bodies = np.array([values.atVector(key) for key in self.body_keys.tolist()])
         joints = np.array([values.atPoint3(key) for key in self.keys.ravel().tolist()])
         others = bodies[:, 3:].copy()
-        others[:, -3:] -= self.window.origin.reshape(-1, 3)
+        others[:, -3:] -= self.window.origin
         zero = np.zeros((*self.keys.shape, 3))
         root = exp_so3(bodies[:, :3]) @ self._upright
         betas = values.atVector(self.shape_key).reshape(self.state.betas.shape)
@@ -150,7 +150,7 @@ class BodyGraph(PersonWindow):
     def _bodies(self) -> Array:
         """(T, N) values of the bodies."""
         turn, others = log_so3(self.state.root @ self._upright.mT), self.state.others.copy()
-        others[:, -3:] += self.window.origin.reshape(-1, 3)
+        others[:, -3:] += self.window.origin
         return np.concatenate([turn, others], axis=1)
 
     def turns(self) -> Array:

@@ -30,8 +30,6 @@ LOOK_S = 0.05
 """Frames within this time count as one observation of the speed. Errors of velocities are
 correlated for longer, but their covariances are too wide. Among 0.03, 0.05 and 0.1 s this has the
 least error over all speeds in simulated recordings of 4 and 6 cameras (crowd 777, salsa 31)."""
-UNSEEN_S = 0.5
-"""Time before and after a joint is seen for which its speed is taken from the body, seconds."""
 ALIKE_S = 0.25
 """Frames within this time count as one look of the views at a standing foot, seconds: detectors'
 errors last."""

@@ -26,10 +26,8 @@ WEIGHTS = ("power", "unseen", "association", "draft", "exchange", "person")
 
 @dataclass(frozen=True)
 class CovarianceFeatures:
-    """Features of the uncertainty of N rows' joints, solved over time: the graph's covariance, and
-    contradicting evidence.
-
-    The last four are temporal means (`in_time.smoothed_in_time`).
+    """Features of the uncertainty of N rows' joints: the graph's covariance, and contradicting
+    evidence.
     """
 
     frame: Whole

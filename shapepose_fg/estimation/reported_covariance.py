@@ -1,5 +1,7 @@
 """Results of people solved frame by frame: uncertainty, how joints are known, and problems."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -7,6 +9,7 @@ from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, JointTargets
 from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.core.decompositions import raise_eigenvalues
 from shapepose_fg.core.notes import Problem
+from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Known, Status
 from shapepose_fg.estimation.association_uncertainty import (
     DOUBTED,
@@ -66,12 +69,7 @@ def outcome(state: State, fitter: BodyFitter) -> WindowSolution:
     covariance += hidden[..., None, None] * np.eye(3)
     covariance += mirrored_spread(X, rows.mirrored, state.config.joints)
     wrong = problems(state, covariance)
-    doubted = np.median(rows.mirrored.max(axis=2, initial=0.0), axis=1) > DOUBTED
-    sided = np.where(doubted, Status.CONTRADICTED, Status.OK)
-    status = np.where(
-        fit.ok, sided, np.where(state.enough, Status.BODY_UNDETERMINED, Status.TOO_FEW_VIEWS)
-    )
-    status[[problem.row for problem in wrong]] = Status.NOT_SOLVED
+    status = statuses(rows, fit.ok, state.enough, wrong)
     return WindowSolution(
         observations=rows,
         joints=X,
@@ -97,6 +95,20 @@ def outcome(state: State, fitter: BodyFitter) -> WindowSolution:
         ]),
         factors=factors_of(people),
     )  # fmt: skip
+
+
+def statuses(
+    rows: Observations, ok: Mask, enough: Mask, problems: Sequence[Problem]
+) -> NDArray[np.str_]:
+    """(N,) status of each row: whether it has a body, `ok` (N,), whether its views determine one,
+    `enough` (N,), whether sides may be exchanged, and whether it could not be solved.
+    """
+    doubted = np.median(rows.mirrored.max(axis=2, initial=0.0), axis=1) > DOUBTED
+    sided = np.where(doubted, Status.CONTRADICTED, Status.OK)
+    failed = np.where(enough, Status.BODY_UNDETERMINED, Status.TOO_FEW_VIEWS)
+    status = np.where(ok, sided, failed)
+    status[[problem.row for problem in problems]] = Status.NOT_SOLVED
+    return status
 
 
 def final_bodies(state: State, covariance: Array, fitter: BodyFitter) -> BodyFit:

@@ -63,8 +63,8 @@ def solve_window(
     """Joints, covariances, bodies and graphs of N rows in any order; (track, frame) must be unique.
 
     Rows of one track at several frames are a window, one factor graph with a body in every frame.
-    A single row of a track is solved by the frame-by-frame method, which with the paper's
-    `EstimatorConfig` is its Algorithm 1, and so are all rows where the fitter has no body model.
+    If no track has several rows, or the fitter no body model, rows are solved by the frame-by-frame
+    method, which with the paper's `EstimatorConfig` is its Algorithm 1.
     `views` are the cameras, by row if they move. `extra_factors`, one function or several, add
     factors of your own to every window. Without `assigning` detections keep their people.
 
