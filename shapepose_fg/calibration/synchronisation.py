@@ -15,7 +15,7 @@ import numpy as np
 from shapepose_fg.calibration.offset_scan import Scan, chosen
 from shapepose_fg.calibration.offsets_in_space import InSpace
 from shapepose_fg.calibration.pairwise import Pairwise
-from shapepose_fg.calibration.tracks import Tracks
+from shapepose_fg.calibration.tracks import Tracks, at_regular_times
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.detections import DetectionSequence
@@ -104,21 +104,23 @@ def synchronise(
     frames: range,
     most_s: float = 60.0,
     progress: Callable[[int, int], None] = lambda done, total: None,
+    time_s: Array | None = None,
 ) -> Synchronised:
     """Estimate offsets, up to `most_s` between any two cameras with known poses, from people in
     `frames`.
 
-    In recordings of over four minutes drift is also estimated. Raises InputError if a camera sees
-    too few people.
+    `time_s` (T, V) are the times of the frames on each camera's own clock, s, from 0 on; by default
+    frame / `fps`. In recordings of over four minutes drift is also estimated. Raises InputError if
+    a camera sees too few people.
     """
     whole, end = round(WHOLE_S * fps), round(_END_S * fps)
     first = frames if len(frames) <= whole + end else frames[:whole]
-    seen = Sightings.of(detections, first)
+    seen = at_regular_times(Sightings.of(detections, first), time_s, fps)
     offset, sigma, sure = offsets(seen, rig, fps, first, most_s, np.zeros(len(rig)), progress)
     middle, none = (first.start + first.stop) / 2 / fps, np.zeros(len(rig))
     if len(first) == len(frames):
         return Synchronised(offset, sigma, sure, none, none, middle)
-    seen = Sightings.of(detections, frames[-end:])
+    seen = at_regular_times(Sightings.of(detections, frames[-end:]), time_s, fps)
     later, later_sigma, _ = offsets(seen, rig, fps, frames[-end:], _DRIFT_S, offset, progress)
     lasts = (frames.stop - end / 2) / fps - middle
     return Synchronised(

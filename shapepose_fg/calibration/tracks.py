@@ -26,6 +26,8 @@ correlated."""
 _BLOCK_S = 1.0
 """Duration within which errors count as one correlated error, s."""
 
+_SAME_TIME = 1e-3
+"""Difference of times that is ignored, frames."""
 _LEAST_AROUND, _LEAST_SPREAD = 0.6, 0.25
 """Minimum share of known values around a frame, and minimum share of their temporal spread."""
 
@@ -122,19 +124,40 @@ def on_one_clock(
     whole = np.floor(shift).astype(np.intp)
     part = (shift - whole)[sightings.view]
     rows = np.flatnonzero((part == 0) | (following >= 0))
-    far, part = np.where(part == 0, np.arange(len(part)), following)[rows], part[rows, None]
-    xy = (1 - part)[..., None] * sightings.xy[rows] + part[..., None] * sightings.xy[far]
-    confidence = np.minimum(sightings.confidence[rows], sightings.confidence[far])
     view, frame = sightings.view[rows], sightings.frame[rows] - whole[sightings.view[rows]]
     frame = frame - frame.min(initial=np.iinfo(np.intp).max)
     ends = [(int(frame[view == v].min()), int(frame[view == v].max())) for v in np.unique(view)]
     begin, end = sorted(first for first, _ in ends)[1:2], sorted(last for _, last in ends)[-2:-1]
     span = range(begin[0], end[0] + 1) if begin else range(0)
-    return OneClock(
-        skeleton,
-        Sightings(frame, view, xy, np.where(np.isfinite(xy[..., 0]), confidence, 0.0)),
-        span,
-    )
+    return OneClock(skeleton, _interpolated(sightings, rows, following, part[rows], frame), span)
+
+
+def at_regular_times(sightings: Sightings, time_s: Array | None, fps: float) -> Sightings:
+    """The sightings of each camera at the times n / `fps` of its own clock, interpolated linearly;
+    `frame` is then n. `time_s` (T, V) are the own times of the frames, s, from about 0 on; None:
+    they are regular already.
+    """
+    if time_s is None:
+        return sightings
+    following = next_of(sightings)
+    begin = time_s[sightings.frame, sightings.view] * fps
+    end = np.where(following < 0, begin + 2 * _SAME_TIME, begin[following])
+    first, last = (np.ceil(each - _SAME_TIME).astype(np.intp) for each in (begin, end))
+    rows = np.repeat(np.arange(len(first)), np.maximum(last - first, 0))
+    number = first[rows] + np.arange(len(rows)) - np.searchsorted(rows, rows)
+    part = ((number - begin[rows]) / (end - begin)[rows]).clip(0.0, 1.0)
+    return _interpolated(sightings, rows, following, np.where(following[rows] < 0, 0, part), number)
+
+
+def _interpolated(
+    sightings: Sightings, rows: Index, following: Index, part: Array, frame: Index
+) -> Sightings:
+    """The sightings of some `rows` (N,), moved by a `part` (N,) towards `following` (S,)."""
+    far = np.where(part == 0, rows, following[rows])
+    near, other = sightings.rows(rows), sightings.rows(far)
+    xy = (1 - part)[:, None, None] * near.xy + part[:, None, None] * other.xy
+    confidence = np.minimum(near.confidence, other.confidence)
+    return Sightings(frame, near.view, xy, np.where(np.isfinite(xy[..., 0]), confidence, 0.0))
 
 
 def next_of(sightings: Sightings) -> Index:

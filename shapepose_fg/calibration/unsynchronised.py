@@ -17,7 +17,8 @@ from shapepose_fg.calibration.from_people import (
 from shapepose_fg.calibration.levelling import Measured
 from shapepose_fg.calibration.offsets_from_heights import offsets_without_poses
 from shapepose_fg.calibration.synchronisation import WHOLE_S, Synchronised, offsets
-from shapepose_fg.calibration.tracks import next_of, on_one_clock
+from shapepose_fg.calibration.tracks import at_regular_times, next_of, on_one_clock
+from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.frame_times import FrameTimes
@@ -37,15 +38,19 @@ def calibrate_unsynchronised(
     lens: Freedom = KNOWN_LENS,
     measured: Measured | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
+    time_s: Array | None = None,
 ) -> tuple[Calibrated, Synchronised]:
     """Estimate the poses of the cameras of `rig`, as `calibrate` does, and their start times, up to
     `most_s` apart.
+
+    `time_s` (T, V) are the times of the frames on each camera's own clock, s, from 0 on; by default
+    frame / `fps`.
 
     Raises Undetermined if the people do not determine poses or offsets.
     """
     V = len(rig)
     frames = frames[: round(WHOLE_S * fps)]
-    sightings = Sightings.of(detections, frames)
+    sightings = at_regular_times(Sightings.of(detections, frames), time_s, fps)
     total, done = V - 1 + 100 * _ROUNDS, 0
 
     def told() -> None:

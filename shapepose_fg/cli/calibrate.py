@@ -10,7 +10,13 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 import typer
 
-from shapepose_fg.cli.found_cameras import MOST_S, check_most, report_option, show_clocks
+from shapepose_fg.cli.found_cameras import (
+    MOST_S,
+    check_most,
+    from_zero,
+    report_option,
+    show_clocks,
+)
 from shapepose_fg.cli.options import (
     INPUT,
     REQUIRED,
@@ -161,15 +167,16 @@ def calibrate(
         )
         recording, known, span = part
         fps, clocks = rate_of(known.frame_s), None
+        time_s = own_times(recording, known, len(rig))
+        time_s = time_s if times is None else from_zero(time_s)
         try:
             with progress("calibrating", "steps") as done:
                 if times is None:
                     found = calibrate(recording, rig, known, span, lens, measured, done)
                 else:
                     found, clocks = calibrate_unsynchronised(
-                        recording, rig, fps, span, most, lens, measured, done
+                        recording, rig, fps, span, most, lens, measured, done, time_s=time_s
                     )
-            time_s = own_times(recording, known, len(rig))
             time_s = time_s if clocks is None else clocks.of_views(time_s)
             whole, time_s = _with_moving(
                 whole,

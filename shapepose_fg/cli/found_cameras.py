@@ -7,6 +7,8 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from shapepose_fg.cli.options import RESULT, frame_range, option
 from shapepose_fg.cli.terminal import note, progress, show, table
 from shapepose_fg.core.errors import InputError
@@ -52,11 +54,23 @@ def found_clocks(
         if times is None or len(times) < 2:
             raise InputError("--fps: missing; give the frame rate of the cameras")
         span = frame_range(frames, len(recording), recording.first)
+        own_s = from_zero(own_times(recording, times, len(rig)))
         with progress("comparing", "pairs") as done:
             found = synchronise(
-                recording, rig, fps or rate_of(times.frame_s), span, most, progress=done
+                recording,
+                rig,
+                fps or rate_of(times.frame_s),
+                span,
+                most,
+                progress=done,
+                time_s=own_s,
             )
-        return found, found.of_views(own_times(recording, times, len(rig)))
+        return found, found.of_views(own_s)
+
+
+def from_zero(time_s: "Array") -> "Array":
+    """(T, V) times of each camera's frames from 0 on, NaN for missing frames."""
+    return time_s - np.nanmin(time_s, axis=0)
 
 
 def check_most(most: float) -> None:

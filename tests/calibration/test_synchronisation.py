@@ -13,7 +13,7 @@ from shapepose_fg.calibration import synchronisation
 from shapepose_fg.calibration.offsets_in_space import InSpace
 from shapepose_fg.calibration.pairwise import Pairwise
 from shapepose_fg.calibration.synchronisation import synchronise
-from shapepose_fg.calibration.tracks import Tracks
+from shapepose_fg.calibration.tracks import Tracks, at_regular_times
 from shapepose_fg.cli.main import main
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.detections import Recording
@@ -51,6 +51,26 @@ def test_clocks_that_run_apart(rig, two_people, monkeypatch):
     assert (np.abs(found.drift - drift)[1:] < 4 * found.drift_sigma[1:]).all()
     # Frame 250 of the third camera was exposed after 10 s of a clock that is 3 in 1,000 slow.
     assert found.at(10.0)[2] == pytest.approx(10.03 - 0.3, abs=0.008)
+
+
+def test_frames_of_any_rate_are_interpolated_to_regular_times():
+    """Two cameras, one 1 % slower and one with jitter, see a point that moves in a straight line;
+    so they do at the same times, apart from a gap.
+    """
+    rng, frame = np.random.default_rng(0), np.arange(200)
+    time_s = np.stack([frame / 24.75, frame / 25 + rng.uniform(-0.005, 0.005, 200)], axis=1)
+    time_s -= time_s[0]
+    seen = np.repeat(frame[(frame < 90) | (frame > 100)], 2)
+    view = np.tile([0, 1], len(seen) // 2)
+    spread = 100 * rng.random((15, 2))
+    xy = spread + 500 + 20 * time_s[seen, view][:, None, None]
+    given = Sightings(seen, view, xy, np.ones(xy.shape[:2]))
+    even = at_regular_times(given, time_s, 25.0)
+    np.testing.assert_allclose(even.xy, spread + 500 + 20 * even.frame[:, None, None] / 25)
+    for each in (0, 1):
+        frames = even.frame[even.view == each]
+        assert len(np.unique(frames)) == len(frames) > 180 and frames[0] == 0
+    assert at_regular_times(given, None, 25.0) is given
 
 
 @pytest.mark.slow

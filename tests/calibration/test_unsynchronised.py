@@ -67,14 +67,14 @@ def test_the_command_finds_poses_and_times_from_people_alone(
     monkeypatch.chdir(tmp_path)
     steps = list[tuple[int, int]]()
 
-    def watched(*given):
+    def watched(*given, **more):
         *others, progress = given
 
         def told(done: int, total: int) -> None:
             steps.append((done, total))
             progress(done, total)
 
-        return calibrate_unsynchronised(*others, progress=told)
+        return calibrate_unsynchronised(*others, progress=told, **more)
 
     monkeypatch.setattr(unsynchronised, "calibrate_unsynchronised", watched)
     write_rig(rig, tmp_path / "lenses.json")
