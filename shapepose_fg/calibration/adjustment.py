@@ -16,6 +16,7 @@ import numpy as np
 from gtsam.symbol_shorthand import B, C, L, X
 
 from factors.noise import diagonal, gaussian, isotropic_models, robust_kernel
+from shapepose_fg.body.model.rotation import exp_so3
 from shapepose_fg.calibration.people import People
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Camera, Rig
@@ -209,6 +210,16 @@ def _lens_covariance(camera: Camera, sigmas: Array, free: bool) -> Array:
         ** 2
     )
     return columns @ np.diag(sigmas[6:] ** 2) @ columns.T + held
+
+
+def changed(camera: Camera, by: Array) -> Camera:
+    """The camera with pose and lens changed by small amounts (Q,) of its parameters."""
+    K, wTc = camera.K.copy(), camera.wTc.copy()
+    K[[0, 1], [0, 1]] *= np.exp(by[FOCAL])
+    K[:2, 2] += by[CENTRE]
+    wTc[:3, 3] += wTc[:3, :3] @ by[MOVE]
+    wTc[:3, :3] = wTc[:3, :3] @ exp_so3(by[TURN])
+    return replace(camera, K=K, wTc=wTc)
 
 
 def _camera(camera: Camera, values: gtsam.Values, view: int, free: bool) -> Camera:

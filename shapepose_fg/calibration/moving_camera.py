@@ -6,7 +6,7 @@ pair of tracks, there and in the world, is registered at all time offsets; the r
 most people agree is refined by their projections. An ambiguous result is rejected.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import product
 
@@ -17,11 +17,12 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
+from shapepose_fg.calibration.adjustment import Adjusted, changed
 from shapepose_fg.calibration.from_people import Undetermined
-from shapepose_fg.calibration.people import Footage
+from shapepose_fg.calibration.people import Footage, People
 from shapepose_fg.calibration.refinement import dilution
 from shapepose_fg.core.arrays import Array, Index, Mask
-from shapepose_fg.core.camera import Camera, Rig
+from shapepose_fg.core.camera import Camera, Rig, Views
 from shapepose_fg.core.decompositions import nearest_rotation, rigid
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.trajectory import Trajectory
@@ -45,16 +46,24 @@ _OTHER_S, _OTHER_DEG = 1.0, 10.0
 _LEAST_SHARE, _LEAST_LEAD, _LEAST_PEOPLE = 0.5, 1.25, 25
 """Minimum share of the people in view that agree with the start, minimum ratio of their number to
 that of any other start, and minimum number."""
-_KNOTS, _DRIFT_M = 6, 0.01
-"""Number of times between which an odometry drifts linearly, and minimum drift between them, m."""
+_KNOT_S, _DRIFT_M, _DRIFT_RAD = 5.0, 0.005, np.radians(0.1)
+"""Time between the knots between which an odometry drifts linearly, s, and minimum drift between
+them, m and rad."""
+_VIEWS_CHANGE = 0.5
+"""Ratio of the correlated errors of a detector that count as one in a camera that moves to those in
+a fixed one; it sees people from changing directions (scripts/check_phones.py)."""
+_DRIFTS = np.log(3.0)
+"""Standard deviation of the log of the ratio of an odometry's drift to the stated one."""
 _LEVEL_RAD, _TILT_RAD = np.radians(6.0), np.radians(0.5)
 """Maximum deviation from the vertical of a log's axis that is along gravity, and the standard
 deviation of that of the world's vertical axis."""
 _STEPS = 12
 """Maximum number of evaluations in each round of adjustment."""
-_MOST_TURN_DEG, _MOST_MOVE_M = 2.0, 0.15
-"""Maximum standard deviations of a start; the refinement of trajectories uses detections within 50
-cm."""
+_SAMPLES, _TINY, _LEAST_VARIANCE = 30, 1e-4, 1e-6
+"""Number of frames for which the uncertainty of poses is averaged; step of numerical derivatives;
+and minimum share of a parameter's variance that is an error of its own."""
+_WIDTH = 2.385
+"""Width of the Cauchy kernel, in standard deviations: 95 % efficient for normal errors."""
 _RIGID, _LONG_M, _FEWEST = 0.1, 0.25, 3
 """Maximum relative variation of the distance of two joints of a bone, its minimum, m, and minimum
 number of bones that give the distance of a person."""
@@ -82,9 +91,14 @@ class Placed:
     """(P, J, 3) metres per second; 0 where unknown."""
     track: Index
     """(P,) track of each."""
+    spread: Array
+    """(M, P, J, 3) changes of the positions by one standard deviation of each of M independent
+    errors of the fixed cameras, metres."""
 
     @classmethod
-    def of(cls, time_s: Array, moment: Index, points: Array) -> "Placed":
+    def of(
+        cls, time_s: Array, moment: Index, points: Array, spread: Array | None = None
+    ) -> "Placed":
         """People at times (P,), linked between consecutive moments."""
         one, other = list[int](), list[int]()
         for now in np.unique(moment).tolist():
@@ -104,27 +118,34 @@ class Placed:
         before[other], after[one] = one, other
         lasts = np.maximum(time_s[after] - time_s[before], _STEP_S / 2)[:, None, None]
         velocity = np.nan_to_num((points[after] - points[before]) / lasts)
-        return cls(time_s, moment, points, velocity, connected_components(links, False)[1])
+        spread = np.zeros((0, *points.shape)) if spread is None else spread
+        track = connected_components(links, False)[1]
+        return cls(time_s, moment, points, velocity, track, spread)
 
     @classmethod
     def by_cameras(
-        cls, detections: DetectionSequence, given: Rig, rig: Rig, time_s: Array
+        cls, detections: DetectionSequence, given: Rig, found: Adjusted, time_s: Array
     ) -> "Placed":
-        """The people of a recording as cameras `rig`, before calibration `given`, place them;
+        """The people of a recording as the cameras `found`, before calibration `given`, place them;
         frames at `time_s` (T, V), NaN for missing ones.
         """
         first = float(np.sort(np.nanmin(time_s, axis=0))[1])
         last = min(float(np.sort(np.nanmax(time_s, axis=0))[-2]), first + _LONGEST_S)
         moments = np.arange(first, last, _STEP_S)
         number = np.full(time_s.shape, -1)
-        for own, found in zip(time_s.T, number.T, strict=True):
+        for own, of_moment in zip(time_s.T, number.T, strict=True):
             frame = _nearest(own, moments)
-            found[frame[frame >= 0]] = np.flatnonzero(frame >= 0)
+            of_moment[frame[frame >= 0]] = np.flatnonzero(frame >= 0)
         seen = Sightings.of(detections, np.flatnonzero((number >= 0).any(axis=1)).tolist())
         seen = replace(seen, frame=number[seen.frame, seen.view])
         footage = Footage.taken(seen.rows(seen.frame >= 0), given, detections.skeleton)
-        people = footage.people(rig)
-        return cls.of(moments[people.frame], people.frame, people.points)
+        people = footage.people(found.rig)
+        spread = _moved_by(people, found)
+        return cls.of(moments[people.frame], people.frame, people.points, spread)
+
+    def changed(self) -> list["Placed"]:
+        """The people, moved by each of the independent errors of the fixed cameras."""
+        return [replace(self, points=self.points + each) for each in self.spread]
 
     def grid(self, track: int, length: int) -> Array:
         """(length, J, 3) positions of a track by moment; NaN where unknown."""
@@ -132,6 +153,33 @@ class Placed:
         found = np.full((length, *self.points.shape[1:]), np.nan)
         found[self.moment[rows]] = self.points[rows]
         return found
+
+
+def _moved_by(people: People, found: Adjusted) -> Array:
+    """(M, P, J, 3) changes of people's joints, m, by one standard deviation of each of the M
+    independent errors of the cameras that place them.
+    """
+    rig, size = found.rig, int(np.prod(found.covariance.shape[:2]))
+    square = found.covariance.reshape(size, size)
+    sigma = np.sqrt(np.maximum(np.diag(square), 0.0))
+    scale = np.where(sigma > 0, sigma, 1.0)
+    values, vectors = np.linalg.eigh(square / scale / scale[:, None])
+    kept = values > _LEAST_VARIANCE
+    errors = (sigma[:, None] * vectors[:, kept] * np.sqrt(values[kept])).T
+    points = np.nan_to_num(people.points)
+    xy, _, by_point = Views.of(rig).project(points)
+    weight = np.where(people.seen, 1 / people.sigma_px, 0.0)[..., None]
+    by_point = np.nan_to_num(by_point) * weight[..., None]
+    inverse = np.linalg.pinv(np.einsum("pjvri,pjvrk->pjik", by_point, by_point), hermitian=True)
+    moved = np.empty((len(errors), *people.points.shape))
+    for each, error in zip(
+        moved, errors.reshape(len(errors), *found.covariance.shape[:2]), strict=True
+    ):
+        cameras = tuple(map(changed, rig.cameras, _TINY * error))
+        other, *_ = Views.of(replace(rig, cameras=cameras)).project(points)
+        missed = np.nan_to_num(weight * (other - xy) / _TINY)
+        each[:] = -np.einsum("pjik,pjvrk,pjvr->pji", inverse, by_point, missed)
+    return moved
 
 
 @dataclass(frozen=True)
@@ -146,31 +194,56 @@ class Start:
     """Time of the fixed cameras' clock at time 0 of the camera's own, s."""
     focal: float = 1.0
     """Ratio of the focal length to the given one."""
+    stretch: float = 1.0
+    """Ratio of the world's unit to that of the odometry."""
+    knots_s: Array = field(default_factory=lambda: np.zeros(1))
+    """(K,) times on the camera's own clock between which its drift is linear."""
+    drift: Array = field(default_factory=lambda: np.zeros((1, 6)))
+    """(K, 6) corrections of the odometry's drift in the world: rotation vectors and metres."""
     agreeing: float = 0.0
     """Number of people that agree, nearer ones counting more."""
     share: float = 0.0
     """Share of the people in view that agree."""
     sigma_turn_deg: float = np.inf
-    """Standard deviation of the rotation, degrees."""
+    """Standard deviation of the camera's rotations, degrees, errors of the fixed cameras, of the
+    lens and of the drift included."""
     sigma_move_m: float = np.inf
-    """Standard deviation of the camera's position, metres."""
+    """Standard deviation of the camera's positions, metres."""
+
+    def carrier(self, oTb: Array, own_s: Array) -> Array:
+        """(F, 4, 4) poses of the carrier in the world, from those in its odometry at times (F,)."""
+        drift = np.stack([np.interp(own_s, self.knots_s, each) for each in self.drift.T], axis=-1)
+        wRo, at = self.wTo[:3, :3], self.stretch * oTb[:, :3, 3]
+        turn = Rotation.from_rotvec(drift[:, :3]).as_matrix()
+        return rigid(turn @ wRo @ oTb[:, :3, :3], at @ wRo.T + self.wTo[:3, 3] + drift[:, 3:])
 
     def of(self, camera: Camera, odometry: Trajectory) -> tuple[Camera, Trajectory]:
-        """The camera on its trajectory, in the world and on the clock of the fixed cameras."""
+        """The camera on its trajectory, in the world and on the clock of the fixed cameras, without
+        the drift that is known.
+        """
         K = camera.K.copy()
         K[[0, 1], [0, 1]] *= self.focal
-        moved = replace(
-            odometry, time_s=odometry.time_s + self.offset_s, wTb=self.wTo @ odometry.wTb
-        )
+        wTb = self.carrier(odometry.wTb, odometry.time_s)
+        moved = replace(odometry, time_s=odometry.time_s + self.offset_s, wTb=wTb)
         return replace(camera, K=K, bTc=self.bTc), moved
 
     def words(self, name: str) -> str:
         """How well the start of a camera is known."""
         return (
             f"camera {name}: its trajectory starts {self.offset_s:+.3f} s after the first camera; "
-            f"{self.share:.0%} of the people in its view agree; its start is known to "
-            f"{self.sigma_turn_deg:.1f} degrees and {1e3 * self.sigma_move_m:.0f} mm (one sigma)"
+            f"{self.share:.0%} of the people in its view agree; its poses are known to "
+            f"{self.within()} (two sigma)"
         )
+
+    def tolerated(self) -> str:
+        """Degrees and mm, rounded up, that two standard deviations of the poses do not exceed."""
+        sigmas = (20 * self.sigma_turn_deg, 200 * self.sigma_move_m)
+        degrees, cm = np.ceil(sigmas)
+        return f"{degrees / 10:g},{10 * cm:g}"
+
+    def within(self) -> str:
+        """Two standard deviations of the poses, in words."""
+        return f"{2 * self.sigma_turn_deg:.1f} degrees and {2e3 * self.sigma_move_m:.0f} mm"
 
 
 @dataclass(frozen=True)
@@ -203,11 +276,21 @@ class Filmed:
         rays[row, place] = seen.xy @ K[:2, :2].T @ np.eye(2, 3) + [*K[:2, 2], 1.0]
         return cls(camera, trajectory, own_s[frames], rays)
 
-    def started(self, placed: Placed, most_s: float, focal: bool) -> Start:
+    def started(
+        self,
+        placed: Placed,
+        most_s: float,
+        focal: bool,
+        most_deg: float,
+        most_m: float,
+        sigma_scale: float = 0.0,
+    ) -> Start:
         """The start on which most people agree, up to `most_s` from the fixed cameras' clock;
-        `focal`: whether the focal length is unknown, too.
+        `focal`: whether the focal length and the principal point are unknown, too; `sigma_scale`:
+        standard deviation of the world's scale, as a share.
 
-        Raises Undetermined, with a sentence, if it is ambiguous or too inaccurate.
+        Raises Undetermined, with a sentence, if it is ambiguous, or if two standard deviations of
+        the poses exceed `most_deg` degrees or `most_m` metres.
         """
         cure = (
             "film the people whom the other cameras see for half a minute while they walk about, "
@@ -226,7 +309,7 @@ class Filmed:
         for each in tried:
             rival = each.agreeing > tried[0].agreeing / 2 and len(best) < _PEAKS
             if rival and all(self._differ(each, other) for other in best):
-                best.append(self._refined(each, placed, most_s, focal))
+                best.append(self._refined(each, placed, most_s, focal, sigma_scale))
         best.sort(key=lambda each: -each.agreeing)
         if not best or best[0].agreeing < _LEAST_PEOPLE or best[0].share < _LEAST_SHARE:
             raise refuse("no start of its trajectory agrees with the people of the other cameras")
@@ -234,23 +317,25 @@ class Filmed:
         others = [each.agreeing for each in best[1:] if self._differ(each, first)]
         if first.agreeing < _LEAST_LEAD * max(others, default=0.0):
             raise refuse("two starts of its trajectory agree with the people about equally well")
-        if first.sigma_turn_deg > _MOST_TURN_DEG or first.sigma_move_m > _MOST_MOVE_M:
-            raise refuse(
-                f"the people determine the start of its trajectory to {first.sigma_turn_deg:.1f} "
-                f"degrees and {100 * first.sigma_move_m:.0f} cm only"
+        if 2 * first.sigma_turn_deg > most_deg or 2 * first.sigma_move_m > most_m:
+            problem = (
+                f"camera {self.camera.name}: its poses are known to {first.within()} only (two "
+                f"sigma), but {most_deg:g} degrees and {1e3 * most_m:g} mm are asked; calibrate "
+                f"the lenses, film two people, or accept this with --tolerance {first.tolerated()}"
             )
+            raise Undetermined((problem,))
         return first
 
     def _differ(self, one: Start, other: Start) -> bool:
         """Whether two starts are different poses or times of the camera."""
         middle = len(self.own_s) // 2
-        a, b = ((each.wTo @ self._poses(each.bTc)[middle])[:3, :3] for each in (one, other))
+        a, b = (self._placed(each, [middle])[0, :3, :3] for each in (one, other))
         turn = np.degrees(Rotation.from_matrix(a.T @ b).magnitude())
         return bool(abs(one.offset_s - other.offset_s) > _OTHER_S or turn > _OTHER_DEG)
 
-    def _poses(self, bTc: Array) -> Array:
-        """(F, 4, 4) odometry from camera, for a mount."""
-        return self._oTb @ bTc
+    def _placed(self, start: Start, frame: Index | list[int]) -> Array:
+        """(N, 4, 4) world from camera in some frames (N,)."""
+        return start.carrier(self._oTb[frame], self.own_s[frame]) @ start.bTc
 
     @cached_property
     def _oTb(self) -> Array:
@@ -273,7 +358,7 @@ class Filmed:
         ]
         begin, found = float((placed.time_s - _STEP_S * placed.moment)[0]), list[Start]()
         for bTc in _QUARTERS:
-            oTc = self._poses(bTc)[frame]
+            oTc = (self._oTb @ bTc)[frame]
             own = points @ oTc[:, :3, :3].mT + oTc[:, None, :3, 3]
             moving = Placed.of(self.own_s[frame], moment[frame], own)
             grids = (moving.grid(n, length) for n in range(moving.track.max(initial=-1) + 1))
@@ -322,7 +407,7 @@ class Filmed:
         """(N, J, 3) joints of placed people in the camera, at the times of the frames (N,)."""
         later = self.own_s[frame] + start.offset_s - placed.time_s[rows]
         points = placed.points[rows] + later[:, None, None] * placed.velocity[rows]
-        wTc = start.wTo @ self._poses(start.bTc)[frame]
+        wTc = self._placed(start, frame)
         return (points - wTc[:, None, :3, 3]) @ wTc[:, :3, :3]
 
     def _judged(self, start: Start, placed: Placed, near_m: float) -> Start:
@@ -331,91 +416,179 @@ class Filmed:
         share = float((agreeing[inside] > 0).mean()) if inside.any() else 0.0
         return replace(start, agreeing=float(agreeing.sum()), share=share)
 
-    def _refined(self, start: Start, placed: Placed, most_s: float, focal: bool) -> Start:
+    def _refined(
+        self, start: Start, placed: Placed, most_s: float, focal: bool, sigma_scale: float
+    ) -> Start:
         """The start adjusted to the projections of the people that agree."""
-        free, bTc = np.array([True] * 6 + [most_s > 0] + [focal] * 4), start.bTc
+        free = np.array([True] * 6 + [most_s > 0] + [focal] * 3 + [True])
+        lasts, sigma_m, bTc = self.own_s[-1] - self.own_s[0], _SIGMA_M, start.bTc
         for number, near_m in enumerate(_NEAR_M):
             rows, frame, person, away, _ = self._matched(start, placed, near_m)
             used = away < near_m
             if used.sum() < _LEAST_PEOPLE:
                 return self._judged(start, placed, near_m)
-            given = replace(start, bTc=bTc)
-            fit = _Fit(self, placed, given, free, rows[used], frame[used], person[used])
-            start, sigma = fit.solved(_KNOTS if number == len(_NEAR_M) - 1 else 1)
-        start = replace(
-            start,
-            sigma_turn_deg=float(np.degrees(np.linalg.norm(sigma[:3]))),
-            sigma_move_m=float(np.linalg.norm(sigma[3:6])),
-        )
+            knots = 1 + int(np.ceil(lasts / _KNOT_S)) if number == len(_NEAR_M) - 1 else 1
+            knots_s = np.linspace(self.own_s[0], self.own_s[-1], knots)
+            given = replace(start, bTc=bTc, knots_s=knots_s, drift=np.zeros((knots, 6)))
+            people = (rows[used], frame[used], person[used])
+            fit = _Fit(self, placed, given, free, sigma_m, sigma_scale, *people)
+            start, sigma_m = fit.solved()
         return self._judged(start, placed, _NEAR_M[-1])
 
 
 @dataclass(frozen=True)
 class _Fit:
     """Adjustment of a start: rotation and translation about the middle of the path, offset, log of
-    the focal length, and rotation of the camera on its carrier, which is that of an unknown
-    principal point, too.
+    the focal length, rotation of the camera about its x and y axes, which is the effect of an
+    unknown principal point, log of the odometry's unit, and its drift at the knots.
     """
 
     filmed: Filmed
     placed: Placed
     start: Start
     free: Mask
-    """(11,) mask of the parameters that are adjusted."""
+    """(11,) mask of the parameters before the drift that are adjusted."""
+    sigma_m: float
+    """Standard deviation of a joint, across the ray, m."""
+    sigma_scale: float
     rows: Index
     frame: Index
     person: Index
 
     def moved(self, x: Array) -> Start:
-        """The start changed by the free parameters, the first ones of `x`."""
-        every, given = np.zeros(len(self.free)), self.start
-        every[self.free] = x[: self.free.sum()]
-        middle = (given.wTo @ self.filmed._poses(given.bTc)[self.frame])[:, :3, 3].mean(axis=0)
-        turn, mount = Rotation.from_rotvec(every[[[0, 1, 2], [8, 9, 10]]]).as_matrix()
+        """The start changed by the free parameters, and by the drift at the knots but the first."""
+        every, given, count = np.zeros(len(self.free)), self.start, int(self.free.sum())
+        every[self.free] = x[:count]
+        wRo, middle = given.wTo[:3, :3], self.filmed._oTb[self.frame, :3, 3].mean(axis=0)
+        turn, mount = Rotation.from_rotvec([every[:3], [*every[8:10], 0.0]]).as_matrix()
+        stretch = given.stretch * float(np.exp(every[10]))
+        at = given.wTo[:3, 3] + given.stretch * wRo @ middle + every[3:6]
         return replace(
             given,
-            wTo=rigid(turn, middle + every[3:6] - turn @ middle) @ given.wTo,
+            wTo=rigid(turn @ wRo, at - stretch * turn @ wRo @ middle),
             bTc=given.bTc @ rigid(mount, np.zeros(3)),
             offset_s=given.offset_s + every[6],
             focal=given.focal * float(np.exp(every[7])),
+            stretch=stretch,
+            drift=self._drift(x[count:]),
         )
 
-    def solved(self, knots: int) -> tuple[Start, Array]:
-        """The adjusted start, and standard deviations of the free parameters, if the odometry's
-        drift is linear between `knots` (1: no drift).
-        """
+    def _drift(self, x: Array) -> Array:
+        """(K, 6) drift at the knots, from steps in standard deviations."""
+        drift = np.zeros((len(self.start.knots_s), 6))
+        drift[1:, self._kinds] = np.cumsum(x.reshape(-1, len(self._kinds)) * self._steps, axis=0)
+        return drift
+
+    @cached_property
+    def _axis(self) -> int:
+        """Axis of the log that is next to the vertical."""
+        return int(np.argmax(np.abs(self.start.wTo[2, :3])))
+
+    @cached_property
+    def _level(self) -> bool:
+        """Whether the log has an axis along gravity: one is vertical within a few degrees."""
+        return bool(abs(self.start.wTo[2, self._axis]) > np.cos(_LEVEL_RAD))
+
+    @cached_property
+    def _kinds(self) -> list[int]:
+        """Rotations and translations that drift; gravity keeps two of the former."""
+        return [2, 3, 4, 5] if self._level else list(range(6))
+
+    @cached_property
+    def _steps(self) -> Array:
+        """(K - 1, D) standard deviations of the drift between knots."""
+        filmed, own_s, knots_s = self.filmed, self.filmed.own_s, self.start.knots_s
+        grown = np.cumsum(filmed.trajectory.drifted(filmed._oTb, own_s)[:, [0, 3], [0, 3]], axis=0)
+        moved = np.diff(filmed.trajectory.at(knots_s)[:, :3, 3], axis=0)
+        turn, move = (np.diff(np.interp(knots_s, own_s[1:], each)) for each in grown.T)
+        turn = turn + _DRIFT_RAD**2
+        move = move + turn * (moved**2).sum(axis=1) + _DRIFT_M**2
+        return np.sqrt(np.stack([turn] * 3 + [move] * 3, axis=-1))[:, self._kinds]
+
+    def solved(self) -> tuple[Start, float]:
+        """The adjusted start, and the standard deviation of a joint."""
         filmed, free = self.filmed, int(self.free.sum())
         rays = filmed.rays[self.frame, self.person]
         known = np.isfinite(rays[..., 0] + self.placed.points[self.rows][..., 0])
-        count = dilution(self.placed.time_s[self.rows])
-        mount = np.flatnonzero(np.flatnonzero(self.free) >= 8)
-        # The log has an axis along gravity if one is vertical within a few degrees.
-        axis = np.argmax(np.abs(self.start.wTo[2, :3]))
-        level = abs(self.start.wTo[2, axis]) > np.cos(_LEVEL_RAD)
-        at = np.linspace(filmed.own_s[0], filmed.own_s[-1], knots)
-        own_s = filmed.own_s
-        grows = np.cumsum(filmed.trajectory.drifted(filmed._oTb, own_s)[:, 3, 3])
-        drifts = np.sqrt(np.diff(np.interp(at, own_s[1:], grows)) + _DRIFT_M**2)
-        part = np.array([np.interp(own_s[self.frame], at, row) for row in np.eye(knots)[1:]])
+        count = _VIEWS_CHANGE * dilution(self.placed.time_s[self.rows])
+        mount = np.flatnonzero(np.isin(np.flatnonzero(self.free), (8, 9)))
+        sigma_scale = np.hypot(self.sigma_scale, filmed.trajectory.drift)
+
+        def data(now: Start, placed: Placed) -> Array:
+            at = filmed._seen(now, placed, self.rows, self.frame)
+            depth = np.maximum(at[known][:, 2:], _LEAST_DEPTH_M)
+            return np.ravel(rays[known][:, :2] / now.focal * depth - at[known][:, :2])
 
         def residuals(x: Array) -> Array:
-            now, drift = self.moved(x), x[free:].reshape(-1, 3)
-            at = filmed._seen(now, self.placed, self.rows, self.frame)
-            if knots > 1:
-                wRc = (now.wTo @ filmed._poses(now.bTc)[self.frame])[:, :3, :3]
-                at = at - np.einsum("nji,nj->ni", wRc, part.T @ drift)[:, None]
-            depth = np.maximum(at[known][:, 2:], _LEAST_DEPTH_M)
-            away = (rays[known][:, :2] / now.focal * depth - at[known][:, :2]) / _SIGMA_M
-            steps = np.diff(drift, axis=0, prepend=0.0) / drifts[:, None]
-            tilt = now.wTo[:2, axis] / _TILT_RAD * level
-            priors = np.concatenate([x[mount] / _MOUNT_RAD, tilt, steps.ravel()])
-            return np.concatenate([away.ravel(), np.sqrt(count) * priors])
+            now = self.moved(x)
+            tilt = now.wTo[:2, self._axis] / _TILT_RAD * self._level
+            unit = np.log(now.stretch) / sigma_scale
+            priors = [x[mount] / _MOUNT_RAD, tilt, [unit], x[free:]]
+            away = data(now, self.placed) / self.sigma_m
+            return np.concatenate([away, np.sqrt(count) * np.concatenate(priors)])
 
-        begin = np.zeros(free + 3 * (knots - 1))
-        fit = least_squares(residuals, begin, x_scale=0.01, loss="cauchy", max_nfev=_STEPS)
-        misfit = max(1.0, float(np.median(np.abs(fit.fun)) / 0.6745))
-        variance = np.diag(np.linalg.pinv(fit.jac.T @ fit.jac, hermitian=True))
-        return self.moved(fit.x), misfit * np.sqrt(count * np.maximum(variance, 0.0))
+        def loss(square: Array) -> Array:
+            """Cauchy's kernel for the joints only, and its derivatives."""
+            rho = np.stack([square, np.ones_like(square), np.zeros_like(square)])
+            z = square[:joints] / _WIDTH**2
+            rho[:, :joints] = [_WIDTH**2 * np.log1p(z), 1 / (1 + z), -1 / (_WIDTH * (1 + z)) ** 2]
+            return rho
+
+        begin, joints = np.zeros(free + self._steps.size), 2 * int(known.sum())
+        fit = least_squares(residuals, begin, x_scale=0.01, loss=loss, max_nfev=_STEPS)
+        sigma = float(self.sigma_m * np.median(np.abs(fit.fun[:joints])) / 0.6745)
+        robust = np.stack([loss(fit.fun**2)[n, :joints] for n in (1, 2)])
+        weight = np.sqrt(np.maximum(robust[0] + 2 * robust[1] * fit.fun[:joints] ** 2, 0.0))
+        information = fit.jac.T @ fit.jac / count
+        kinds = np.r_[np.full(free, -1), np.tile(np.array(self._kinds) // 3, len(self._steps))]
+        level, covariance = _drift_levels(information, fit.x, kinds)
+        now = self.moved(x := covariance @ information @ fit.x)
+        missed = data(now, self.placed)
+        # A constant error of the fixed cameras changes all joints, and so the parameters.
+        into = covariance @ fit.jac[:joints].T * weight / count / self.sigma_m
+        changed = [into @ (data(now, each) - missed) for each in self.placed.changed()]
+        errors = [covariance, *(np.outer(each, each) for each in changed)]
+        turn, move = self._spread(x, np.sum(errors, axis=0), level)
+        sigmas = {"sigma_turn_deg": np.degrees(turn), "sigma_move_m": move}
+        return replace(now, **sigmas), sigma
+
+    def _spread(self, x: Array, covariance: Array, level: Array) -> tuple[float, float]:
+        """Standard deviations of the camera's poses, rad and m, root mean square over the path, for
+        a covariance of the parameters `x`.
+        """
+        frames = np.unique(np.linspace(0, len(self.filmed.own_s) - 1, _SAMPLES).astype(np.intp))
+        poses = self.filmed._placed(self.moved(x), frames)
+        changes = np.empty((len(frames), 6, len(x)))
+        for n, step in enumerate(_TINY * np.eye(len(x))):
+            other = self.filmed._placed(self.moved(x + step), frames)
+            turn = Rotation.from_matrix(poses[:, :3, :3].mT @ other[:, :3, :3]).as_rotvec()
+            changes[..., n] = np.hstack([turn, other[:, :3, 3] - poses[:, :3, 3]]) / _TINY
+        variance = np.einsum("fpn,nm,fpm->fp", changes, covariance, changes).mean(axis=0)
+        if len(self._steps) > 0:  # a random walk deviates from the line between two knots
+            steps = self._steps * level[np.array(self._kinds) // 3]
+            variance[self._kinds] += (steps**2).mean(axis=0) / 6
+        return float(np.sqrt(variance[:3].sum())), float(np.sqrt(variance[3:].sum()))
+
+
+def _drift_levels(information: Array, x: Array, kinds: Index) -> tuple[Array, Array]:
+    """Most probable ratios (2,) of the drift's rotations and translations to their standard
+    deviations, and the covariance of all parameters `x` for these.
+
+    `information` includes a unit prior on the parameters that are rotations (0 in `kinds`) or
+    translations (1). The ratios' prior is log-normal; parameters are integrated out.
+    """
+
+    def judged(ratio: Array) -> tuple[float, Array]:
+        sigma = np.where(kinds < 0, 1.0, ratio[kinds])
+        inverse = np.linalg.pinv(information + np.diag(1 / sigma**2 - 1), hermitian=True)
+        both = information @ x
+        prior = 0.5 * float((np.log(ratio) ** 2).sum()) / _DRIFTS**2
+        spread = 0.5 * np.linalg.slogdet(inverse)[1] - np.log(sigma).sum()
+        return spread + 0.5 * both @ inverse @ both - prior, inverse
+
+    ratios = list(product(np.exp(_DRIFTS * np.linspace(-2, 1, 13)), repeat=2))
+    best = max(map(np.array, ratios), key=lambda each: judged(each)[0])
+    return best, judged(best)[1]
 
 
 @dataclass(frozen=True)

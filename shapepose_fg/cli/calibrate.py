@@ -113,6 +113,12 @@ def calibrate(
         "Log of a camera that moves (TUM, CSV, ARKit, ARCore); its start is found from the people.",
         metavar="CAMERA=FILE",
     ),
+    tolerance: str = option(
+        _CAMERAS,
+        "Largest error of the poses of a camera that moves, two sigma; a worse one is refused.",
+        "0.6,25",
+        metavar="DEG,MM",
+    ),
     output: Path = option(RESULT, "File for the cameras.", REQUIRED),
     form: Literal["rig", "pose2sim"] = option(
         RESULT, "Format of the file: rig (JSON), or Pose2Sim's TOML.", "rig", "--format"
@@ -146,6 +152,7 @@ def calibrate(
     if stature is not None and not 0.5 <= stature <= 2.5:
         raise InputError(f"--stature {stature:g}: must be 0.5 to 2.5 metres")
     check_most(most)
+    within = _within(tolerance)
     if times is not None and rate.timestamps is not None:
         raise InputError(
             "--times and --timestamps: times are either estimated or given; give one of them"
@@ -180,13 +187,14 @@ def calibrate(
             time_s = time_s if clocks is None else clocks.of_views(time_s)
             whole, time_s = _with_moving(
                 whole,
-                found.rig,
+                found,
                 recording,
                 time_s,
                 seen,
                 rate,
                 0.0 if times is None else most,
                 focal,
+                within,
             )
         except Undetermined as error:
             note(*error.problems)
@@ -242,13 +250,14 @@ def calibrate(
 
 def _with_moving(
     whole: "Rig",
-    rig: "Rig",
+    found: "Calibrated",
     recording: "DetectionTable",
     time_s: "Array",
     seen: LensOptions,
     rate: RateOptions,
     most: float,
     focal: bool,
+    within: tuple[float, float],
 ) -> tuple["Rig", "Array"]:
     """The rig `whole` with the fixed cameras as calibrated in `rig`, and with moving ones, whose
     start is found; and the times (T, V) of frames, from 0 on.
@@ -260,18 +269,22 @@ def _with_moving(
     from shapepose_fg.io.calibration import carried
     from shapepose_fg.io.recording import own_times
 
+    rig = found.rig
     cameras = dict(zip(rig.names, rig.cameras, strict=True))
     columns = dict(zip(rig.names, time_s.T, strict=True))
     trajectories = {each.name: each for each in whole.trajectories}
     placed = None
     for name in trajectories:
         given = whole.only([name])
-        placed = placed or Placed.by_cameras(recording, whole.only(rig.names), rig, time_s)
+        placed = placed or Placed.by_cameras(
+            recording, whole.only(rig.names), found.adjusted, time_s
+        )
         with tempfile.TemporaryDirectory(prefix="shapepose-fg-") as folder:
             own, known, _ = rate.part(seen.detections, seen.skeleton, given, Path(folder), True)
             own_s = own_times(own, known, 1)[:, 0]
             odometry = trajectories[name].from_start(own_s)
-            start = Filmed.of(own, given.cameras[0], odometry, own_s).started(placed, most, focal)
+            filmed = Filmed.of(own, given.cameras[0], odometry, own_s)
+            start = filmed.started(placed, most, focal, *within, found.world.sigma_scale)
         cameras[name], trajectories[name] = start.of(given.cameras[0], odometry)
         columns[name] = own_s + start.offset_s
         note(start.words(name))
@@ -281,8 +294,8 @@ def _with_moving(
     )
     begin = np.nanmin(time_s) if most > 0 else 0.0
     moving = tuple(replace(each, time_s=each.time_s - begin) for each in trajectories.values())
-    found = Rig(tuple(cameras[name] for name in whole.names), "z", trajectories=moving)
-    return carried(found), time_s - begin
+    moved = Rig(tuple(cameras[name] for name in whole.names), "z", trajectories=moving)
+    return carried(moved), time_s - begin
 
 
 _CAPTION = (
@@ -348,6 +361,19 @@ def _world(found: "Calibrated", stature: float | None, distances: list[str]) -> 
         ),
         trust + ("" if distances else better),
     ]
+
+
+def _within(given: str) -> tuple[float, float]:
+    """Tolerated errors of poses, degrees and metres."""
+    try:
+        degrees, mm = (float(each) for each in given.split(","))
+    except ValueError:
+        degrees = mm = np.nan
+    if not (0 < degrees <= 180 and 0 < mm <= 1e5):
+        raise InputError(
+            f"--tolerance {given[:80]}: must be degrees and millimetres, such as 0.6,25"
+        )
+    return degrees, mm / 1e3
 
 
 def _distances(given: list[str], names: Sequence[str]) -> tuple[tuple[int, int, float], ...]:
