@@ -92,13 +92,14 @@ def adjust(
     given: Rig,
     start: Rig,
     people: People,
-    freedom: Freedom,
+    freedom: Freedom | Sequence[Freedom],
     dilution: float,
     scale: float = 1.0,
     reference: int | None = None,
     scaled: bool = False,
 ) -> Adjusted:
-    """Adjust cameras to `people`, starting at `start`, with the prior `given` and its `freedom`.
+    """Adjust cameras to `people`, starting at `start`, with the prior `given` and its `freedom`, of
+    all cameras or of each.
 
     The camera `reference` keeps its pose; without one the mean pose of the rig is kept, and with
     `scaled` the covariance excludes the rig's size. `dilution` is the number of correlated errors
@@ -106,7 +107,8 @@ def adjust(
     the covariance scaled, so that the kernel keeps its width in pixels. `scale` multiplies the
     detections' standard deviations.
     """
-    free = freedom.lens > 0
+    freedoms = [freedom] * len(start) if isinstance(freedom, Freedom) else list(freedom)
+    free = any(each.lens > 0 for each in freedoms)
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     person, joint, view = np.nonzero(people.seen)
     points = people.points[person, joint]
@@ -133,7 +135,7 @@ def adjust(
     for each, (camera, before) in enumerate(zip(start.cameras, given.cameras, strict=True)):
         values.insert(X(each), gtsam.Pose3(camera.wTc))
         values.insert(C(each), _lens(camera, free))
-        sigmas = freedom.sigmas / weight
+        sigmas = freedoms[each].sigmas / weight
         pose = diagonal(
             np.full(6, _HELD) if each == reference else np.maximum(sigmas[:6], _HELD), kernel
         )
@@ -169,7 +171,8 @@ def adjust(
     information = (
         _information(graph, found, list(dict.fromkeys(joints)), view.tolist(), rig, free) / dilution
     )
-    covariance = _covariance(information, rig, freedom.sigmas, reference, scaled)
+    prior = np.stack([each.sigmas for each in freedoms])
+    covariance = _covariance(information, rig, prior, reference, scaled)
     return Adjusted(rig, covariance, placed, scale * misfit(placed, rig, scale))
 
 
@@ -264,13 +267,12 @@ def _information(
 
 
 def _covariance(
-    information: Array, rig: Rig, sigmas: Array, reference: int | None, scaled: bool
+    information: Array, rig: Rig, prior: Array, reference: int | None, scaled: bool
 ) -> Array:
-    """(V, Q, V, Q) covariance of the cameras' parameters, without rigid motion, or scaling, of the
-    whole rig.
+    """(V, Q, V, Q) covariance of the cameras' parameters, with `prior` standard deviations (V, Q),
+    without rigid motion, or scaling, of the whole rig.
     """
     V = len(rig)
-    prior = np.tile(sigmas, (V, 1))
     if reference is not None:
         prior[reference, :6] = 0.0
     used = prior.ravel() > 0

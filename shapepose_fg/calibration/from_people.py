@@ -5,7 +5,7 @@ and bundle adjustment (`adjustment`), and last scale, up and the floor (`levelli
 undetermined result is rejected.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from typing import Any
@@ -144,7 +144,7 @@ def calibrate(
     rig: Rig,
     times: FrameTimes,
     frames: range,
-    lens: Freedom = KNOWN_LENS,
+    lens: Freedom | Sequence[Freedom] = KNOWN_LENS,
     measured: Measured | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
     start: Rig | None = None,
@@ -152,7 +152,8 @@ def calibrate(
     """Estimate the poses of the cameras of `rig`, ignoring its own poses, from the people in
     `detections`.
 
-    `lens` has the prior standard deviations of the lenses; that of the poses is ignored. The scale
+    `lens` has the prior standard deviations of the lenses, of all or of each; that of the poses is
+    ignored. The scale
     comes from `measured` distances, or from the stature of adults. `start` are approximate cameras,
     which replace the search. Raises Undetermined if cameras share too few people, or motion does
     not determine them; InputError if measured distances contradict each other.
@@ -166,10 +167,9 @@ def calibrate(
         done += more
         progress(done, total)
 
-    footage, freedom = (
-        Footage.of(detections, rig, times, frames),
-        replace(lens, turn_deg=20.0, move_m=1.0),
-    )
+    footage = Footage.of(detections, rig, times, frames)
+    lenses = [lens] * views if isinstance(lens, Freedom) else lens
+    freedom = tuple(replace(each, turn_deg=20.0, move_m=1.0) for each in lenses)
     taken = np.unique(footage.sightings.frame)
     how = _How(rig, times, freedom, detections.skeleton, measured.stature_m, told)
     if start is None:
@@ -280,7 +280,7 @@ class _How:
 
     given: Rig
     times: FrameTimes
-    freedom: Freedom
+    freedom: tuple[Freedom, ...]
     skeleton: Skeleton
     stature_m: float | None
     told: Callable[[int], None]

@@ -2,7 +2,7 @@
 alternately.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -35,7 +35,7 @@ def calibrate_unsynchronised(
     fps: float,
     frames: range,
     most_s: float = 60.0,
-    lens: Freedom = KNOWN_LENS,
+    lens: Freedom | Sequence[Freedom] = KNOWN_LENS,
     measured: Measured | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
     time_s: Array | None = None,

@@ -61,34 +61,46 @@ class LensOptions:
     field_of_view: list[str] | None = option(
         INPUT,
         "Instead of a calibration: field of view along the longer side of a picture in degrees, "
-        "or a photo with EXIF; of one camera: CAMERA=...",
+        "a photo with EXIF, or a phone's log with its lens; of one camera: CAMERA=...",
         metavar="DEG",
     )
     image_size: str | None = option(INPUT, "Picture size, if no file contains it.", metavar="WxH")
     cameras: str | None = option(INPUT, "Use only these cameras.", metavar="A,B")
     without: str | None = option(INPUT, "Leave out these cameras.", metavar="A,B")
 
-    def rig(self) -> "Rig":
-        """The cameras without poses; InputError if their lenses are unknown."""
+    def rig(self, trajectories: Sequence[str]) -> "tuple[Rig, set[str]]":
+        """The cameras without poses, and the names of those whose lenses are guessed; InputError if
+        lenses are unknown. `trajectories` are CAMERA=FILE: a log with intrinsics gives the lens.
+        """
         from shapepose_fg.core.camera import choose
         from shapepose_fg.io.calibration import read_rig
-        from shapepose_fg.io.lenses import lenses_of
+        from shapepose_fg.io.footage.places import per_camera
+        from shapepose_fg.io.lenses import is_log, lenses_of
+        from shapepose_fg.io.trajectories import read_log_lens
 
         if (self.calibration is None) == (self.field_of_view is None):
             raise InputError(
                 "--calibration, --field-of-view: the focal lengths are needed; give one of them"
             )
-        size = picture_size(self.image_size)
+        size, guessed = picture_size(self.image_size), set[str]()
         if self.calibration is not None:
             rig = read_rig(self.calibration, up="z", unit="m", image_size=size)
         else:
-            rig = lenses_of(self.detections, self.field_of_view or [], size)
+            fields = list(self.field_of_view or [])
+            named = {each.partition("=")[0] for each in fields}
+            for each in trajectories:
+                name, _, file = each.partition("=")
+                lacks = is_log(file) and name not in named and Path(file).is_file()
+                fields += [each] if lacks and read_log_lens(Path(file)) is not None else []
+            rig = lenses_of(self.detections, fields, size)
+            given = per_camera("--field-of-view", fields, rig.names, one_for_all=True)
+            guessed = {n for n, each in zip(rig.names, given, strict=True) if not is_log(each)}
         note(*rig.notes)
         with naming("--cameras, --without"):
             rig = rig.only(choose(rig.names, names_of(self.cameras), names_of(self.without) or ()))
         if len(rig) < 2:
             raise InputError(f"{self.detections}: at least 2 cameras are needed, got {len(rig)}")
-        return rig
+        return rig, guessed
 
 
 @grouped
@@ -157,14 +169,16 @@ def calibrate(
         raise InputError(
             "--times and --timestamps: times are either estimated or given; give one of them"
         )
-    whole, guessed = with_trajectories(seen.rig(), trajectory or []), seen.calibration is None
+    whole, guessed = seen.rig(trajectory or [])
+    whole = with_trajectories(whole, trajectory or [])
     if form == "pose2sim" and whole.moves:
         raise InputError("--format pose2sim: cannot hold --trajectory; write a rig file")
-    lens = Freedom(
-        focal=0.0 if not focal else _GUESS_OFF if guessed else _FILE_OFF,
-        centre_px=_CENTRE_OFF * whole.image_sizes.max() if guessed else 0.0,
+    guess = Freedom(
+        focal=focal * _GUESS_OFF, centre_px=_CENTRE_OFF * float(whole.image_sizes.max())
     )
+    known = Freedom(focal=focal * _FILE_OFF * (seen.calibration is not None))
     rig = whole.without([camera.name for camera in whole.cameras if camera.carrier])
+    lens = [guess if name in guessed else known for name in rig.names]
     if len(rig) < 2:
         raise InputError(f"--trajectory: at least 2 cameras must stand still, got {len(rig)}")
     measured = Measured(stature, _distances(distance or [], rig.names))
@@ -193,7 +207,7 @@ def calibrate(
                 seen,
                 rate,
                 0.0 if times is None else most,
-                focal,
+                guessed if seen.calibration is None else set(whole.names) if focal else set(),
                 within,
             )
         except Undetermined as error:
@@ -256,11 +270,11 @@ def _with_moving(
     seen: LensOptions,
     rate: RateOptions,
     most: float,
-    focal: bool,
+    guessed: set[str],
     within: tuple[float, float],
 ) -> tuple["Rig", "Array"]:
     """The rig `whole` with the fixed cameras as calibrated in `rig`, and with moving ones, whose
-    start is found; and the times (T, V) of frames, from 0 on.
+    start is found, with the lens of those in `guessed`; and the times (T, V) of frames, from 0 on.
 
     `time_s` (T, W) are the times of the fixed cameras' frames.
     """
@@ -284,7 +298,7 @@ def _with_moving(
             own_s = own_times(own, known, 1)[:, 0]
             odometry = trajectories[name].from_start(own_s)
             filmed = Filmed.of(own, given.cameras[0], odometry, own_s)
-            start = filmed.started(placed, most, focal, *within, found.world.sigma_scale)
+            start = filmed.started(placed, most, name in guessed, *within, found.world.sigma_scale)
         cameras[name], trajectories[name] = start.of(given.cameras[0], odometry)
         columns[name] = own_s + start.offset_s
         note(start.words(name))

@@ -4,6 +4,7 @@ sizes from the footage.
 
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from shapepose_fg.core.storage.files import BIG, open_regular
 from shapepose_fg.io.detections.reading import camera_names
 from shapepose_fg.io.footage.placement import read_used_footage
 from shapepose_fg.io.footage.places import per_camera
+from shapepose_fg.io.trajectories import read_log_lens
 
 _NARROWEST, _WIDEST = 5.0, 150.0
 """Smallest and largest field of view along the longer side that is accepted for a lens without
@@ -25,6 +27,8 @@ external programs."""
 _EXIF, _FOCAL_35MM = 0x8769, 0xA405
 """EXIF tags: the Exif directory in a photo, and FocalLengthIn35mmFilm in it."""
 _FILM_MM = (36.0, 24.0)
+_OFF_CENTRE = 0.05
+"""Maximum distance of a logged principal point from the middle, as a share of half the picture."""
 _USUAL = 65.0
 """Typical field of view of a phone along the longer side of a video, degrees."""
 
@@ -33,10 +37,11 @@ def lenses_of(detections: Path, fields: Sequence[str], size: tuple[int, int] | N
     """Cameras without poses, one for each file or folder of `detections`, in the order of their
     names.
 
-    `fields` are fields of view along the longer side of a picture in degrees, upright or not, or
-    photos of the same lens with the focal length in EXIF; `CAMERA=` before a value restricts it to
-    one camera. `size` is (width, height) of the pictures, pixels; by default it is read from
-    footage.json, which `detect` writes. InputError names what is missing.
+    `fields` are fields of view along the longer side of a picture in degrees, upright or not,
+    photos of the same lens with the focal length in EXIF, or logs of the phone with its intrinsics
+    (.csv); `CAMERA=` before a value restricts it to one camera. `size` is (width, height) of the
+    pictures, pixels; by default it is read from footage.json, which `detect` writes. InputError
+    names what is missing.
     """
     names = camera_names(detections)
     given = dict(
@@ -59,9 +64,32 @@ def lenses_of(detections: Path, fields: Sequence[str], size: tuple[int, int] | N
                 "WIDTHxHEIGHT"
             )
         with naming(detections):
-            cameras.append(_camera(name, picture, _degrees(field)))
+            camera = _camera(name, picture, _USUAL if is_log(field) else _degrees(field))
+        cameras.append(of_log(camera, Path(field)) if is_log(field) else camera)
     with naming(detections):
         return Rig(tuple(cameras), "z")
+
+
+def is_log(field: str | None) -> bool:
+    """Whether a value of --field-of-view is a log with intrinsics."""
+    return field is not None and field.lower().endswith(".csv")
+
+
+def of_log(camera: Camera, log: Path) -> Camera:
+    """The camera with the intrinsics of its phone's log; InputError if it has none, or for pictures
+    of another size.
+    """
+    K = read_log_lens(log)
+    if K is None:
+        raise InputError(f"{log}: has no intrinsics, columns fx fy cx cy; give degrees instead")
+    size, (u, v) = np.array(camera.image_size), 2 * K[:2, 2]
+    if not ((np.abs([u, v] / size - 1) < _OFF_CENTRE).all() and min(K[0, 0], K[1, 1]) > 0):
+        raise InputError(
+            f"{log}: its lens belongs to pictures of about {u:.0f} x {v:.0f} pixels, but those of "
+            f"camera {camera.name} have {size[0]} x {size[1]}; detect people in the pictures as "
+            "they were recorded, or give degrees"
+        )
+    return replace(camera, K=K)
 
 
 def pictures_only(names: Sequence[str], sizes: Sequence[tuple[int, int]]) -> Rig:

@@ -14,7 +14,9 @@ from shapepose_fg.io.number_table import read_number_table
 from shapepose_fg.io.validation import is_number
 
 _STRAY = {"timestamp", "frame", *POSE[1:]}
-"""Columns of Stray Scanner's odometry.csv; it may have further ones."""
+"""Columns of Stray Scanner's odometry.csv; it may have further ones, some of them empty."""
+_LENS = ("fx", "fy", "cx", "cy")
+"""Columns of the lens in a log, pixels."""
 _MATRIX = ("time_s", *(f"r{row}{column}" for row in "123" for column in "123t"))
 """Columns of ARKit Data Logger's ARKit_camera_pose.txt."""
 _LONGEST_STEP_S = 1e3
@@ -49,7 +51,7 @@ def read_trajectory(path: str | Path, name: str = "") -> Trajectory:
             _check_columns(path, line, names)
         return names, header
 
-    names, numbers, lines = read_number_table(path, heads, "write seconds and metres")
+    names, numbers, lines = read_number_table(path, heads, "write seconds and metres", _may_lack)
     if len(numbers) < 2:
         raise InputError(
             f"{path}: a trajectory needs 2 poses or more, got {len(numbers)}; write a line for each"
@@ -91,6 +93,30 @@ def read_trajectory(path: str | Path, name: str = "") -> Trajectory:
             )
     with naming(path, "correct it in the file"):
         return Trajectory(name or path.stem, pose[:, 0], wTb, covariance)
+
+
+def read_log_lens(path: Path) -> Array | None:
+    """(3, 3) intrinsics in a phone's log, pixels of the pictures as the sensor has them: medians of
+    the columns fx fy cx cy (Stray Scanner's odometry.csv), or a 3 x 3 matrix (its
+    camera_matrix.csv); None for other tables.
+    """
+
+    def heads(line: int, words: list[str]) -> tuple[list[str], bool]:
+        return words, not is_number(words[0])
+
+    units = "give a log with columns fx fy cx cy"
+    names, numbers, _ = read_number_table(path, heads, units, _may_lack)
+    if numbers.shape == (3, 3):
+        return numbers
+    if not set(_LENS) <= set(names) or len(numbers) == 0:
+        return None
+    fx, fy, cx, cy = (float(np.median(numbers[:, names.index(each)])) for each in _LENS)
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+def _may_lack(name: str) -> bool:
+    """Whether a column of a phone's log may be empty."""
+    return name.startswith("distortion_center")
 
 
 def _of_phone(

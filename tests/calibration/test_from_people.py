@@ -232,6 +232,32 @@ def test_lenses_by_their_field_of_view(tmp_path):
             lenses_of(tmp_path, fields, size)
 
 
+def test_lenses_by_the_logs_of_phones(tmp_path):
+    """Stray Scanner's, per picture or as a matrix; not those of pictures of another size."""
+    for name in ("left_json", "right_json"):
+        (tmp_path / name).mkdir()
+    head = "timestamp, frame, x, y, z, qx, qy, qz, qw, fx, fy, cx, cy\n"
+    row = "812.{}, 0, 1, 2, 3, 0, 0, 0, 1, {}, 1401, 950, 725\n"
+    (tmp_path / "odometry.csv").write_text(head + row.format(5, 1400) + row.format(6, 1402))
+    (tmp_path / "camera_matrix.csv").write_text("1380.0, 0, 955\n0, 1381, 715\n0, 0, 1.0\n")
+    (tmp_path / "poses.csv").write_text("0 1 2 3 0 0 0 1\n1 1 2 3 0 0 0 1\n")
+    logs = [f"left={tmp_path}/odometry.csv", f"right={tmp_path}/camera_matrix.csv"]
+    left, right = lenses_of(tmp_path, logs, (1920, 1440)).cameras
+    np.testing.assert_allclose(left.K, [[1401, 0, 950], [0, 1401, 725], [0, 0, 1]])
+    np.testing.assert_allclose(right.K, [[1380, 0, 955], [0, 1381, 715], [0, 0, 1]])
+    for log, size, said in (
+        (
+            "odometry",
+            (1440, 1920),
+            "pictures of about 1900 x 1450 pixels, but those of camera left",
+        ),
+        ("poses", (1920, 1440), "has no intrinsics, columns fx fy cx cy; give degrees"),
+        ("no", (1920, 1440), "no such file"),
+    ):
+        with pytest.raises(InputError, match=rf"{log}\.csv: .*{said}"):
+            lenses_of(tmp_path, [f"left={tmp_path}/{log}.csv", "right=65"], size)
+
+
 def test_lenses_by_a_photo(tmp_path):
     """Of film's 36 x 24 mm a lens of 28 mm sees 75.4 degrees along the diagonal, whatever the
     picture's shape.

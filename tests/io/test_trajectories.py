@@ -35,9 +35,10 @@ def test_tum(tmp_path):
 
 
 STRAY = (
-    "timestamp, frame, x, y, z, qx, qy, qz, qw, fx\n"
-    "812.5, 000000, 1, 2, 3, 0, 0, 0, 1, 1400\n"
-    "812.6, 000001, 1, 2, 4, 0, 0, 0, 1, 1400\n"
+    "timestamp, frame, x, y, z, qx, qy, qz, qw, fx, fy, cx, cy, distortion_center_x, "
+    "distortion_center_y\n"
+    "812.5, 000000, 1, 2, 3, 0, 0, 0, 1, 1400, 1401, 950, 725, , \n"
+    "812.6, 000001, 1, 2, 4, 0, 0, 0, 1, 1402, 1403, 952, 727, , \n"
 )
 """What Stray Scanner writes on an iPhone: OpenCV's axes."""
 ARKIT = "812500000000 1 0 0 1 0 1 0 2 0 0 1 3 \n812600000000 1 0 0 1 0 1 0 2 0 0 1 4 \n"
