@@ -171,15 +171,13 @@ def _moved_by(people: People, found: Adjusted) -> Array:
     weight = np.where(people.seen, 1 / people.sigma_px, 0.0)[..., None]
     by_point = np.nan_to_num(by_point) * weight[..., None]
     inverse = np.linalg.pinv(np.einsum("pjvri,pjvrk->pjik", by_point, by_point), hermitian=True)
-    moved = np.empty((len(errors), *people.points.shape))
-    for each, error in zip(
-        moved, errors.reshape(len(errors), *found.covariance.shape[:2]), strict=True
-    ):
+    moved = list[Array]()
+    for error in errors.reshape(len(errors), *found.covariance.shape[:2]):
         cameras = tuple(map(changed, rig.cameras, _TINY * error))
         other, *_ = Views.of(replace(rig, cameras=cameras)).project(points)
         missed = np.nan_to_num(weight * (other - xy) / _TINY)
-        each[:] = -np.einsum("pjik,pjvrk,pjvr->pji", inverse, by_point, missed)
-    return moved
+        moved.append(-np.einsum("pjik,pjvrk,pjvr->pji", inverse, by_point, missed))
+    return np.reshape(moved, (len(moved), *points.shape))
 
 
 @dataclass(frozen=True)
@@ -234,6 +232,15 @@ class Start:
             f"{self.share:.0%} of the people in its view agree; its poses are known to "
             f"{self.within()} (two sigma)"
         )
+
+    def as_dict(self) -> dict[str, float]:
+        """The figures as plain values."""
+        return {
+            "start_s": round(self.offset_s, 5),
+            "agreeing": round(self.share, 3),
+            "sigma_turn_deg": round(self.sigma_turn_deg, 3),
+            "sigma_move_mm": round(1e3 * self.sigma_move_m, 1),
+        }
 
     def tolerated(self) -> str:
         """Degrees and mm, rounded up, that two standard deviations of the poses do not exceed."""
@@ -535,7 +542,7 @@ class _Fit:
             return rho
 
         begin, joints = np.zeros(free + self._steps.size), 2 * int(known.sum())
-        fit = least_squares(residuals, begin, x_scale=0.01, loss=loss, max_nfev=_STEPS)
+        fit = least_squares(residuals, begin, x_scale=0.01, loss=loss, max_nfev=_STEPS)  # type: ignore[arg-type]
         sigma = float(self.sigma_m * np.median(np.abs(fit.fun[:joints])) / 0.6745)
         robust = np.stack([loss(fit.fun**2)[n, :joints] for n in (1, 2)])
         weight = np.sqrt(np.maximum(robust[0] + 2 * robust[1] * fit.fun[:joints] ** 2, 0.0))
@@ -583,8 +590,9 @@ def _drift_levels(information: Array, x: Array, kinds: Index) -> tuple[Array, Ar
         inverse = np.linalg.pinv(information + np.diag(1 / sigma**2 - 1), hermitian=True)
         both = information @ x
         prior = 0.5 * float((np.log(ratio) ** 2).sum()) / _DRIFTS**2
-        spread = 0.5 * np.linalg.slogdet(inverse)[1] - np.log(sigma).sum()
-        return spread + 0.5 * both @ inverse @ both - prior, inverse
+        spread = float(0.5 * np.linalg.slogdet(inverse)[1] - np.log(sigma).sum())
+        fit = 0.5 * float(both @ inverse @ both)
+        return spread + fit - prior, np.asarray(inverse, dtype=np.float64)
 
     ratios = list(product(np.exp(_DRIFTS * np.linspace(-2, 1, 13)), repeat=2))
     best = max(map(np.array, ratios), key=lambda each: judged(each)[0])

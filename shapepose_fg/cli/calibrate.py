@@ -35,6 +35,7 @@ from shapepose_fg.core.errors import InputError, naming
 
 if TYPE_CHECKING:
     from shapepose_fg.calibration.from_people import Calibrated
+    from shapepose_fg.calibration.moving_camera import Start
     from shapepose_fg.core.arrays import Array
     from shapepose_fg.core.camera import Rig
     from shapepose_fg.io.detection_table import DetectionTable
@@ -199,7 +200,7 @@ def calibrate(
                         recording, rig, fps, span, most, lens, measured, done, time_s=time_s
                     )
             time_s = time_s if clocks is None else clocks.of_views(time_s)
-            whole, time_s = _with_moving(
+            whole, time_s, starts = _with_moving(
                 whole,
                 found,
                 recording,
@@ -244,6 +245,7 @@ def calibrate(
         told = found.as_dict() | (
             {} if clocks is None else {"clocks": clocks.as_dict(rig)["cameras"]}
         )
+        told |= {"moving": {name: each.as_dict() for name, each in starts.items()}}
         print(json.dumps(told, indent=2, allow_nan=False))
     else:
         show(table(("camera", *heads), [(name, *each) for name, each in rows], caption=_CAPTION))
@@ -272,9 +274,10 @@ def _with_moving(
     most: float,
     guessed: set[str],
     within: tuple[float, float],
-) -> tuple["Rig", "Array"]:
+) -> "tuple[Rig, Array, dict[str, Start]]":
     """The rig `whole` with the fixed cameras as calibrated in `rig`, and with moving ones, whose
-    start is found, with the lens of those in `guessed`; and the times (T, V) of frames, from 0 on.
+    start is found, with the lens of those in `guessed`; the times (T, V) of frames, from 0 on; and
+    the starts of the moving ones.
 
     `time_s` (T, W) are the times of the fixed cameras' frames.
     """
@@ -287,7 +290,7 @@ def _with_moving(
     cameras = dict(zip(rig.names, rig.cameras, strict=True))
     columns = dict(zip(rig.names, time_s.T, strict=True))
     trajectories = {each.name: each for each in whole.trajectories}
-    placed = None
+    placed, starts = None, dict[str, "Start"]()
     for name in trajectories:
         given = whole.only([name])
         placed = placed or Placed.by_cameras(
@@ -298,7 +301,9 @@ def _with_moving(
             own_s = own_times(own, known, 1)[:, 0]
             odometry = trajectories[name].from_start(own_s)
             filmed = Filmed.of(own, given.cameras[0], odometry, own_s)
-            start = filmed.started(placed, most, name in guessed, *within, found.world.sigma_scale)
+            starts[name] = start = filmed.started(
+                placed, most, name in guessed, *within, found.world.sigma_scale
+            )
         cameras[name], trajectories[name] = start.of(given.cameras[0], odometry)
         columns[name] = own_s + start.offset_s
         note(start.words(name))
@@ -309,7 +314,7 @@ def _with_moving(
     begin = np.nanmin(time_s) if most > 0 else 0.0
     moving = tuple(replace(each, time_s=each.time_s - begin) for each in trajectories.values())
     moved = Rig(tuple(cameras[name] for name in whole.names), "z", trajectories=moving)
-    return carried(moved), time_s - begin
+    return carried(moved), time_s - begin, starts
 
 
 _CAPTION = (
