@@ -70,11 +70,12 @@ def measure(room: int, mocap: Mocap, folder: Path, logs: bool) -> str:
     poses = rig.trajectories[0].at(frame_s) @ rig.cameras[-1].bTc
     degrees, mm = (float((each**2).mean() ** 0.5) for each in errors(poses, phones[-1].wTc, by))
     carried = told["moving"][names[-1]]
+    sigma = 2 * np.array([carried["sigma_turn_deg"], carried["sigma_move_mm"]])
     return (
         f"{row} {turn.max():.2f}° ({sure[:, 0].max():.2f}) | {move.max():.0f} mm "
         f"({sure[:, 1].max():.0f}) | {100 * by[2] - 100:+.1f} % "
-        f"({200 * told['sigma_scale']:.1f}) | {degrees:.2f}° ({2 * carried['sigma_turn_deg']:.2f}), {mm:.0f} mm "
-        f"({2 * carried['sigma_move_mm']:.0f}) |"
+        f"({200 * told['sigma_scale']:.1f}) | {degrees:.2f}° ({sigma[0]:.2f}), {mm:.0f} mm "
+        f"({sigma[1]:.0f}) |"
     )
 
 
