@@ -45,14 +45,21 @@ def measure(room: int, mocap: Mocap, folder: Path, logs: bool) -> str:
     own = np.column_stack([each.time_s - each.time_s[0] for each in phones])
     write_timestamps(folder / "detection" / "times.csv", names, own)
     write_trajectory(odometry(phones[-1], rng), folder / "log.tum")
-    far = np.linalg.norm(truth.centres[0] - truth.centres[1]) + rng.normal(0, 0.01)
+    apart = np.linalg.norm(truth.centres[:, None] - truth.centres, axis=-1)
+    one, other = np.unravel_index(apart.argmax(), apart.shape)
+    far = apart[one, other] + rng.normal(0, 0.01)
     words = ["--detections", folder / "detection", "--focal", "--tolerance", "180,100000", "--json"]
     for phone in phones:
         log, lens = folder / f"{phone.camera.name}.csv", phone.camera.K.tolist()
         log.write_text("\n".join(", ".join(map(str, row)) for row in lens))
         words += ["--field-of-view", f"{phone.camera.name}={log if logs else 65}"]
     words += ["--image-size", "{}x{}".format(*fixed[0].camera.image_size)]
-    words += ["--distance", f"phone1,phone2={far:.2f}", "--times", folder / "times.csv"]
+    words += [
+        "--distance",
+        f"{names[one]},{names[other]}={far:.2f}",
+        "--times",
+        folder / "times.csv",
+    ]
     words += ["--trajectory", f"{names[-1]}={folder / 'log.tum'}"]
     said, rig_file = io.StringIO(), folder / "found.json"
     with contextlib.redirect_stdout(said), contextlib.suppress(SystemExit):

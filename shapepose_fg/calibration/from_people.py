@@ -202,13 +202,13 @@ def calibrate(
     found = _judged(
         replace(adjusted, rig=new, people=people), world, halves, np.concatenate(missed), footage
     )
-    usual = _UNUSUAL * sigma_of_scale(world.persons, False)
-    if not measured.distances or abs(np.log(world.stature_m / ADULT_M)) < usual:
+    if not measured.distances:
         return found
-    tall = f"the median stature of people is {world.stature_m:.2f} m"
-    return replace(
-        found, notes=(f"{tall}; if they are adults, measure the distance of the cameras again",)
-    )
+    notes, tall = measured.better(adjusted, sigma), np.log(world.stature_m / ADULT_M)
+    if abs(tall) >= _UNUSUAL * sigma_of_scale(world.persons, False):
+        what = f"the median stature of people is {world.stature_m:.2f} m"
+        notes += (f"{what}; if they are adults, measure the distance of the cameras again",)
+    return replace(found, notes=notes)
 
 
 def _pairs(

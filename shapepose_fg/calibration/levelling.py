@@ -21,6 +21,8 @@ _PERSON, _KNOWN_PERSON, _COMMON = 0.07, 0.02, 0.025
 people of a known stature; and the error common to all people, from the detector."""
 _TAPE_M = 0.02
 """Standard deviation of a distance between lenses that was measured with a tape, m."""
+_CLEARLY = 1.3
+"""Ratio of standard deviations from which another measurement is recommended."""
 _CONTRADICTS = 4.0
 """Number of standard deviations above which measurements contradict each other."""
 _LEAN_RAD = np.radians(3.0)
@@ -39,6 +41,21 @@ class Measured:
     """Median stature of the people, m; None for adults'."""
     distances: tuple[tuple[int, int, float], ...] = ()
     """Pairs of cameras, and metres between their lenses; if given, they determine the scale."""
+
+    def better(self, adjusted: Adjusted, sigma: float) -> tuple[str, ...]:
+        """A note if the distance of the two cameras that are farthest apart would determine the
+        scale clearly better than `sigma`.
+        """
+        apart = np.linalg.norm(adjusted.rig.centres[:, None] - adjusted.rig.centres, axis=-1)
+        a, b = sorted(int(each) for each in np.unravel_index(apart.argmax(), apart.shape))
+        other = Measured(None, ((a, b, float(apart[a, b])),)).size_of(adjusted)[1]
+        if _CLEARLY * other > sigma:
+            return ()
+        one, two = (adjusted.rig.names[each] for each in (a, b))
+        return (
+            f"--distance {one},{two}=METRES, of the cameras that are farthest apart, would give "
+            f"all lengths to {100 * other:.1f} %, one sigma, instead of {100 * sigma:.1f} %",
+        )
 
     def size_of(self, adjusted: Adjusted) -> tuple[float, float]:
         """Scale factor of the cameras from the distances, and its standard deviation.

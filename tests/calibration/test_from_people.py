@@ -131,6 +131,10 @@ def test_measured_distances_say_the_scale(adjusted):
         InputError, match=r"distance of cam1 and cam0: people and .* give .* m instead of"
     ):
         Measured(distances=wrong).size_of(adjusted)
+    (note,) = Measured().better(adjusted, 0.05)
+    far = ",".join(adjusted.rig.names[each] for each in sorted(max(away, key=away.__getitem__)))
+    assert note.startswith(f"--distance {far}=") and "instead of 5.0 %" in note
+    assert Measured().better(adjusted, 0.001) == ()
 
 
 @pytest.mark.slow
