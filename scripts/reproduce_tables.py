@@ -83,7 +83,7 @@ class Column(NamedTuple):
 
 
 COLUMNS = [
-    Column(*each) for each in (
+    Column(*each) for each in list[tuple[Any, ...]]((
         ("F1", "f1"), ("least", "f1", 1, "least"), ("recall", "recall"), ("IDF1", "idf1"),
         ("MPJPE", "mpjpe_mm"), ("accel", "acceleration_error"), ("FP", "false_positives", 0, "sum"),
         ("missed", "people_missed", 0, "sum"), ("switches", "switches", 0, "sum"),
@@ -93,7 +93,7 @@ COLUMNS = [
             ("2 views", "seen"), ("1", "one_view"), ("0", "no_view"), ("u", "unseen"),
             ("v", "velocity")) for level in (50, 95)),
         ("u", "joints_unseen", 0, "sum"), ("v", "velocity_error", 2), ("ms", "cpu_ms", 0),
-    )
+    ))
 ]  # fmt: skip
 """Columns of all tables: lengths in mm, accelerations in m/s², velocities in m/s, `u`: joints that
 no view has seen for ten frames; ms: processor time per frame."""
@@ -140,7 +140,9 @@ def who_is_there(mocap: Mocap | None, split: Split, seeds: Sequence[int]) -> Ite
             two = partial(built_in_scene, seed, people=2, cameras=2, frames=120, fps=30)
             named = f"two people, {mode}"
             yield Case(named, f"{seed} {named}", two, range(120), seed, config)
-            for name in ("crowd", "crossing") if mocap is not None else ():
+            if mocap is None:
+                continue
+            for name in ("crowd", "crossing"):
                 made = replace(SEQUENCES[name], seed=seed)
                 for cameras, rate in kinds if config.temporal else [(n, 30) for n in rates]:
                     make = partial(

@@ -128,7 +128,7 @@ def score_tracks(
         name: covariance_calibration(error[those], found.covariance[those])
         for name, those in classes.items()
     }
-    placed = people.rows(np.isfinite(people.joints).all(axis=2).any(axis=1))
+    placed = people.rows(np.isfinite(people.joints.sum(axis=2)).any(axis=1))
     by_frame = ((truth.rows(truth.frame == frame), placed.rows(placed.frame == frame))
                 for frame in frames)  # fmt: skip
     tracks = track_metrics(TrackFrame.of(*pair) for pair in by_frame) if identities else None
