@@ -195,13 +195,6 @@ class JointMetrics:
         """Number of unmatched predictions: duplicates, and people who do not exist."""
         return self.people_duplicated + self.people_invented
 
-    @property
-    def everyone_once(self) -> bool:
-        """Whether every person was found in every frame, exactly once, and there was no false
-        positive.
-        """
-        return self.people_missed == self.people_duplicated == self.people_invented == 0
-
 
 def joint_metrics(
     predicted: People | Sequence[Real],
@@ -265,13 +258,6 @@ class CovarianceCalibration:
     log_score: float
     """Mean of the logarithm of the Gaussian's density, 1/m³, at the truth, each at least -50.
     Sigmas that are too large decrease it. NaN without joints."""
-
-    @property
-    def mean_nees(self) -> float:
-        """Mean NEES: 3 if the covariances are correct; more if they are too small; NaN without
-        joints.
-        """
-        return float(self.nees.mean()) if len(self.nees) else float("nan")
 
 
 def covariance_calibration(errors: Real, covariances: Real) -> CovarianceCalibration:
