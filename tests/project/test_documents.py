@@ -334,6 +334,24 @@ def test_every_command_on_a_page_is_one_that_the_program_takes(page):
             parse(group, words, command)
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_options_of_commands_in_a_sentence_exist(page):
+    """In a sentence a command may lack its other arguments, so only options are compared."""
+    group = typer.main.get_command(app)
+    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    for span in re.findall(r"`(?:shapepose-fg )?([^`]+)`", text):
+        command = group.commands.get(span.split()[0])
+        if command is not None and page.name != "CHANGELOG.md":
+            given = set(re.findall(r"(?<=[ /])--[a-z][\w-]*", span))
+            assert given <= options(command) | {"--help"}, span
+
+
+def options(command) -> set[str]:
+    """The options of a command and of the commands below it."""
+    own = {each for given in command.params for each in (*given.opts, *given.secondary_opts)}
+    return own.union(*map(options, getattr(command, "commands", {}).values()))
+
+
 def parse(command, words: list[str], whole: str) -> None:
     """Parse the words of a command as the program does, without running it."""
     commands = getattr(command, "commands", {})
