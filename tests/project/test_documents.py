@@ -245,25 +245,39 @@ GUIDES = [page for page in PAGES if page.parent.name == "guides"]
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", GUIDES, ids=lambda page: page.name)
-def test_the_python_of_a_guide_runs(page, tmp_path, monkeypatch):
-    if "to_frame(" in page.read_text(encoding="utf-8"):
+def test_a_guide_is_typed_in_an_empty_folder(page, tmp_path, monkeypatch, capsys):
+    """In the order of the page: its Python, and the commands that need no files of the reader."""
+    text = page.read_text(encoding="utf-8")
+    if "to_frame(" in text:
         pytest.importorskip("pandas", reason="tables of results are pandas's")
     monkeypatch.chdir(tmp_path)
-    run(page)
+    names: dict = {}
+    for language, block in re.findall(r"```(python|bash)\n(.*?)```", text, flags=re.DOTALL):
+        if language == "python":
+            exec(compile(block, str(page), "exec"), names)
+        elif "simulated" in block:
+            type_commands(block, capsys)
+
+
+def type_commands(block: str, capsys) -> None:
+    """Run the program's commands in a shell block; each must end well."""
+    for command in commands_in(block):
+        with pytest.raises(SystemExit) as end:
+            main(shlex.split(command)[1:])
+        assert end.value.code in (0, None), f"{command}: {capsys.readouterr()}"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "page", [page for page in PAGES if simulating(page)], ids=lambda page: page.name
+    "page",
+    [page for page in PAGES if simulating(page) and page not in GUIDES],
+    ids=lambda page: page.name,
 )
 def test_blocks_that_simulate_their_recording_run(page, tmp_path, monkeypatch, capsys):
     """Typed one after the other into an empty folder, each command ends well."""
     monkeypatch.chdir(tmp_path)
     for block in simulating(page):
-        for command in commands_in(block):
-            with pytest.raises(SystemExit) as end:
-                main(shlex.split(command)[1:])
-            assert end.value.code in (0, None), f"{command}: {capsys.readouterr()}"
+        type_commands(block, capsys)
 
 
 def steps(result: Reconstruction, feet: np.ndarray) -> np.ndarray:
