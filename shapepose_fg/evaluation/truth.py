@@ -33,6 +33,10 @@ _PANOPTIC = (
 """Joint order of CMU Panoptic (`joints19`)."""
 _MOST_M = 1e6
 """Largest magnitude of a coordinate, m."""
+_SIZE_M = (0.1, 5.0)
+"""Diagonal of the box around the joints of a person, m; another median means another unit."""
+_SMPLX_VALUES = 165
+"""Values of a pose of SMPL-X, whose shape differs from SMPL's."""
 _MAT_BYTES = 2**26
 """Maximum size of a MATLAB variable in memory, bytes; Shelf's annotation has 5 MB."""
 _CELL, _FLOATS, _MATRIX, _COMPRESSED = 1, (6, 7), 14, 15
@@ -123,8 +127,16 @@ def _table(place: object, rows: list[tuple[int, int, Array]], names: tuple[str, 
     if count.max() > 1:
         at, who = pairs[count.argmax()]
         raise InputError(f"{place}: person {who} is twice in frame {at}; remove one of them")
-    if np.abs(joints[np.isfinite(joints)]).max(initial=0) > _MOST_M or np.isinf(joints).any():
-        raise InputError(f"{place}: joints must be metres, at most {_MOST_M:g}; check the unit")
+    known = np.isfinite(joints)
+    box = np.where(known, joints, -np.inf).max(axis=1) + np.where(known, -joints, -np.inf).max(1)
+    size = np.linalg.norm(box[np.isfinite(box).all(axis=1) & box.any(axis=1)], axis=1)
+    median = float(np.median(size)) if len(size) > 0 else 1.0
+    largest = np.abs(joints[~np.isnan(joints)]).max(initial=0)
+    if not (_SIZE_M[0] < median < _SIZE_M[1] and largest < _MOST_M):
+        raise InputError(
+            f"{place}: joints must be metres, but people are {median:.3g} m large and up to "
+            f"{largest:.3g} m from the origin; check the unit"
+        )
     return PlainPeople(frame, joints, person, names, **more)
 
 
@@ -202,6 +214,10 @@ def _amass(files: list[Path], turn: Array, fps: float | None, body: Path | None)
             raise InputError(
                 f"{file}: must hold poses (F, 66 or more), trans (F, 3) and betas (10 or more); "
                 "give a motion of AMASS"
+            )
+        if poses.shape[1] == _SMPLX_VALUES:
+            raise InputError(
+                f"{file}: its shape belongs to SMPL-X; download the motion as SMPL+H instead"
             )
         numbers = data.get("frames", np.arange(count))
         rate = float(data.get("mocap_framerate", data.get("mocap_frame_rate", np.nan)))

@@ -188,7 +188,11 @@ class PeopleNode(Node):
 def main() -> None:
     """Run the node until it is stopped."""
     rclpy.init()
-    node = PeopleNode()
+    try:
+        node = PeopleNode()
+    except InputError as error:  # the calibration, mostly
+        rclpy.try_shutdown()
+        raise SystemExit(str(error)) from None
     try:
         with node.people:
             rclpy.spin(node)
