@@ -31,9 +31,6 @@ from shapepose_fg.pipeline.pipeline import refine_trajectories
 from shapepose_fg.simulation.mocap import Mocap
 from tests.calibration.filmed_by_phones import errors, film, odometry, similarity
 
-REFINED = 250
-"""Number of frames in which the carried phone is refined."""
-
 
 def measure(room: int, mocap: Mocap, folder: Path) -> dict[str, object]:
     """Film a room, type the commands, and compare the result with the truth."""
@@ -65,7 +62,8 @@ def measure(room: int, mocap: Mocap, folder: Path) -> dict[str, object]:
         folder / "detection", rig, None, folder / "kept", timestamps=folder / "times.csv"
     )
     assert times is not None
-    span = range(len(recording) // 3, len(recording) // 3 + REFINED)
+    # Number of frames in which the carried phone is refined.
+    span = range(len(recording) // 3, len(recording) // 3 + 250)
     begin, end = times.frame_s[[span.start, span.stop]]
     frame_s = np.genfromtxt(folder / "times.csv", delimiter=",", skip_header=1)[:, -1]
     used = (frame_s > begin) & (frame_s < end)

@@ -43,13 +43,6 @@ from shapepose_fg.io.detections.yolo import label_files, read_yolo
 from shapepose_fg.io.footage.placement import FOOTAGE
 from shapepose_fg.io.skeleton_file import find_skeleton
 
-_MOST_FRAMES = 2_000_000
-"""Maximum number of frames of a recording: larger numbers are not frame numbers but ids of
-pictures."""
-_MOST_EMPTY = 200_000
-"""Maximum number of frames without people at the beginning. If there are more, frames are counted
-from the first one with people, with a note."""
-
 
 @dataclass(frozen=True)
 class Format:
@@ -315,7 +308,9 @@ def _streams_of(
     """
     cameras = [each.camera for each in people]
     first, last = _span(cameras)
-    empty = first if first <= _MOST_EMPTY and all(camera.lists_people for camera in cameras) else 0
+    # Maximum number of frames without people at the beginning. If there are more, frames
+    # are counted from the first one with people, with a note.
+    empty = first if first <= 200_000 and all(camera.lists_people for camera in cameras) else 0
     first -= empty
     rule, note = score_rule(people)
     for each, camera in zip(people, cameras, strict=True):
@@ -350,7 +345,9 @@ def _span(cameras: Sequence[CameraPeople]) -> tuple[int, int]:
         problem = f"recognised as {cameras[0].program}, but no camera has a frame"
         raise InputError(f"{cameras[0].source}: {problem}; give detections of people")
     first, last = min(each.first for each in listed), max(each.last for each in listed)
-    if last - first >= _MOST_FRAMES:
+    # Maximum number of frames of a recording: larger numbers are not frame numbers but ids
+    # of pictures.
+    if last - first >= 2_000_000:
         problem = (
             f"recognised as {listed[0].program}, but its frames would run from {first} to {last}"
         )
