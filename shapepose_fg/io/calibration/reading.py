@@ -45,11 +45,11 @@ def read_rig(
     """Read the cameras of a calibration file or folder; the format is recognised by the content.
 
     The formats are `FORMATS`; docs/calibration_files.md lists their units and up axes. `up` and
-    `unit` override the file. `image_size` (width, height) is for formats that do not state the size of the
-    pictures. `cameras` are names of the cameras to read, all by default; `without` are names of
-    cameras to leave out. InputError, one sentence that names the file, the key and the cure, if a
-    required value is given neither by the file nor by the caller. `notes` of the rig list what was
-    left out.
+    `unit` override the file. `image_size` (width, height) is for formats that do not state the
+    size of the pictures. `cameras` are names of the cameras to read, all by default; `without`
+    are names of cameras to leave out. InputError, one sentence that names the file, the key and
+    the cure, if a required value is given neither by the file nor by the caller. `notes` of the
+    rig list what was left out.
     """
     path = Path(path)
     for name, value, known in (("up", up, get_args(Axis)), ("unit", unit, METRES)):
