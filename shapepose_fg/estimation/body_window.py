@@ -53,8 +53,16 @@ _PLACED_M = 0.05
 _STRAYS_M = 0.07
 """Standard deviation, m, of an unseen joint of the body at which its own deviation is as large:
 errors of poses that nothing shows are larger than their Gaussian when they are large."""
+NEW, LASTING = 0.4, 0.5
+"""Variance of detectors' errors that are new in every frame, and of those that last longer than a
+window averages, as shares of the noise law's. Fitted to the reported covariances of simulated and
+real recordings (docs/evaluation.md)."""
+_LOOKS = 16
+"""Number of frames, evenly over the window, from which it is taken how much it averages."""
 _STEPS, _SETTLED_M = 8, 5e-4
 """Most steps of the solver; it ends when joints move by less on average, metres."""
+_ANYWHERE = 1e-3
+"""Information on the place and direction of a body in a frame by itself, 1/m² and 1/rad²."""
 HELD = 1e-6
 """Information on every unknown, so that what nothing determines stays where it is."""
 _DAMPING = 1e-3
@@ -149,6 +157,9 @@ class BodyWindow:
             np.zeros(shape := (*self.variance.shape, 3)), np.zeros((*shape, 3))
         )
         """Constraint on the joints of standing feet by other frames, metres in the world."""
+        self.walk = np.full((len(steps), self.sigmas_px.shape[1]), np.inf)
+        """(T - 1, J) density of the random walk of standing feet in each step, m²/s; infinite for
+        others."""
         self.links: Links | None = None
         self._asynchronous = bool(leads(observations, views).any())
 
@@ -213,10 +224,16 @@ class BodyWindow:
         told = JointTargets(evidence.target[:, feet], told)
         information, pull = held_in_place(told, density, self.times_s)
         information[~seen], pull[~seen] = 0.0, 0.0
-        scale = np.trace(information, axis1=-2, axis2=-1)[..., None, None]
-        known = np.where(scale > 0, information + 1e-9 * scale * np.eye(3), np.eye(3))
-        self.standing.information[:, feet] = information
+        scale = np.trace(information, axis1=-2, axis2=-1)
+        known = information + 1e-9 * scale[..., None, None] * np.eye(3)
+        known = np.where(scale[..., None, None] > 0, known, np.eye(3))
         self.standing.xyz[:, feet] = (inverses(known) @ pull[..., None])[..., 0]
+        self.walk[:, feet] = np.where(seen[1:] & seen[:-1], density, np.inf)
+        # Detectors' errors last: all frames of a stance together say as much as one.
+        own = np.trace(told.information, axis1=-2, axis2=-1)
+        share = np.where(scale > 0, own / np.maximum(own + scale, 1e-9), 1.0)
+        self.standing.information[:, feet] = share[..., None, None] * information
+        self.sigmas_px[:, feet] /= np.sqrt(share)[..., None]
         self.last = self.around(state, self.last.bodies)
         return self._descended(state)
 
@@ -474,6 +491,31 @@ class Marginals:
         flat = slope.reshape(T, 3 * J, -1)
         return (flat @ whole).reshape(slope.shape) @ slope.mT
 
+    def lasting(self) -> float:
+        """How many times larger covariances are because detectors' errors last.
+
+        Errors that are new in every frame are averaged over time: they leave the covariances of
+        the window. Those that last are not: they leave those of a frame by itself.
+        """
+        window, last = self.window, self.window.last
+        some = slice(None, None, max(len(window) // _LOOKS, 1))
+        seen = np.asarray(last.evidence.inlier.any(axis=-1)[some])
+        if not seen.any():
+            return NEW + LASTING
+        slope, gain = self.slopes[some, ..., 10:], last.gain[some]
+        variance = window.variance[some, ..., None, None]
+        (T, J), N = seen.shape, slope.shape[-1]
+        flat = slope.reshape(T, 3 * J, N)
+        views = flat.mT @ (gain / variance @ slope).reshape(flat.shape)
+        prior = _ANYWHERE * np.eye(N)
+        prior[3:-3, 3:-3] += window.energy.priors.precision
+        shown = np.linalg.inv(views + prior)
+        of_body = (flat @ (shown @ views @ shown)).reshape(slope.shape) @ slope.mT
+        kept = np.eye(3) - gain
+        alone = np.trace(kept @ of_body @ kept.mT + variance * kept, axis1=-2, axis2=-1)
+        over_time = np.trace(self.joints()[some], axis1=-2, axis2=-1)
+        return NEW + LASTING * float(np.exp(np.log(alone / over_time)[seen].mean()))
+
     def velocities(self) -> Array:
         """(T, J, 3, 3) covariances of velocities as in `in_time.velocities`, m²/s²; NaN for a
         single frame.
@@ -492,8 +534,12 @@ class Marginals:
         for k in range(int((last - first).max(initial=0))):
             there = np.minimum(first + k, T - 2)
             across = np.where((first + k < last)[:, None, None, None], goes[there] @ across, across)
-        found = own[first] + own[last] - across - across.mT
-        return found / lasts[:, None, None, None] ** 2
+        found = (own[first] + own[last] - across - across.mT) / lasts[:, None, None, None] ** 2
+        # Standing feet move no farther than their random walk.
+        walk = np.minimum(self.window.walk, 1.0) * np.diff(self.window.times_s)[:, None]
+        moved = np.concatenate((np.zeros((1, J)), walk.cumsum(axis=0)))
+        density = (moved[last] - moved[first]) / lasts[:, None] ** 2
+        return found @ inverses(np.eye(3) + found / density[..., None, None])
 
 
 def nearest_keypoint(energy: BodyEnergy) -> Index:
