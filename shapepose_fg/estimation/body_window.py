@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import lapack
 
 from factors import DEFAULT_WIDTH_SIGMA, Motion
 from shapepose_fg.body.fitting.chains import Links
@@ -58,8 +59,9 @@ LASTS = 1.1
 Measured as that with which the 95 % regions hold in most recordings (docs/evaluation.md)."""
 _LOOKS = 16
 """Number of frames, evenly over the window, from which it is taken how much it averages."""
-_STEPS, _SETTLED_M = 8, 5e-4
-"""Most steps of the solver; it ends when joints move by less on average, metres."""
+_STEPS, _SETTLED_M = 8, 2e-3
+"""Most steps of the solver; it ends when joints move by less on average, metres. GTSAM's last step
+then moves them by a tenth of that."""
 _ANYWHERE = 1e-3
 """Information on the place and direction of a body in a frame by itself, 1/m² and 1/rad²."""
 HELD = 1e-6
@@ -211,7 +213,7 @@ class BodyWindow:
         stand; the state itself if none does.
         """
         velocity = velocities(self.joints(state), self.times_s)[:, feet]
-        covariance = self.covariances(state).velocities()[:, feet]
+        covariance = self.covariances(state).velocities(feet)
         seen = np.asarray(self.last.evidence.sigma_m[:, feet] < _PLACED_M)
         velocity = np.where(seen[..., None], velocity, np.nan)
         density = standing_density(velocity, covariance, self.times_s)
@@ -428,7 +430,8 @@ class BodyWindow:
         after, arrows = np.zeros((n * N, n * N)), np.zeros((n * N, 10))
         for t in range(T - 1, -1, -1):
             L, ahead = kept[t, :N, :N], kept[t, N : N + n * N, :N]
-            inverse = np.linalg.inv(np.tril(L))
+            inverse, _ = lapack.dtrtri(L, lower=1)
+            inverse = np.tril(inverse)
             W = ahead @ inverse
             across = -after @ W  # of those after it with this one
             own = inverse.T @ inverse - W.T @ across
@@ -516,14 +519,14 @@ class Marginals:
         over_time = np.trace(self.joints()[some], axis1=-2, axis2=-1)
         return LASTS * float(np.exp(np.log(alone / over_time)[seen].mean() / 2))
 
-    def velocities(self) -> Array:
-        """(T, J, 3, 3) covariances of velocities as in `in_time.velocities`, m²/s²; NaN for a
-        single frame.
+    def velocities(self, joints: Index | slice = slice(None)) -> Array:
+        """(T, J, 3, 3) covariances of the velocities of J `joints` as in `in_time.velocities`,
+        m²/s²; NaN for a single frame.
 
         Errors between distant frames are a Markov chain of those of consecutive ones, joint by
         joint, which is less correlated than they are.
         """
-        slope = self.slopes[..., 10:]
+        slope = self.slopes[:, joints, :, 10:]
         T, J = slope.shape[:2]
         flat = slope.reshape(T, 3 * J, -1)
         own = (flat @ self.poses).reshape(slope.shape) @ slope.mT
@@ -536,7 +539,7 @@ class Marginals:
             across = np.where((first + k < last)[:, None, None, None], goes[there] @ across, across)
         found = (own[first] + own[last] - across - across.mT) / lasts[:, None, None, None] ** 2
         # Standing feet move no farther than their random walk.
-        walk = np.minimum(self.window.walk, 1.0) * np.diff(self.window.times_s)[:, None]
+        walk = np.minimum(self.window.walk[:, joints], 1.0) * np.diff(self.window.times_s)[:, None]
         moved = np.concatenate((np.zeros((1, J)), walk.cumsum(axis=0)))
         density = (moved[last] - moved[first]) / lasts[:, None] ** 2
         return found @ inverses(np.eye(3) + found / density[..., None, None])
