@@ -55,7 +55,6 @@ CASES = {
 }
 """For each case, the recording and additional options. A preset applies to this checkout; the
 commit runs its default."""
-_LONG = 3000
 _ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 
 
@@ -195,7 +194,7 @@ def _written(kind: str, data: Path, folder: Path, frames: int | None) -> tuple[l
     number of frames.
     """
     recording, rig, fps = _crowd(data) if kind == "crowd" else _short(data)
-    count = _LONG if kind == "long" else len(recording)
+    count = 3000 if kind == "long" else len(recording)
     count = min(count, frames or count)
     write_association(to_and_fro(recording, count), rig, folder)
     named = [

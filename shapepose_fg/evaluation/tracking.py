@@ -23,11 +23,6 @@ from shapepose_fg.evaluation.track_metrics import TrackFrame, TrackMetrics, trac
 from shapepose_fg.io.solved_setup import model_of
 
 WRISTS = [BODY_25.index("RWrist"), BODY_25.index("LWrist")]
-FAST_M_S = 1.5
-"""Speed of a wrist, m/s, above which too much smoothing becomes visible."""
-LONG_UNSEEN = 10
-"""Number of consecutive frames without a view, the current one included, from which a joint counts
-as long unseen."""
 UNMATCHED = np.iinfo(np.int64).min
 """Code for "no identity"; every other number may be an identity."""
 
@@ -118,11 +113,13 @@ def score_tracks(
 
     views, error = views_used(found), found.joints - true[at]
     moving = found.velocity - velocities(true, fps)[at]
+    # Number of consecutive frames without a view, the current one included, from which a
+    # joint counts as long unseen.
     classes = {
         "seen": views >= 2,
         "one_view": views == 1,
         "no_view": views == 0,
-        "unseen": frames_unseen(views > 0, found.frame, identity) >= LONG_UNSEEN,
+        "unseen": frames_unseen(views > 0, found.frame, identity) >= 10,
     }
     calibration = {
         name: covariance_calibration(error[those], found.covariance[those])
@@ -198,7 +195,8 @@ def velocities(truth: Array, fps: float) -> Array:
 def fast_wrist_errors(placed: Array, truth: Array, fps: float) -> Array:
     """(M,) errors in metres of the wrists with a true speed above 1.5 m/s (central differences)."""
     true = truth[:, :, WRISTS]
-    fast = np.linalg.norm(velocities(true, fps), axis=-1) > FAST_M_S
+    # Speed of a wrist, m/s, above which too much smoothing becomes visible.
+    fast = np.linalg.norm(velocities(true, fps), axis=-1) > 1.5
     error = np.linalg.norm(placed[:, :, WRISTS] - true, axis=-1)
     return error[fast & np.isfinite(error)]
 

@@ -32,7 +32,6 @@ NOISE_FRAMES = 60
 """Maximum number of frames for learning the noise law. Shorter recordings use the shipped law."""
 _ENOUGH = 10_000
 """Number of detections that are enough for the noise law; a crowd has them in about 12 frames."""
-_GOLDEN = (5**0.5 - 1) / 2
 
 
 def estimate_offsets(
@@ -112,7 +111,7 @@ def noise_of(
         )
         frames, learnt = detections.first + np.array(spread_frames(count, NOISE_FRAMES)), 0
         # In golden-ratio order, frames are spread over the whole recording even if it ends early.
-        order = np.argsort(np.arange(len(frames)) * _GOLDEN % 1.0, kind="stable")
+        order = np.argsort(np.arange(len(frames)) * ((5**0.5 - 1) / 2) % 1.0, kind="stable")
         for found, people in _people(stage, setup.rig, detections, frames[order].tolist(), times):
             whole = Observations.of(whole_people(people.candidate, found), found, people.initial)
             chosen.append(people)
