@@ -4,7 +4,8 @@
 
 The rooms are those of tests/calibration/filmed_by_phones.py; people walk as in the recorded motions
 of `--data FOLDER` (or SHAPEPOSE_DATA). The commands are told 65 degrees, --focal and one distance.
-Run it from a clone. docs/evaluation.md has the results. About three minutes per room on one core.
+Run it from a clone. docs/evaluation/cameras.md has the results. About three minutes
+per room on one core.
 """
 
 import argparse

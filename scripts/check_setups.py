@@ -5,8 +5,8 @@ detectors.
 
 Simulated rooms with 3 to 6 cameras and 1 to 8 people, 6 s each. In every room the same kinds of
 faults are simulated with a detector of typical errors; detectors with lasting biases are simulated
-without faults. Run it from a clone. docs/evaluation.md has the results. About a minute and a half
-per room on one core.
+without faults. Run it from a clone. docs/evaluation/cameras.md has the results. About a minute
+and a half per room on one core.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""Measure the tables of simulated people in docs/evaluation.md again.
+"""Measure the tables of docs/evaluation/people.md again.
 
     python scripts/reproduce_tables.py --mocap cmu_smpl24.npz                    # all tables: hours
     python scripts/reproduce_tables.py --mocap cmu_smpl24.npz --cases crowd "3 cameras" --split tune
@@ -32,7 +32,7 @@ from shapepose_fg.simulation.mocap import Mocap
 from shapepose_fg.simulation.sequences import SEQUENCES, Split, sequence
 from shapepose_fg.simulation.training.motions import split_of
 
-PAGE = Path(__file__).parents[1] / "docs" / "evaluation.md"
+PAGE = Path(__file__).parents[1] / "docs" / "evaluation" / "people.md"
 OVER_TIME = PipelineConfig()
 MODES = {"with time": OVER_TIME, "without time": replace(OVER_TIME, temporal=False)}
 SEGMENTS: dict[Split, dict[str, tuple[int, int]]] = {
@@ -193,7 +193,7 @@ def main() -> None:
     parser.add_argument("--seeds", nargs="*", type=int, default=range(6101, 6106),
                         help="of `who is there`")  # fmt: skip
     parser.add_argument("--split", choices=("tune", "report"), default="report")
-    parser.add_argument("--results", type=Path, default=PAGE.parents[1] / "build" / "figures")
+    parser.add_argument("--results", type=Path, default=PAGE.parents[2] / "build" / "figures")
     parser.add_argument("--update", action="store_true", help="write the tables into the page")
     arguments = parser.parse_args()
     mocap = None if arguments.mocap is None else Mocap.load(arguments.mocap)

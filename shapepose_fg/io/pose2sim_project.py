@@ -245,7 +245,7 @@ def _calibration(session: Path, folder: Path) -> Path:
     found = next((each for each in (*files, rooms[0]) if is_calibration(each)), None)
     if found is None:
         there = listing(sorted(each.name for each in rooms[0].iterdir()))
-        cure = "run Pose2Sim's calibration, or put one of the formats of docs/conventions.md there"
+        cure = "run Pose2Sim's calibration, or put a format of docs/calibration_files.md there"
         raise InputError(
             f"{rooms[0]}: there is no calibration in a known format, only {there}; {cure}"
         )

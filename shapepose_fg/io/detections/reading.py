@@ -94,13 +94,14 @@ def read_detections(
 ) -> DetectionTable:
     """Read the detections of every camera of `rig` from the folder `path`, undistorted.
 
-    The formats are `FORMATS`, recognised by the files (docs/conventions.md). Files of cameras that
-    are not in the rig are ignored. `skeleton` is a `Skeleton`, the name of one in `SKELETONS`, or a
-    TOML file that describes it; by default it is determined by joint names in the files, by a
-    project's declaration, or by the number of keypoints. `notes` of the table list how the files
-    were interpreted. The recording is stored in `kept`, by default in memory; with an empty
-    `InFolder` it may be larger than memory. With `own_frames`, cameras may have different numbers
-    of frames. Raises InputError, one sentence that names file, place and cure.
+    The formats are `FORMATS`, recognised by the files (docs/detection_files.md). Files of
+    cameras that are not in the rig are ignored. `skeleton` is a `Skeleton`, the name of one in
+    `SKELETONS`, or a TOML file that describes it; by default it is determined by joint names in
+    the files, by a project's declaration, or by the number of keypoints. `notes` of the table
+    list how the files were interpreted. The recording is stored in `kept`, by default in
+    memory; with an empty `InFolder` it may be larger than memory. With `own_frames`, cameras
+    may have different numbers of frames. Raises InputError, one sentence that names file, place
+    and cure.
     """
     kept = InMemory() if kept is None else kept
     form, places, notes = find_places(Path(path), rig)
