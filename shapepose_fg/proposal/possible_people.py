@@ -44,7 +44,7 @@ class Frame:
 
     @cached_property
     def sight(self) -> Sight:
-        """The frame in the form that kernels take."""
+        """Detections and cameras of the frame as the arrays that compiled kernels take."""
         return Sight.of(self.detections, self.rig, self.skeleton)
 
     @cached_property
