@@ -73,7 +73,7 @@ class _Compared:
             return cls((), ids[:0], np.zeros((0, len(states))))
         groups = [group for group in group_people(found) if len(group) >= len(skeleton.core) // 2]
         rows = np.concatenate([np.zeros(0, dtype=np.intp), *groups])
-        count = np.array([len(group) for group in groups])
+        count = np.array([len(group) for group in groups], dtype=np.intp)
         view, joint = found.view[rows], found.joint[rows]
         xy, depth = rig.project(joints.position)  # (V, A, J, 2), (V, A, J)
         unit_px = (
