@@ -48,8 +48,8 @@ class Sample:
     _found: list[tuple[Detections, Observations]] = field(default_factory=list, init=False)
 
     def people(self, most: int) -> Iterator[tuple[Detections, Observations]]:
-        """Detections and people of up to `most` frames, until there are `_ENOUGH` detections."""
-        setup, first, used = self.setup, self.detections.first, 0
+        """Detections and people of up to `most` frames."""
+        setup, first = self.setup, self.detections.first
         config, rig, time_s = setup.config, setup.rig, self.times.of_views(len(setup.rig))
         stage = StageOne(setup.skeleton, config.candidates, config.proposals, Notebook())
         spread = max(NOISE_FRAMES, config.offsets.frames)
@@ -63,9 +63,6 @@ class Sample:
                 time = np.tile(time_s[frame], (len(people), 1))
                 self._found.append((found, replace(people, time_s=time)))
             yield self._found[n]
-            used += int(self._found[n][1].seen.sum())
-            if used >= _ENOUGH:
-                break
 
     def __len__(self) -> int:
         return len(self.detections) - self.detections.first
@@ -136,12 +133,15 @@ def noise_of(sample: Sample, book: Notebook) -> NoiseLaw:
         return NoiseLaw.load(source)
     if source == "none" or len(sample) < NOISE_FRAMES:
         return NoiseLaw.shipped()
-    chosen, every = list[Observations](), list[Observations]()
+    chosen, every, learnt = list[Observations](), list[Observations](), 0
     with book.stage("noise"):
         for found, people in sample.people(NOISE_FRAMES):
-            whole = whole_people(people.candidate, found)
+            whole = Observations.of(whole_people(people.candidate, found), found, people.initial)
             chosen.append(people)
-            every.append(Observations.of(whole, found, people.initial))
+            every.append(whole)
+            learnt += int(whole.seen.sum())
+            if learnt >= _ENOUGH:
+                break
         rows, whole = Observations.concatenate(chosen), Observations.concatenate(every)
         views, config = Views.of(setup.rig, rows.time_s), setup.config.observations
         return Residuals.of(rows, whole, views, config, setup.skeleton.joints).law()
@@ -162,7 +162,12 @@ def offsets_of(sample: Sample, book: Notebook) -> KeypointOffsets | None:
     if source != "recording":
         return KeypointOffsets.load(source)
     with book.stage("offsets"):
-        people = [each for _, each in sample.people(config.offsets.frames)]
+        people, learnt = list[Observations](), 0
+        for _, each in sample.people(config.offsets.frames):
+            people.append(each)
+            learnt += int(each.seen.sum())
+            if learnt >= _ENOUGH:
+                break
         if len(people) == 0:
             return KeypointOffsets.identity()
         rows = Observations.concatenate(people)
