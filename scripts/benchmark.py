@@ -65,8 +65,7 @@ _GROWTH = {
     "false_candidates": (1, 10),
 }
 """Sizes of simulated recordings; all others are `_USUAL`. Every camera stands elsewhere."""
-_LONG = 3000
-_ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+_ENVIRONMENT = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 _ENVIRONMENT |= {"PYTHONDONTWRITEBYTECODE": ""}
 
 
@@ -227,7 +226,7 @@ def _written(kind: str, data: Path, folder: Path, frames: int | None) -> tuple[l
     number of frames.
     """
     recording, rig, fps = _crowd(data) if kind == "crowd" else _short(data)
-    count = _LONG if kind == "long" else len(recording)
+    count = 3000 if kind == "long" else len(recording)
     count = min(count, frames or count)
     return _options(to_and_fro(recording, count), rig, fps, folder), count
 

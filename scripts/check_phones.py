@@ -4,7 +4,8 @@
 
 The rooms are those of tests/calibration/filmed_by_phones.py; people walk as in the recorded motions
 of `--data FOLDER` (or SHAPEPOSE_DATA). The commands are told 65 degrees, --focal and one distance.
-Run it from a clone. docs/evaluation.md has the results. About three minutes per room on one core.
+Run it from a clone. docs/evaluation/cameras.md has the results. About three minutes
+per room on one core.
 """
 
 import argparse
@@ -30,9 +31,6 @@ from shapepose_fg.io.write_detections import write_association
 from shapepose_fg.pipeline.pipeline import refine_trajectories
 from shapepose_fg.simulation.mocap import Mocap
 from tests.calibration.filmed_by_phones import errors, film, odometry, similarity
-
-REFINED = 250
-"""Number of frames in which the carried phone is refined."""
 
 
 def measure(room: int, mocap: Mocap, folder: Path) -> dict[str, object]:
@@ -65,7 +63,8 @@ def measure(room: int, mocap: Mocap, folder: Path) -> dict[str, object]:
         folder / "detection", rig, None, folder / "kept", timestamps=folder / "times.csv"
     )
     assert times is not None
-    span = range(len(recording) // 3, len(recording) // 3 + REFINED)
+    # Number of frames in which the carried phone is refined.
+    span = range(len(recording) // 3, len(recording) // 3 + 250)
     begin, end = times.frame_s[[span.start, span.stop]]
     frame_s = np.genfromtxt(folder / "times.csv", delimiter=",", skip_header=1)[:, -1]
     used = (frame_s > begin) & (frame_s < end)

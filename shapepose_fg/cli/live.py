@@ -17,7 +17,7 @@ from shapepose_fg.cli.terminal import note
 from shapepose_fg.core.errors import InputError, naming
 
 if TYPE_CHECKING:
-    from shapepose_fg.live.online import OnlineReconstructor, Said
+    from shapepose_fg.live.online import CameraChange, OnlineReconstructor
 
 
 @grouped
@@ -95,12 +95,12 @@ def live(
 
 
 def _say(
-    people: "OnlineReconstructor", last: "Said | None", note: Callable[[str], None]
-) -> "Said | None":
+    people: "OnlineReconstructor", last: "CameraChange | None", note: Callable[[str], None]
+) -> "CameraChange | None":
     """Print changes of the cameras' statuses since `last`, the last printed ones; returns the
     current ones.
     """
-    events = people.said()
+    events = people.camera_changes()
     if len(events) == 0 or events[-1] is last:
         return last
     new = next((n for n, each in enumerate(reversed(events)) if each is last), len(events))

@@ -16,12 +16,6 @@ from shapepose_fg.core.kept_kernels import kept_folder, wanted_folder
 
 _BYTES_S = 1300
 """Bytes of Python bytecode that an average machine compiles in a second."""
-_WORTH_S = 3.0
-"""Compile time below which kernels are compiled in this process, s: starting a process takes a
-second."""
-_MOST = 8
-"""Maximum number of processes: the longest kernel takes an eighth of the total time, so more
-processes give no speed-up."""
 
 _tried = False
 """Whether this process has compiled the missing kernels; kernels that are missing later are
@@ -42,7 +36,11 @@ def compile_beside(kernels: Sequence[Any]) -> None:
     with _alone():
         missing = [each for each in kernels if not each.is_kept]
         lasts_s = _work(missing) / _BYTES_S
-        count = min(cores(), _MOST, len(missing)) if lasts_s > _WORTH_S and place is not None else 1
+        # Compile time below which kernels are compiled in this process, s: starting a
+        # process takes a second.
+        # Maximum number of processes: the longest kernel takes an eighth of the total
+        # time, so more processes give no speed-up.
+        count = min(cores(), 8, len(missing)) if lasts_s > 3.0 and place is not None else 1
         what = (
             f"compiling {len(missing)} functions for this machine, which takes about"
             f" {max(lasts_s / count, 1):.0f} s"

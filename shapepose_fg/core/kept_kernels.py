@@ -34,11 +34,6 @@ NUMBA: Any = cast(Any, numba).config
 _GIVEN = "SHAPEPOSE_FG_KERNELS"
 """Environment variable by which a process passes the path of its temporary folder to its child
 processes."""
-_SPACE = 50_000_000
-"""Minimum free space on the disk, bytes: ten times the size of all kernels."""
-_VERSIONS = 16
-"""Maximum number of cached folders per module: for several checkouts, Python versions,
-processors."""
 
 
 def wanted_folder() -> Path:
@@ -76,7 +71,8 @@ def _can_keep(place: Path) -> bool:
     try:
         place.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=place).close()
-        return shutil.disk_usage(place).free > _SPACE
+        # Minimum free space on the disk, bytes: ten times the size of all kernels.
+        return shutil.disk_usage(place).free > 50_000_000
     except OSError:
         return False
 
@@ -114,7 +110,9 @@ def module_folder(module: str) -> Path | None:
 
 def _remove_old(place: Path, module: str) -> None:
     by_age = sorted(place.glob(f"{module}-*"), key=lambda each: each.stat().st_mtime, reverse=True)
-    for each in by_age[_VERSIONS:]:
+    # Maximum number of cached folders per module: for several checkouts, Python versions,
+    # processors.
+    for each in by_age[16:]:
         shutil.rmtree(each, ignore_errors=True)
 
 

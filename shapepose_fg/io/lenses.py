@@ -24,9 +24,6 @@ _FORMATS = ("JPEG", "PNG", "TIFF")
 external programs."""
 _EXIF, _FOCAL_35MM = 0x8769, 0xA405
 """EXIF tags: the Exif directory in a photo, and FocalLengthIn35mmFilm in it."""
-_FILM_MM = (36.0, 24.0)
-_USUAL = 65.0
-"""Typical field of view of a phone along the longer side of a video, degrees."""
 
 
 def lenses_of(detections: Path, fields: Sequence[str], size: tuple[int, int] | None) -> Rig:
@@ -66,8 +63,9 @@ def lenses_of(detections: Path, fields: Sequence[str], size: tuple[int, int] | N
 
 def pictures_only(names: Sequence[str], sizes: Sequence[tuple[int, int]]) -> Rig:
     """Upright cameras for which only the picture sizes (width, height) are known, without poses."""
+    # Typical field of view of a phone along the longer side of a video, degrees.
     return Rig(
-        tuple(_camera(name, size, _USUAL) for name, size in zip(names, sizes, strict=True)), "z"
+        tuple(_camera(name, size, 65.0) for name, size in zip(names, sizes, strict=True)), "z"
     )
 
 
@@ -121,4 +119,4 @@ def _focal_of_photo(file: Path) -> float:
             ) from None
     if not isinstance(found, int | float) or not 0 < found < 2000 or min(sides) < 1:
         raise InputError(f"{file}: its EXIF data have no FocalLengthIn35mmFilm; {cure}")
-    return float(found / np.hypot(*_FILM_MM) * np.hypot(*sides) / max(sides))
+    return float(found / np.hypot(36.0, 24.0) * np.hypot(*sides) / max(sides))

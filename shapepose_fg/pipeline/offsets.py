@@ -32,7 +32,6 @@ NOISE_FRAMES = 60
 """Maximum number of frames for learning the noise law. Shorter recordings use the shipped law."""
 _ENOUGH = 10_000
 """Number of detections that are enough for either; a crowd has them in about 12 frames."""
-_GOLDEN = (5**0.5 - 1) / 2
 
 
 @dataclass(frozen=True)
@@ -55,7 +54,7 @@ class Sample:
         spread = max(NOISE_FRAMES, config.offsets.frames)
         frames = first + np.array(spread_frames(len(self), spread), dtype=np.intp)
         # In golden-ratio order, frames are spread over the whole recording even if it ends early.
-        order = np.argsort(np.arange(len(frames)) * _GOLDEN % 1.0, kind="stable")
+        order = np.argsort(np.arange(len(frames)) * ((5**0.5 - 1) / 2) % 1.0, kind="stable")
         for n, frame in enumerate(frames[order[:most]].tolist()):
             if n == len(self._found):
                 found = self.detections[frame]

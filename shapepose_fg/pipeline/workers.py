@@ -35,8 +35,6 @@ _ENVIRONMENT = dict.fromkeys(
 ) | {"LOKY_MAX_MEMORY_LEAK_SIZE": "1e18"}
 """Environment of worker processes: one thread each for linear algebra; loky must not restart a
 worker whose memory grows, because recordings differ in size."""
-_LOOK_S = 0.5
-"""Interval at which a worker checks whether the process that started it is alive, s."""
 
 
 @dataclass(frozen=True)
@@ -187,7 +185,9 @@ def _begin(parent: int, initializer: Callable[..., object], *arguments: Any) -> 
 def _end_with(parent: int) -> None:
     """End this process, even if busy, when its parent has ended or was killed."""
     while os.getppid() == parent:
-        time.sleep(_LOOK_S)
+        # Interval at which a worker checks whether the process that started it is
+        # alive, s.
+        time.sleep(0.5)
     os._exit(1)
 
 

@@ -13,10 +13,6 @@ from shapepose_fg.proposal.nearby import LEAST_AFFINITY, own_affinity
 from shapepose_fg.proposal.pairs_of_people import pooled
 from shapepose_fg.proposal.possible_people import Frame, PossiblePeople, settled
 
-_ROUNDS = 8
-"""Maximum number of searches, each among what the people found so far leave unexplained."""
-_PASSES = 2
-"""Number of reassignments of detections around the joints of selected people."""
 _SHARED = 0.2
 """Maximum share of its joints that a missing part may have in common with the person it
 completes."""
@@ -138,7 +134,8 @@ def choose(points: PairPoints, frame: Frame, least: float) -> tuple[PossiblePeop
     probabilities (P,).
     """
     people, sure = PossiblePeople.none(frame), np.zeros(0)
-    for _ in range(_ROUNDS):
+    # Maximum number of searches, each among what the people found so far leave unexplained.
+    for _ in range(8):
         taken = np.zeros(len(frame.detections), dtype=bool)
         taken[people.chosen[people.chosen >= 0]] = True
         pool = pooled(points, ~taken, frame)
@@ -182,7 +179,8 @@ def _given_out(people: PossiblePeople, frame: Frame, least: float) -> tuple[Poss
     probable first.
     """
     while True:
-        people = settled(people.places, people.chosen, frame, _PASSES, exclusive=True)
+        # Number of reassignments of detections around the joints of selected people.
+        people = settled(people.places, people.chosen, frame, 2, exclusive=True)
         sure = existence(people, frame)
         if len(people) == 0 or sure.min() >= least:
             return people, sure

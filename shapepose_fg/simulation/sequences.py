@@ -14,6 +14,7 @@ import numpy as np
 
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.skeleton import smpl_joints
 from shapepose_fg.simulation.bystanders import (
     stand,
     standing_clips,
@@ -28,7 +29,7 @@ from shapepose_fg.simulation.motion import Motion
 from shapepose_fg.simulation.performance import Figure, Performance, hold_hands, perform, together
 from shapepose_fg.simulation.scene import Scene, ring_of_cameras
 
-_TORSO = (0, 6, 9, 12)
+_TORSO = smpl_joints("pelvis spine2 spine3 neck")
 """Pelvis, spine and neck: joints from which other people must keep a distance."""
 _HALF_ROOM_M = 1.75
 """Maximum distance of pelvises from the centre of the room, in x and in y, m."""
@@ -36,8 +37,10 @@ _LIMBS_M = 0.12
 """Minimum distance of a standing person's joints from those of others, if space permits, m."""
 _TORSO_M = 0.2
 """Minimum distance of another person's joints from pelvis, spine and neck, m."""
-_MIDDLES, _LIMBS = (0, 9), (18, 19, 20, 21, 22, 23, 4, 5)
-"""Pelvis and chest; elbows, wrists, hands, knees."""
+_MIDDLES = smpl_joints("pelvis spine3")
+_LIMBS = smpl_joints(
+    "left_elbow right_elbow left_wrist right_wrist left_hand right_hand left_knee right_knee"
+)
 _SPOTS, _PAIR_OPTIONS, _TRIED = 150, 60, 30
 """Number of random positions for standing people and for pairs, and number of them that
 are tested."""

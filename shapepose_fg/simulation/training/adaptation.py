@@ -35,8 +35,6 @@ from shapepose_fg.simulation.training.train import (
 TRAINED, PLAIN = "trained", "plain optimiser"
 _RIDGE_M = 0.005
 """Displacement of points by a shape component, m, below which it is ignored in the other body."""
-_SLOWER = 0.2
-"""Learning rate relative to training from scratch, since only small changes are needed."""
 _CALIBRATION_PEOPLE = 4096
 _SEEN = tuple(range(len(BODY_25)))
 
@@ -56,7 +54,8 @@ def adapted(
     the number of finished iterations and of all.
     """
     shipped, frame = FitterWeights.default(), PersonFrame.of(body, motions.poses, motions.weight)
-    rate = _SLOWER * config.learning_rate
+    # Learning rate relative to training from scratch, since only small changes are needed.
+    rate = 0.2 * config.learning_rate
     config = replace(config, network=shipped.network.config, learning_rate=rate)
     torch.manual_seed(config.seed)
     # The network is on a GPU if available, the bodies on the CPU.
