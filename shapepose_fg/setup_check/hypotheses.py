@@ -132,7 +132,7 @@ class _Nearest:
     """Nearest sighting of each person at one offset."""
 
     there: Mask
-    """(P,) whether the camera has sightings in that frame."""
+    """(P,) whether the camera has sightings in the frame of each person."""
     sighting: Index
     """(P,) row of the sighting; -1 if none is within the gate."""
     error: Array

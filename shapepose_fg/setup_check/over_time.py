@@ -21,7 +21,7 @@ from shapepose_fg.setup_check.matching import GATE, Pinhole, Sightings
 
 _PIECES = 12
 _LEAST_PEOPLE = 6
-"""Minimum number of the others' people for a piece to be used."""
+"""Minimum number of the others' people for a piece to be used, and on either side of a step."""
 _RESTLESS = 0.1
 """Difference of a camera's score between pieces above which it is examined: 3 cm on people."""
 _THERE, _GOOD = 0.2, 0.45
@@ -173,6 +173,9 @@ def _bumped(
         before = _settled(*_during(others, seen, -1, at), camera, before)
         after = _settled(*_during(others, seen, at, np.inf), camera, after)
     amount = fit.difference(_turned(camera, after).cTw, _turned(camera, before).cTw)[0]
+    parts = (_during(others, seen, *span) for span in ((-1, at), (at, np.inf)))
+    if min(match(*part, camera).possible for part in parts) < _LEAST_PEOPLE:
+        amount = 0.0  # what a few frames show may be lasting errors of the detector
     frames = (None, at) if np.linalg.norm(before) > np.linalg.norm(after) else (at, None)
     finding = Finding(Kind.BUMPED, (), amount, frames=frames)
     return (

@@ -34,7 +34,7 @@ class CameraFigures:
     people: int
     """Number of people seen in the frames used."""
     matched: float
-    """Share of these people that another camera sees too."""
+    """Share of the camera's people whom another camera sees, too."""
     median_px: float | None
     """Median reprojection error of all matched joints, pixels."""
     high_px: float | None
@@ -46,7 +46,7 @@ class CameraFigures:
     left_out_px: float | None
     """Median distance from joints triangulated by the other cameras only, pixels."""
     left_out_mm: float | None
-    """Median distance from these joints as a length, millimetres."""
+    """Median distance from where the other cameras place the joints, millimetres."""
     left_out_matched: float
     """Share of the possible matches with people of the others that the camera has."""
     late_frames: int
@@ -248,7 +248,7 @@ _MOST, _FEW = 0.5, 50
 _LOST, _LOST_SHARE = 0.5, 0.1
 """Minimum number of missing people per frame, and minimum share of them, for a warning."""
 _LOOKED_AT = 200
-"""Number of frames, spread over the recording, in which detections are counted for that."""
+"""Number of frames, spread over the recording, in which unused detections are counted."""
 _SHORT_S = 1.0
 """Duration, s, below which people seen by two cameras may lack evidence."""
 _REASONS = {

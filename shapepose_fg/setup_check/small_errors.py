@@ -36,7 +36,8 @@ unusual bias."""
 _KNOCKED = 3
 """Prior frequency of rotated or translated cameras, relative to other mistakes."""
 _PARTS = 8
-"""Number of parts of a recording at whose borders a camera may be bumped."""
+"""Maximum number of parts of a recording at whose borders a camera may be bumped; errors of a
+detector last for some frames, so a part has `_LEAST_OF_ONE` or more."""
 _MOST_PEOPLE = 160
 _LEAST_OF_ONE = 6
 """Minimum number of frames of a person; people with fewer are pooled for the biases."""
@@ -85,7 +86,8 @@ class Problem:
         frame = groups.frame
         often = np.bincount(who, minlength=1) >= _LEAST_OF_ONE
         person = np.unique(np.where(often[who], who, len(often)), return_inverse=True)[1]
-        ends = np.quantile(frame, np.arange(1, _PARTS) / _PARTS) if len(frame) > 0 else np.zeros(0)
+        parts = min(_PARTS, len(np.unique(frame)) // _LEAST_OF_ONE)
+        ends = np.quantile(frame, np.arange(1, parts) / parts) if parts > 1 else np.zeros(0)
         part = np.unique(
             np.searchsorted(np.unique(np.ceil(ends)), frame, side="right"), return_inverse=True
         )[1]
