@@ -8,10 +8,6 @@ from shapepose_fg.cli.terminal import note, progress, show, table, warn
 from shapepose_fg.core.errors import InputError, optional
 from shapepose_fg.core.storage.output_folder import prepare_output
 
-_WORSE = 1.1
-"""Ratio of the error to that of the plain optimiser above which weights are rejected (the learned
-fitter takes half the time)."""
-
 
 @grouped
 def train_fitter(
@@ -72,7 +68,9 @@ def train_fitter(
     minutes = (time.perf_counter() - start) / 60
     caption = f"on unseen poses with some joints missing; training took {minutes:.0f} minutes"
     show(table(["fitter", "error, mm", "ms per fit"], rows, caption=caption))
-    if output is None and scores[TRAINED].joints_mm > _WORSE * scores[PLAIN].joints_mm:
+    # Ratio of the error to that of the plain optimiser above which weights are rejected
+    # (the learned fitter takes half the time).
+    if output is None and scores[TRAINED].joints_mm > 1.1 * scores[PLAIN].joints_mm:
         warn(
             f"the plain optimiser is more accurate on {body}, so these weights are not stored; "
             "give more --iterations"

@@ -36,8 +36,8 @@ class FrameSets:
     picture: Index
     """(T, V) index of each camera's picture; -1 if it has none within half a frame."""
     time_s: Array | None
-    """(T, V) times of these pictures, seconds; for a missing picture, the time of the set, or NaN
-    if start times are unknown. None without a clock."""
+    """(T, V) times of the pictures of each set, seconds; for a missing picture, the time of the
+    set, or NaN if start times are unknown. None without a clock."""
     notes: tuple[str, ...]
     """Notes on pictures that were left out, and on the time differences within a set."""
 

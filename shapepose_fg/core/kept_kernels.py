@@ -22,6 +22,8 @@ from typing import Any, cast
 import numba
 from llvmlite.binding import get_host_cpu_features, get_host_cpu_name
 
+from shapepose_fg.core.storage.files import user_cache
+
 OPTIONS: dict[str, Any] = {
     "error_model": "numpy",
     "nogil": True,
@@ -40,8 +42,7 @@ def wanted_folder() -> Path:
     """The folder for compiled functions: below NUMBA_CACHE_DIR, or in the user's cache."""
     if given := os.environ.get("NUMBA_CACHE_DIR"):
         return Path(given).absolute() / "shapepose-fg"
-    base = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")  # noqa: PTH111
-    return Path(base).absolute() / "shapepose-fg" / "kernels"
+    return user_cache("kernels").absolute()
 
 
 @cache

@@ -22,7 +22,7 @@ from shapepose_fg.core.skeleton import SMPL_24
 from shapepose_fg.core.storage.files import read_bytes, read_json
 from shapepose_fg.core.storage.npz import NpzFile, read_npz
 from shapepose_fg.evaluation.metrics import PlainPeople
-from shapepose_fg.evaluation.shelf_annotation import SHELF_JOINTS, read_shelf_ground_truth
+from shapepose_fg.evaluation.shelf import SHELF_JOINTS, read_shelf_ground_truth
 from shapepose_fg.io.export.motion_files import OPEN_BODY
 from shapepose_fg.io.export.take import z_up
 

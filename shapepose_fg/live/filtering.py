@@ -42,7 +42,7 @@ class EndedTracks(Rows):
     time_s: Array
     """(G,) times of the last detections, seconds."""
     place: Array
-    """(G, 3) centre of the core joints at that time, metres."""
+    """(G, 3) centre of the core joints when the track ended, metres."""
     bones: Array
     """(G, B) mean length of each bone between core joints, metres; NaN where unknown."""
 

@@ -22,9 +22,6 @@ ARMS = tuple(
     smpl_joints(f"{side}_collar {side}_shoulder {side}_elbow {side}_wrist") for side in SIDES
 )
 """Collar, shoulder, elbow, wrist: left, right."""
-_REACH = 0.995
-"""Maximum extension of a limb, as a share of its length; keeps the direction of its
-bend defined."""
 
 
 @dataclass(frozen=True)
@@ -183,7 +180,9 @@ def _two_bones(
     line = target - position[:, first]
     reach = np.linalg.norm(line, axis=1, keepdims=True)
     u = line / reach
-    distance = np.clip(reach, abs(upper - lower) + 0.1, (upper + lower) * _REACH)
+    # Maximum extension of a limb, as a share of its length; keeps the direction of its bend
+    # defined.
+    distance = np.clip(reach, abs(upper - lower) + 0.1, (upper + lower) * 0.995)
     v = pole - (pole * u).sum(axis=1, keepdims=True) * u
     v /= np.linalg.norm(v, axis=1, keepdims=True)
     along = (upper**2 - lower**2 + distance**2) / (2 * distance)  # law of cosines

@@ -13,7 +13,7 @@ from shapepose_fg.core.joint_names import keypoint_names
 from shapepose_fg.core.skeleton import BODY_25, SKELETONS, SMPL_24
 from shapepose_fg.evaluation.metrics import PlainPeople
 from shapepose_fg.evaluation.score import aligned, score
-from shapepose_fg.evaluation.shelf_annotation import SHELF_JOINTS
+from shapepose_fg.evaluation.shelf import SHELF_JOINTS
 from shapepose_fg.evaluation.truth import read_people
 from shapepose_fg.io.export.registry import FORMATS, export_result
 from shapepose_fg.simulation import built_in_scene

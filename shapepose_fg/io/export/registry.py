@@ -49,6 +49,8 @@ class Job:
     """Markers of TRC and C3D."""
     fill_gaps_s: float = 0.2
     """Longest gap in a body's motion, s, that is interpolated for formats without gaps."""
+    neutral: range | None = None
+    """Frames of a neutral posture, to which joint angles are relative; None: absolute angles."""
 
     @property
     def body(self) -> Path | None:
@@ -183,6 +185,7 @@ def export_result(
     markers: MarkerSet = MarkerSet.OPENSIM,
     fill_gaps_s: float = 0.2,
     body: Path | None = None,
+    neutral: range | None = None,
     **options: Any,
 ) -> dict[str, Written]:
     """Export a result to several formats into `folder`; returns the output by format. InputError if
@@ -195,7 +198,8 @@ def export_result(
     if not all(each.rows for each in formats):
         kinds = ("identities", "observations")
         needs: Any = {name: any(getattr(each, name) for each in formats) for name in kinds}
-        job = Job(read_take(results, **options, **needs), folder, body, markers, fill_gaps_s)
+        take = read_take(results, **options, **needs)
+        job = Job(take, folder, body, markers, fill_gaps_s, neutral)
     done: dict[str, Written] = {}
     for each in formats:
         if each.rows:

@@ -51,7 +51,7 @@ class _Limb(NamedTuple):
     links: tuple[str, ...]
     """Upper and lower link, and the end."""
     joints: tuple[str, ...]
-    """Joints at the origins of these links, in the result."""
+    """Joints of the result at the origins of the links."""
     smpl: tuple[int, ...]
     """SMPL's joints from above the pelvis to the upper link."""
     side: float

@@ -46,8 +46,6 @@ WALK_CAP = 0.25
 unseen people's walks rise by 1.6 nats a frame, and those of all else fall by 0.1; without a cap by
 a further 0.6 and 0.1."""
 
-_LEANING_RAD = 0.15
-"""Standard deviation of the lean of sampled people, rad."""
 _WRISTS, _HANDS, _TOES = (
     smpl_joints(f"left_{name} right_{name}") for name in ("wrist", "hand", "foot")
 )
@@ -112,7 +110,8 @@ def drawn_motions(count: int, seed: int) -> Motions:
     recordings.
     """
     rng = np.random.default_rng(seed)
-    root = rng.normal(0, _LEANING_RAD, (count, 1, 3))
+    # Standard deviation of the lean of sampled people, rad.
+    root = rng.normal(0, 0.15, (count, 1, 3))
     root[:, 0, 1] = rng.uniform(-np.pi, np.pi, count)
     poses = np.concatenate((root, PosePrior.default().sample(rng, count)), axis=1).astype(
         np.float32

@@ -39,7 +39,7 @@ class CameraPage:
     heads: Sequence[str]
     """Column headings of the table of cameras."""
     rows: Sequence[tuple[str, Sequence[str]]]
-    """Name of each camera, and its values for these columns."""
+    """Name of each camera, and its values, a column each."""
     missed_px: Mapping[str, Array]
     """(N, V) distances of joints from their positions by the other cameras, pixels, by name of the
     series; NaN if unknown."""

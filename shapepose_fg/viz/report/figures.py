@@ -83,7 +83,7 @@ class CameraFigures:
     given: int
     """Number of detections that were assigned to people."""
     gates: dict[Gate, int]
-    """Number of these detections by gate: used, or the reason why not."""
+    """Number of assigned detections by gate: used, or the reason why not."""
     all: Residual
     """Residuals of all detections that were assigned to people."""
     used: Residual
