@@ -196,7 +196,8 @@ def test_a_neutral_posture_cancels_what_joints_do_not_show(people):
     ratio = relative.sigma / found.sigma  # as if the errors of both were independent
     assert (ratio > 1).all() and np.median(ratio) == pytest.approx(2**0.5, abs=0.1)
     one = rest.people.person == 0
-    alone = replace(rest, people=rest.people.rows(np.flatnonzero(one)), degrees=rest.degrees[one])
+    alone = replace(rest, people=rest.people.rows(np.flatnonzero(one)), degrees=rest.degrees[one],
+                    covariance=rest.covariance[one])  # fmt: skip
     with pytest.raises(ValueError, match="person 1 has no body in the neutral posture"):
         found.relative_to(alone)
 

@@ -179,18 +179,18 @@ def test_a_run_learns_it_once_and_keeps_it(noisy, of_few_frames, monkeypatch):
     scene, recording, times = noisy
     setup, frames = set_up(scene, recording)
     kept = InMemory()
-    law = offsets.kept_noise(kept, setup, frames, times, Notebook())
+    law = offsets.kept_noise(kept, offsets.Sample(setup, frames, times), Notebook())
     found, usual = np.array([law.times, NoiseLaw.shipped().times])[:, 3:6]
     assert (found > 1.4 * usual).all() and (found < 2.4 * usual).all()
     monkeypatch.setattr(offsets, "noise_of", None)
-    assert offsets.kept_noise(kept, setup, frames, times, Notebook()) == law
+    assert offsets.kept_noise(kept, offsets.Sample(setup, frames, times), Notebook()) == law
 
 
 def test_a_short_recording_keeps_what_ships(noisy, monkeypatch):
     scene, recording, times = noisy
     monkeypatch.setattr(offsets, "NOISE_FRAMES", 21)
     setup, frames = set_up(scene, recording)
-    assert offsets.noise_of(setup, frames, times, Notebook()) == NoiseLaw.shipped()
+    assert offsets.noise_of(offsets.Sample(setup, frames, times), Notebook()) == NoiseLaw.shipped()
 
 
 @pytest.mark.slow
