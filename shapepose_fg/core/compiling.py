@@ -3,14 +3,14 @@
 import gc
 import logging
 import os
-import subprocess
-import sys
 from collections.abc import Iterator, Sequence
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from importlib import import_module
-from pathlib import Path
 from threading import Timer
 from typing import Any
+
+from loky import ProcessPoolExecutor
 
 from shapepose_fg.core.kept_kernels import kept_folder, wanted_folder
 
@@ -68,42 +68,31 @@ def _share_out(kernels: Sequence[Any], count: int) -> None:
         p for m in modules.values() for p in ([m] if _work(m) < bound else [[each] for each in m])
     ]
     groups.sort(key=_work, reverse=True)
-    words = [",".join(each.name for each in group) for group in groups]
-    # The same packages as in this process, whatever is in the working directory.
-    environment = os.environ | {
-        "PYTHONPATH": os.pathsep.join(each or str(Path.cwd()) for each in sys.path)
-    }
-    command = [sys.executable, "-P", "-c", f"from {__name__} import main; main()", *words]
-    started = list[subprocess.Popen[Any]]()
-    numbers, to = os.pipe()  # pipe of group numbers, two bytes each, from which all processes read
+    pool = ProcessPoolExecutor(count, initializer=_begin)
     try:
-        os.write(to, b"".join(n.to_bytes(2) for n in range(len(groups))))
-        os.close(to)
-        for _ in range(count):
-            quiet: Any = dict.fromkeys(("stdout", "stderr"), subprocess.DEVNULL)
-            started.append(subprocess.Popen(command, env=environment, stdin=numbers, **quiet))
-        for each in started:
-            each.wait()
-    except OSError as error:  # without processes, kernels are compiled when they are called
+        waiting = [pool.submit(_load, [each.name for each in group]) for group in groups]
+        for each in waiting:
+            each.result()
+    except (OSError, BrokenProcessPool) as error:  # kernels are compiled when they are called
         logging.getLogger(__name__).debug("%r", error)
     finally:
-        os.close(numbers)
-        for each in started:
-            each.kill()
-            each.wait()
+        pool.shutdown(kill_workers=True)
 
 
-def main() -> None:
-    """Entry point of a process of `compile_beside`: the command line names groups of kernels, and
-    standard input has the numbers of the groups that this process compiles.
-    """
+def _begin() -> None:
+    """Prepare a process of `compile_beside`: it compiles what it is told, and prints nothing."""
     global _tried
     _tried = True
     gc.disable()
-    while number := os.read(0, 2):
-        for name in sys.argv[1 + int.from_bytes(number)].split(","):
-            module, _, function = name.partition(":")
-            getattr(import_module(module), function).load()
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+    os.dup2(nowhere, 2)
+
+
+def _load(names: Sequence[str]) -> None:
+    """Compile kernels, by `module:name`."""
+    for module, _, function in (name.partition(":") for name in names):
+        getattr(import_module(module), function).load()
 
 
 @contextmanager

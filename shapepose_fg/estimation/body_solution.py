@@ -91,7 +91,7 @@ def solve_bodies(
         try:
             state = window.solve(_filled(free, start.ok[rows], window.times_s))
             if len(rows) > 2 and len(feet) > 0:
-                state = window.hold(state, feet)
+                window.hold(state, feet)
             state = window.take(state, *gtsam_step(window, state))
             marginals = window.covariances(state)
         except np.linalg.LinAlgError:

@@ -57,7 +57,7 @@ errors of poses that nothing shows are larger than their Gaussian when they are 
 LASTS = 1.1
 """Factor on the covariances of a window, besides how much it averages (`Marginals.lasting`).
 Measured as that with which the 95 % regions hold in most recordings (docs/evaluation.md)."""
-_LOOKS = 16
+_LOOKS = 8
 """Number of frames, evenly over the window, from which it is taken how much it averages."""
 _STEPS, _SETTLED_M = 8, 2e-3
 """Most steps of the solver; it ends when joints move by less on average, metres. GTSAM's last step
@@ -208,9 +208,9 @@ class BodyWindow:
         self.last = here
         return state
 
-    def hold(self, state: BodyState, feet: Index) -> BodyState:
-        """The solution in which the joints `feet` (F,) stay in place between frames where they
-        stand; the state itself if none does.
+    def hold(self, state: BodyState, feet: Index) -> None:
+        """Hold the joints `feet` (F,) in place between frames where they stand, in the next steps
+        (`take`).
         """
         velocity = velocities(self.joints(state), self.times_s)[:, feet]
         covariance = self.covariances(state).velocities(feet)
@@ -219,7 +219,7 @@ class BodyWindow:
         density = standing_density(velocity, covariance, self.times_s)
         density = np.where(density > FREE_M2_S, np.inf, density)
         if not np.isfinite(density).any():
-            return state
+            return
         evidence = self.last.evidence
         told = np.where(seen[..., None, None], evidence.information[:, feet], 0.0)
         told = JointTargets(evidence.target[:, feet], told)
@@ -236,7 +236,6 @@ class BodyWindow:
         self.standing.information[:, feet] = share[..., None, None] * information
         self.sigmas_px[:, feet] /= np.sqrt(share)[..., None]
         self.last = self.around(state, self.last.bodies)
-        return self._descended(state)
 
     def take(self, state: BodyState, shape: Array, pose: Array) -> BodyState:
         """The state after another step of betas (10,) and poses (T, N) from the solution; the

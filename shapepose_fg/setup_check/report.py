@@ -3,6 +3,7 @@
 `check_setup` needs cameras and detections; `result_check` adds results of a reconstruction.
 """
 
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import combinations
@@ -86,6 +87,8 @@ class SetupReport:
     notes: tuple[str, ...] = ()
     """Observations that are not necessarily mistakes: people with biased detections in one view, or
     of small stature."""
+    seconds: float = 0.0
+    """Time that the check took, s."""
 
     def with_consequences(self, rig: Rig) -> list[str]:
         """The warnings, with their consequences for a reconstruction."""
@@ -137,9 +140,10 @@ def check_setup(
     """Check whether cameras and detections of a recording are consistent, and diagnose the mistake
     if not.
 
-    Uses frames spread over `frames` (by default all) and needs no reconstruction; takes about a
-    second. `more` are findings from elsewhere.
+    Uses frames spread over `frames` (by default all), a few if nothing in them is odd, and needs no
+    reconstruction; takes about a second. `more` are findings from elsewhere.
     """
+    start = time.perf_counter()
     diagnosis = diagnose(detections, rig, frames)
     findings, build = (*diagnosis.findings, *more), diagnosis.build
     return SetupReport(
@@ -153,6 +157,7 @@ def check_setup(
         build.stature if build is not None and build.count > 0 else None,
         diagnosis.trust,
         (*(sentence(finding, rig) for finding in diagnosis.biased), *_children(build)),
+        time.perf_counter() - start,
     )
 
 

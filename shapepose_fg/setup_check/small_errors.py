@@ -125,17 +125,16 @@ class Problem:
         done = np.zeros(to.shape[1])
         if before is not None:
             done[: len(sigma)] = before / sigma
-        found = []
-        for each in marginals:
-            H, g = to.T @ each.H @ to, to.T @ each.g
-            known = H + np.eye(len(H))
-            best = np.linalg.solve(known, g - done)
-            likely = each.log + 0.5 * float(
-                (g - done) @ best - done @ done - np.linalg.slogdet(known)[1]
-            )
-            found.append((likely, best[: len(sigma)] * sigma))
-        logs = np.nan_to_num([likely for likely, _ in found], nan=-np.inf)  # people behind a camera
-        return float(np.logaddexp.reduce(logs)), found[int(np.argmax(logs))][1]
+        there = np.flatnonzero(to.any(axis=1))
+        to = to[there]
+        H = to.T @ np.array([each.H[np.ix_(there, there)] for each in marginals]) @ to
+        g = np.array([each.g[there] for each in marginals]) @ to - done
+        known = H + np.eye(len(done))
+        best = np.linalg.solve(known, g[..., None])[..., 0]
+        gain = (g * best).sum(axis=1) - done @ done - np.linalg.slogdet(known)[1]
+        likely = np.array([each.log for each in marginals]) + 0.5 * gain
+        logs = np.nan_to_num(likely, nan=-np.inf)  # people behind a camera
+        return float(np.logaddexp.reduce(logs)), best[int(np.argmax(logs)), : len(sigma)] * sigma
 
     @cached_property
     def causes(self) -> list[Cause]:
