@@ -16,8 +16,6 @@ Camera = gtsam.PinholeCameraCal3_S2
 _LEAST, _TRIED = 16, 4000
 """Minimum number of visible points for the fit, and maximum number of points that are tried, at
 increasing distances."""
-_STEP = 1e-6
-_EXACT_PX = 1e-10
 
 
 def camera_of(pixel: Callable[[Array], Array | None], near: Array) -> Camera | None:
@@ -44,13 +42,13 @@ def camera_of(pixel: Callable[[Array], Array | None], near: Array) -> Camera | N
         off = _seen(camera, X) - uv
         if not np.isfinite(off).all():
             return None
-        steps = np.eye(11) * _STEP * _scales(camera)
+        steps = np.eye(11) * 1e-6 * _scales(camera)
         slopes = [
             (_seen(_moved(camera, d), X) - _seen(_moved(camera, -d), X)).ravel() / 2 for d in steps
         ]
         change = np.linalg.lstsq(np.stack(slopes, axis=1), -off.ravel(), rcond=None)[0]
         camera = _moved(camera, change @ steps)
-    return camera if np.abs(_seen(camera, X) - uv).max() < _EXACT_PX * np.abs(uv).max() else None
+    return camera if np.abs(_seen(camera, X) - uv).max() < 1e-10 * np.abs(uv).max() else None
 
 
 def _linear(X: Array, uv: Array) -> Array:

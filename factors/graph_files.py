@@ -32,9 +32,6 @@ Array = NDArray[np.float64]
 
 FORMAT = "shapepose-fg graph 1"
 _CURE = "give a file that factors.save_graph wrote"
-_ROTATION_TOLERANCE = 1e-6
-_LARGEST = 1e15
-"""Maximum absolute value of a number in a file."""
 
 
 def save_graph(file: str | Path, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
@@ -398,16 +395,15 @@ def _array(numbers: Any, shape: tuple[int, ...]) -> Array:
     found = np.array(numbers, dtype=np.float64)
     if shape == (-1,):
         shape = (min(found.size, _LARGEST_VECTOR),)
-    if found.shape != shape or not (np.abs(found) <= _LARGEST).all():
+    # Maximum absolute value of a number in a file.
+    if found.shape != shape or not (np.abs(found) <= 1e15).all():
         raise ValueError(f"numbers must be finite and of the shape {shape}, got {found.shape}")
     return found
 
 
 def _pose(matrix: Array) -> gtsam.Pose3:
     R = matrix[:3, :3]
-    if np.abs(R @ R.T - np.eye(3)).max() > _ROTATION_TOLERANCE or not np.array_equal(
-        matrix[3], [0, 0, 0, 1]
-    ):
+    if np.abs(R @ R.T - np.eye(3)).max() > 1e-6 or not np.array_equal(matrix[3], [0, 0, 0, 1]):
         raise ValueError("a pose must be a rotation and a translation, with a last row 0 0 0 1")
     return gtsam.Pose3(matrix)
 

@@ -10,8 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from factors.keys import JointKey
 
-_PER_SYMBOL = 2**56
-"""Number of indices of a symbol's character."""
 _KINDS = _POSITION, _VELOCITY, _REPORTED = 0, 1, 2
 _NAMES = ("position", "velocity", "reported position")
 
@@ -62,7 +60,8 @@ class KeySpace:
         if isinstance(self.space, range):
             return self.space
         first = int(gtsam.symbol(self.space, 0))
-        return range(first, first + _PER_SYMBOL)
+        # Number of indices of a symbol's character.
+        return range(first, first + 2**56)
 
     @property
     def frames(self) -> int:

@@ -53,8 +53,8 @@ class CameraKey(NamedTuple):
 
 
 def joint_key(person: int, joint: int, frame: int = 0) -> int:
-    """Key of the position (`Point3`, metres, world) of a joint. ValueError if a number exceeds the
-    limits above or is not an integer.
+    """Key of the position (`Point3`, metres, world) of a joint. ValueError if a number is not an
+    integer or has more digits than the key has for it.
     """
     return int(_pack(_JOINT, person, joint, frame))
 

@@ -4,8 +4,10 @@
 Runs `shapepose-fg reconstruct` as a separate process on each recording, alternately from this
 checkout and from that of the commit, `--rounds` times each after a short warm-up run (which
 compiles and is not counted). Prints medians and spread of processor time, wall time and peak
-memory, the ratio, and the wall time of each stage. Processes use one thread; the machine should be
-idle otherwise.
+memory, the median ratio of runs that followed each other, and the wall time of each stage.
+`--growth` runs this checkout on simulated recordings that differ in one size, and prints the
+exponent with which processor time, beyond that of a single frame, grows. Processes use one thread;
+the machine should be idle otherwise.
 
 The recording is Shelf if it is available (`--data`), otherwise the built-in scene. `crowd` is salsa
 of eight people and six cameras, from recorded motions if these are available. Longer recordings are
@@ -38,6 +40,7 @@ from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.io.write_detections import write_association
 from shapepose_fg.simulation import built_in_scene, simulate
+from shapepose_fg.simulation.detector import DetectorConfig
 from shapepose_fg.simulation.mocap import Mocap
 from shapepose_fg.simulation.sequences import sequence
 
@@ -53,10 +56,17 @@ CASES = {
     "crowd, fast": ("crowd", ("--preset", "fast")),
     "recording, paper": ("short", ("--preset", "paper")),
 }
-"""For each case, the recording and additional options. A preset applies to this checkout; the
-commit runs its default."""
-_LONG = 3000
-_ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+"""For each case, the recording and additional options."""
+_USUAL = {"frames": 300, "people": 4, "cameras": 6, "false_candidates": 1}
+_GROWTH = {
+    "frames": (300, 3000),
+    "people": (2, 4, 8, 16),
+    "cameras": (3, 6, 12, 24),
+    "false_candidates": (1, 10),
+}
+"""Sizes of simulated recordings; all others are `_USUAL`. Every camera stands elsewhere."""
+_ENVIRONMENT = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+_ENVIRONMENT |= {"PYTHONDONTWRITEBYTECODE": ""}
 
 
 @dataclass(frozen=True)
@@ -92,9 +102,13 @@ def main() -> None:
     parser.add_argument(
         "--frames", type=int, help="the first frames of each recording only (default: all)"
     )
+    parser.add_argument("--growth", action="store_true", help="how time and memory grow")
     arguments = parser.parse_args()
     console = Console()
     console.print(_machine(), highlight=False)
+    if arguments.growth:
+        with tempfile.TemporaryDirectory() as work:
+            return console.print(growth(Path(work)))
     with tempfile.TemporaryDirectory() as work, _checkouts(arguments.against, Path(work)) as trees:
         made: dict[str, tuple[list[str], int]] = {}
         for case in arguments.cases:
@@ -109,21 +123,14 @@ def main() -> None:
 def compare(
     trees: dict[str, Path], options: Sequence[str], work: Path, rounds: int
 ) -> dict[str, list[Spent]]:
-    """Run the command in each tree, alternately, `rounds` times after a warm-up; presets only in
-    this tree.
-    """
+    """Run the command in each tree, alternately, `rounds` times after a warm-up."""
     spent: dict[str, list[Spent]] = {name: [] for name in trees}
-    at = options.index("--preset") if "--preset" in options else len(options)
-    own = {
-        name: [*options[:at], *(options[at:] if name == "here" else options[at + 2 :])]
-        for name in trees
-    }
-    for name in trees:
+    for tree in trees.values():
         short = [] if "--frames" in options else ["--frames", "0:8"]
-        spend(trees[name], [*own[name], *short], work / "results")
+        spend(tree, [*options, *short], work / "results")
     for _ in range(rounds):
-        for name in trees:
-            spent[name].append(spend(trees[name], own[name], work / "results"))
+        for name, tree in trees.items():
+            spent[name].append(spend(tree, options, work / "results"))
     return spent
 
 
@@ -139,7 +146,7 @@ def spend(tree: Path, options: Sequence[str], output: Path) -> Spent:
         *workers,
         "--overwrite",
     ]
-    environment = os.environ | _ONE_THREAD | {"PYTHONPATH": str(tree)}
+    environment = os.environ | _ENVIRONMENT | {"PYTHONPATH": str(tree)}
     with tempfile.TemporaryFile() as said:
         start = time.perf_counter()
         process = subprocess.Popen(
@@ -159,6 +166,30 @@ def spend(tree: Path, options: Sequence[str], output: Path) -> Spent:
     stages_s = json.loads((output / "run.json").read_text(encoding="utf-8"))["seconds"]
     cpu_s = math.nan if "--workers" in options else used.ru_utime + used.ru_stime
     return Spent(cpu_s, wall_s, peak_mib, stages_s)
+
+
+def growth(work: Path) -> Table:
+    """Cost of this checkout on recordings of all sizes in `_GROWTH`."""
+
+    def cost(*more: str, **sizes: int) -> Spent:
+        size = _USUAL | sizes
+        scene = built_in_scene(
+            people=size["people"], cameras=size["cameras"], frames=_USUAL["frames"]
+        )
+        seen = simulate(scene, DetectorConfig(false_candidates=size["false_candidates"]))
+        options = _options(to_and_fro(seen, size["frames"]), scene.rig, scene.fps, work / "grown")
+        return spend(HERE, [*options, *more], work / "results")
+
+    cost("--frames", "0:8")  # compiles
+    start_s, table = cost("--frames", "0:1").cpu_s, Table("", "processor s", "exponent", "peak MiB")
+    for what, values in _GROWTH.items():
+        spent = [cost(**{what: value}) for value in values]
+        first = spent[0].cpu_s - start_s
+        for value, each in zip(values, spent, strict=True):
+            more, grown = (each.cpu_s - start_s) / first, value / values[0]
+            exponent = f"{math.log(more) / math.log(grown):.2f}" if grown > 1 else ""
+            table.add_row(f"{what} {value}", f"{each.cpu_s:.1f}", exponent, f"{each.peak_mib:.0f}")
+    return table
 
 
 def to_and_fro(recording: DetectionSequence, frames: int) -> Recording:
@@ -195,16 +226,16 @@ def _written(kind: str, data: Path, folder: Path, frames: int | None) -> tuple[l
     number of frames.
     """
     recording, rig, fps = _crowd(data) if kind == "crowd" else _short(data)
-    count = _LONG if kind == "long" else len(recording)
+    count = 3000 if kind == "long" else len(recording)
     count = min(count, frames or count)
-    write_association(to_and_fro(recording, count), rig, folder)
-    named = [
-        "--calibration",
-        str(folder / "calibration.json"),
-        "--detections",
-        str(folder / "detection"),
-    ]
-    return [*named, "--fps", str(fps)], count
+    return _options(to_and_fro(recording, count), rig, fps, folder), count
+
+
+def _options(recording: Recording, rig: Rig, fps: float, folder: Path) -> list[str]:
+    """Options of the command for a recording, which is written into `folder`."""
+    write_association(recording, rig, folder)
+    files = str(folder / "calibration.json"), str(folder / "detection")
+    return ["--calibration", files[0], "--detections", files[1], "--fps", str(fps)]
 
 
 def _short(data: Path) -> tuple[DetectionSequence, Rig, float]:
@@ -256,10 +287,9 @@ def _table(title: str, spent: dict[str, list[Spent]]) -> Table:
         cells = [
             f"{median(v):.{digits}f} ({min(v):.{digits}f} to {max(v):.{digits}f})" for v in values
         ]
-        first, last = median(values[0]), median(values[-1])
-        if math.isnan(last):
-            return
-        table.add_row(label, *cells, f"{last / first:.2f}" if first > 0 else "", style=style)
+        ratios = [last / first for first, last in zip(values[0], values[-1], strict=True) if first]
+        if not any(map(math.isnan, values[-1])):
+            table.add_row(label, *cells, f"{median(ratios):.2f}" if ratios else "", style=style)
 
     runs = list(spent.values())
     row("processor", [[each.cpu_s for each in tree] for tree in runs], 2, "bold")

@@ -6,8 +6,8 @@
 The rooms are those of tests/calibration/filmed_by_phones.py; people walk as in the recorded motions
 of `--data FOLDER` (or SHAPEPOSE_DATA). The command is told 65 degrees, --focal and one distance, or
 with `--logs` the lenses that the phones have logged. It prints the rows of the table in
-docs/evaluation.md: errors, and in brackets two standard deviations. Run it from a clone. About
-three minutes per room on one core.
+docs/evaluation/cameras.md: errors, and in brackets two standard deviations. Run it from a clone.
+About three minutes per room on one core.
 """
 
 import argparse

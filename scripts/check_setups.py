@@ -5,8 +5,8 @@ detectors.
 
 Simulated rooms with 3 to 6 cameras and 1 to 8 people, 6 s each. In every room the same kinds of
 faults are simulated with a detector of typical errors; detectors with lasting biases are simulated
-without faults. Run it from a clone. docs/evaluation.md has the results. About a minute and a half
-per room on one core.
+without faults. Run it from a clone. docs/evaluation/cameras.md has the results. About a minute
+and a half per room on one core.
 """
 
 import argparse
@@ -41,8 +41,6 @@ from tests.setup_check.spoiled_setups import (
 )
 
 FRAMES = 150
-LEVELS = ((0.02, 0.04), (0.02, 0.12), (0.06, 0.12))
-"""Minimum and maximum bias of a joint in a view, as shares of the person's size."""
 
 
 def main() -> None:
@@ -162,7 +160,8 @@ def _biased(
     shape = scene.people, 25, len(scene.rig)
     people = np.array([scene.truth_at(frame) for frame in range(len(seen))])
     yield "no bias", seen
-    for low, high in LEVELS:
+    # Minimum and maximum bias of a joint in a view, as shares of the person's size.
+    for low, high in ((0.02, 0.04), (0.02, 0.12), (0.06, 0.12)):
         one_view, one_person = np.zeros((*shape, 2)), np.zeros((*shape, 2))
         one_view[:, :, rng.integers(shape[2])] = lasting(rng, low, high, shape[1])
         one_person[rng.integers(shape[0]), :, rng.integers(shape[2])] = lasting(rng, low, high)

@@ -46,12 +46,8 @@ CASES: tuple[tuple[str, Split, int, int], ...] = (
 are needed because exchanged limbs are rare, and long ones did not occur with the seeds of
 `tune`."""
 FRAMES, FPS = 120, 30.0
-SHARES = (0.5, 0.7, 1.0)
-"""Shares in the log score of joints that are seen by no view, by one view, and by two or more."""
 FAR = 30.0
 """Squared Mahalanobis distance beyond which the loss grows only logarithmically."""
-AT_95 = 7.815
-"""95 % quantile of chi-squared with 3 degrees of freedom (squared Mahalanobis distance)."""
 ROUND = 0.05
 """Width over which the kink of the quantile loss is smoothed."""
 ALIKE = ("Nose Eye Ear", "Neck", "Shoulder", "Elbow", "Wrist", "Hip", "Knee", "Ankle", "Toe Heel")
@@ -135,7 +131,11 @@ def fitted(found: list[tuple[CovarianceFeatures, np.ndarray]]) -> dict:
         torch.from_numpy(np.concatenate(column)) for column in zip(*parts, strict=True)
     )
     views, added = views.clamp(max=2), torch.stack(added)
-    share = torch.tensor(SHARES, dtype=off.dtype) / torch.bincount(views, minlength=3).clamp(min=1)
+    # Shares in the log score of joints that are seen by no view, by one view, and by two or
+    # more.
+    share = torch.tensor((0.5, 0.7, 1.0), dtype=off.dtype) / torch.bincount(
+        views, minlength=3
+    ).clamp(min=1)
     log_scale, powers, log_added = (
         torch.full((count,), value, dtype=off.dtype, requires_grad=True)
         for count, value in ((len(ALIKE), -0.5), (2, 0.5), (3, 0.0))
@@ -165,8 +165,9 @@ def fitted(found: list[tuple[CovarianceFeatures, np.ndarray]]) -> dict:
     optimiser.step(loss)
     # Quantile regression: ratio of the 95 % quantile of squared distances to that of a Gaussian, as
     # a function of the uncertainty of a person.
+    # 95 % quantile of chi-squared with 3 degrees of freedom (squared Mahalanobis distance).
     squared, wider = (
-        torch.log(squares()[1].detach() / AT_95),
+        torch.log(squares()[1].detach() / 7.815),
         torch.zeros(2, dtype=off.dtype, requires_grad=True),
     )
     optimiser = torch.optim.LBFGS([wider], max_iter=100, line_search_fn="strong_wolfe")

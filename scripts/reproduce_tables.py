@@ -1,31 +1,185 @@
-"""Measure the tables of README.md and docs/ again: python scripts/reproduce_tables.py [--update].
+"""Measure the tables of docs/evaluation/people.md again.
 
-    python scripts/reproduce_tables.py --quick  # does everything work? two minutes
-    python scripts/reproduce_tables.py --list                         # names of the tables
-    python scripts/reproduce_tables.py --only time shelf --update
-    python scripts/reproduce_tables.py --split tune --only time --cases salsa
-    python scripts/reproduce_tables.py --only "who is there" --list --cases     # names of its cases
-    python scripts/reproduce_tables.py --only "who is there" --cases "crowd 3 cameras 10 Hz"
+    python scripts/reproduce_tables.py --mocap cmu_smpl24.npz                    # all tables: hours
+    python scripts/reproduce_tables.py --mocap cmu_smpl24.npz --cases crowd "3 cameras" --split tune
+    python scripts/reproduce_tables.py --mocap cmu_smpl24.npz --only time --update
 
-Scenes come from fixed seeds. Recordings and recorded motions are read from `--data FOLDER` (or
-SHAPEPOSE_DATA); tables that need them are skipped if they are missing. Results are stored in the
-folder `--results`, one file per case and commit of the code, so that an interrupted run is resumed;
-with uncommitted changes, use `--afresh`. `--update` writes tables between their marks `<!-- NAME
-@COMMIT -->` and `<!-- end -->`; a table without marks names its commit.
+Scenes come from fixed seeds. Without `--mocap`, only recordings of two people are measured. Figures
+of a case are kept in `--results`, so that an interrupted measurement continues; give another folder
+after a change of the code. `--update` writes tables between the marks `<!-- NAME -->` and
+`<!-- end -->` of the page.
 """
 
 import argparse
-import os
+import json
 import re
-import subprocess
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any, NamedTuple
 
-from shapepose_fg.evaluation.experiments.experiment import measured
-from shapepose_fg.evaluation.experiments.registry import experiments
-from shapepose_fg.evaluation.experiments.scenes import RECORDINGS, Scale
+import numpy as np
 
-ROOT = Path(__file__).parents[1]
-DOCS = ROOT / "docs"
+from shapepose_fg.core.frame_times import FrameTimes
+from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.evaluation.tracking import score_tracks
+from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
+from shapepose_fg.simulation import Scene, built_in_scene, simulate
+from shapepose_fg.simulation.files import truth_of
+from shapepose_fg.simulation.mocap import Mocap
+from shapepose_fg.simulation.sequences import SEQUENCES, Split, sequence
+from shapepose_fg.simulation.training.motions import split_of
+
+PAGE = Path(__file__).parents[1] / "docs" / "evaluation" / "people.md"
+OVER_TIME = PipelineConfig()
+MODES = {"with time": OVER_TIME, "without time": replace(OVER_TIME, temporal=False)}
+SEGMENTS: dict[Split, dict[str, tuple[int, int]]] = {
+    "report": {"salsa": (108, 618), "crossing": (0, 726), "crowd": (0, 826)},
+    "tune": {"salsa": (0, 564), "crossing": (0, 564), "crowd": (241, 900)},
+}
+"""First frames of the segments of the named sequences; each has 300 frames without a cut."""
+POOLS: dict[str, Callable[..., Any]] = {"mean": np.average, "least": np.min, "sum": np.sum}
+
+
+class Case(NamedTuple):
+    """One independent measurement."""
+
+    row: str
+    """Name of the row in which its figures are combined with those of other cases."""
+    name: str
+    """Name, unique in the table."""
+    make: Callable[[], Scene]
+    """Function that makes the people and cameras."""
+    span: range
+    """Frames of the scene."""
+    seed: int = 0
+    """Seed of the detector's errors."""
+    config: PipelineConfig = OVER_TIME
+    """Settings of the reconstruction."""
+
+
+class Column(NamedTuple):
+    """A column of a table."""
+
+    heading: str
+    figure: str
+    """Name of the figure that it shows."""
+    decimals: int = 1
+    pool: str = "mean"
+    """How the figures of a row's cases are combined. Shares of joints are weighted by their
+    count."""
+
+    def cell(self, cases: Sequence[dict[str, Any]]) -> str:
+        """Text in a row of these cases; a dash if none has the figure."""
+        those = [case for case in cases if case.get(self.figure) is not None]
+        if len(those) == 0:
+            return "-"
+        count = f"joints_{self.figure.partition('_inside_')[0].removesuffix('_log_score')}"
+        weighted = self.pool == "mean" and all(case.get(count) for case in those)
+        how = {"weights": [case[count] for case in those]} if weighted else {}
+        return f"{POOLS[self.pool]([case[self.figure] for case in those], **how):.{self.decimals}f}"
+
+
+COLUMNS = [
+    Column(*each) for each in list[tuple[Any, ...]]((
+        ("F1", "f1"), ("least", "f1", 1, "least"), ("recall", "recall"), ("IDF1", "idf1"),
+        ("MPJPE", "mpjpe_mm"), ("accel", "acceleration_error"), ("FP", "false_positives", 0, "sum"),
+        ("missed", "people_missed", 0, "sum"), ("switches", "switches", 0, "sum"),
+        ("wrist", "fast_wrist_error_mm"), ("body", "body_mpjpe_mm"),
+        ("b accel", "body_acceleration_error"),
+        *((f"{words} {level} %", f"{name}_inside_{level}") for words, name in (
+            ("2 views", "seen"), ("1", "one_view"), ("0", "no_view"), ("u", "unseen"),
+            ("v", "velocity")) for level in (50, 95)),
+        ("u", "joints_unseen", 0, "sum"), ("v", "velocity_error", 2), ("ms", "cpu_ms", 0),
+    ))
+]  # fmt: skip
+"""Columns of all tables: lengths in mm, accelerations in m/s², velocities in m/s, `u`: joints that
+no view has seen for ten frames; ms: processor time per frame."""
+
+
+def in_time(mocap: Mocap, split: Split) -> Iterator[Case]:
+    """Two segments of each sequence."""
+    for name, starts in SEGMENTS[split].items():
+        for span in (range(start, start + 300) for start in starts):
+            label = f"{name} {span.start}:{span.stop}"
+            make = partial(sequence, name, split, mocap, until=span.stop)
+            yield Case(label, label, make, span)
+
+
+def held_back(mocap: Mocap) -> Iterator[Case]:
+    """Held-out people, in sequences that were created after all settings had been chosen.
+
+    The dancers are the same recordings as in the reported segments, which are not used for
+    training. People who stand and walk around them are test subjects only. Positions, bodies,
+    cameras and the detector's errors are from other random draws.
+    """
+    learnt_from = frozenset(each for each in mocap.subjects if split_of(each) != "test")
+    for mode, config in MODES.items():
+        for name, start in {"salsa": 0, "crossing": 108, "crowd": 0}.items():
+            made, span = (
+                replace(SEQUENCES[name], seed=1001, without=learnt_from),
+                range(start, start + 300),
+            )
+            make = partial(sequence, name, "report", mocap, until=span.stop, config=made)
+            label = f"{name} {span.start}:{span.stop}, {mode}"
+            yield Case(label, label, make, span, 1001, config)
+
+
+def who_is_there(mocap: Mocap | None, split: Split, seeds: Sequence[int]) -> Iterator[Case]:
+    """4 s of crowds of eight people and crossings of seven with 2 to 8 cameras, at 10 to 60 frames
+    a second, and of two people; single frames at 30 frames a second only, since they are
+    independent of the rate.
+    """
+    rates = {2: (10, 15, 20, 30, 60), 3: (10, 15, 20, 30, 60), 4: (10, 15, 20, 30, 60),
+             6: (10, 15, 20, 30, 60), 8: (30,)}  # fmt: skip
+    kinds = [(cameras, rate) for cameras, every in rates.items() for rate in every]
+    for seed in seeds:
+        for mode, config in MODES.items():
+            two = partial(built_in_scene, seed, people=2, cameras=2, frames=120, fps=30)
+            named = f"two people, {mode}"
+            yield Case(named, f"{seed} {named}", two, range(120), seed, config)
+            if mocap is None:
+                continue
+            for name in ("crowd", "crossing"):
+                made = replace(SEQUENCES[name], seed=seed)
+                for cameras, rate in kinds if config.temporal else [(n, 30) for n in rates]:
+                    make = partial(
+                        sequence, name, split, mocap, cameras=cameras, until=4 * rate, fps=rate,
+                        config=made,
+                    )  # fmt: skip
+                    row = f"{name}, {cameras} cameras {rate} Hz, {mode}"
+                    yield Case(row, f"{seed} {row}", make, range(4 * rate), seed, config)
+
+
+def measure(case: Case) -> dict[str, Any]:
+    """`TrackingScore.as_dict` of a case, and `cpu_ms` a frame."""
+    scene = case.make().part(case.span)
+    detections = simulate(scene, seed=case.seed)
+    began = time.process_time()
+    times = FrameTimes.from_fps(scene.fps, len(scene))
+    people = reconstruct(detections, scene.rig, case.config, times=times, cuts=scene.cuts)
+    cpu_ms = 1e3 * (time.process_time() - began) / len(scene)
+    score = score_tracks(people, truth(scene), scene.fps, identities=case.config.temporal)
+    return score.as_dict() | {"cpu_ms": cpu_ms}
+
+
+def truth(scene: Scene) -> Reconstruction:
+    """The people as a result, in which identities change at a cut."""
+    found = truth_of(scene)
+    part = np.searchsorted(scene.cuts, found.frame, side="right")
+    return replace(found, person=found.person + part * (int(found.person.max(initial=0)) + 1))
+
+
+def table(cases: Sequence[Case], figures: Sequence[dict[str, Any]]) -> str:
+    """A Markdown table: a row for each name of rows, and one for all cases."""
+    rows = {row: [f for c, f in zip(cases, figures, strict=True) if c.row == row]
+            for row in dict.fromkeys(case.row for case in cases)}  # fmt: skip
+    rows |= {"**all**": list(figures)} if len(rows) > 1 else {}
+    lines = [["", *(column.heading for column in COLUMNS)], ["---"] * (1 + len(COLUMNS))]
+    lines += [[row, *(column.cell(those) for column in COLUMNS)] for row, those in rows.items()]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def main() -> None:
@@ -33,139 +187,37 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    given = os.environ.get("SHAPEPOSE_DATA")
-    parser.add_argument("--data", type=Path, default=None if given is None else Path(given))
-    parser.add_argument("--only", nargs="*", help="names of tables, or their first words")
-    parser.add_argument(
-        "--cases",
-        nargs="*",
-        help="only cases that have all words of one of these; with --list: names",
-    )
-    parser.add_argument(
-        "--seeds", nargs="*", type=int, help="of the sequences that `who is there` draws"
-    )
-    parser.add_argument(
-        "--split", choices=("tune", "report"), default="report", help="of the recorded motions"
-    )
-    parser.add_argument("--quick", action="store_true", help="a few frames of each but Shelf's own")
-    parser.add_argument("--list", action="store_true", help="measure nothing, say what there is")
-    parser.add_argument("--afresh", action="store_true", help="measure again what is kept")
-    parser.add_argument(
-        "--results", type=Path, default=ROOT / "build" / "figures", help="where figures are kept"
-    )
-    parser.add_argument("--update", action="store_true", help="write the tables into the documents")
+    parser.add_argument("--mocap", type=Path, help="file of recorded motions")
+    parser.add_argument("--only", nargs="*", help="names of tables")
+    parser.add_argument("--cases", nargs="*", default=(), help="only cases with all these texts")
+    parser.add_argument("--seeds", nargs="*", type=int, default=range(6101, 6106),
+                        help="of `who is there`")  # fmt: skip
+    parser.add_argument("--split", choices=("tune", "report"), default="report")
+    parser.add_argument("--results", type=Path, default=PAGE.parents[2] / "build" / "figures")
+    parser.add_argument("--update", action="store_true", help="write the tables into the page")
     arguments = parser.parse_args()
-    if arguments.update and (
-        arguments.quick or arguments.cases or arguments.seeds or arguments.split != "report"
-    ):
-        parser.error(
-            "--update: of all cases at full scale, split report; leave out the other options"
-        )
-    data = recordings(ROOT.parent / "shared" if arguments.data is None else arguments.data)
-    if data is None and arguments.data is not None:
-        wanted = " or ".join(RECORDINGS)
-        parser.error(
-            f"--data: neither {arguments.data} nor {arguments.data / 'data'} has a folder {wanted}"
-        )
-    scale = Scale(
-        arguments.quick, data, arguments.split, *[tuple(arguments.seeds)] if arguments.seeds else []
-    )
-    commit = code_commit()
-    results = arguments.results / commit / ("quick" if arguments.quick else arguments.split)
-    total, found = 0.0, 0
-    for experiment in experiments(scale):
-        if arguments.only is not None and not any(
-            begins(experiment.name, each) for each in arguments.only
-        ):
-            continue
-        part = experiment.only(
-            lambda name: not arguments.cases or any(has_words(name, w) for w in arguments.cases)
-        )
-        found += len(part.cases)
-        if arguments.list:
-            print(f"{experiment.name:<24}{len(part.cases):>3} cases")
-            if arguments.cases is not None:
-                print("\n".join(f"    {case.name}" for case in part.cases))
-            continue
-        if len(part.cases) == 0:
-            continue
-        figures, seconds = measured(part, results, afresh=arguments.afresh)
-        total += seconds
-        text = "\n".join(part.table(figures))
-        print(f"{experiment.name} ({seconds:.0f} s)\n\n{text}\n", flush=True)
-        if arguments.update and not write_table(experiment.name, text, commit):
-            print(
-                f"no page has marks <!-- {experiment.name} --> and <!-- end -->: add them to one "
-                "in docs/\n"
-            )
-    if found == 0:
-        absent = [name for name in RECORDINGS if scale.recording(name) is None]
-        why = (
-            f", and {data or 'this machine'} has no {', '.join(absent)} (see --data)"
-            if len(absent) > 0
-            else ""
-        )
-        parser.error(f"there is no such case; --list --cases names those of every table{why}")
-    if not arguments.list:
-        print(f"{total / 60:.0f} minutes in all")
-
-
-def recordings(folder: Path) -> Path | None:
-    """The given folder, or its subfolder data, if it has one of the recordings; None if neither
-    has.
-    """
-    those = (
-        each
-        for each in (folder / "data", folder)
-        if any((each / name).is_dir() for name in RECORDINGS)
-    )
-    return next(those, None)
-
-
-def code_commit() -> str:
-    """The last commit that changed the measured code; with the suffix "-changed" if there are
-    uncommitted changes.
-    """
-    code = ("--", "shapepose_fg", "factors")
-    commands = (("log", "-1", "--format=%h", *code), ("status", "--porcelain", *code))
-    try:
-        runs = [
-            subprocess.run(("git", "-C", ROOT, *each), capture_output=True, text=True)
-            for each in commands
+    mocap = None if arguments.mocap is None else Mocap.load(arguments.mocap)
+    tables = {"who is there": who_is_there(mocap, arguments.split, arguments.seeds)}
+    if mocap is not None:
+        tables = {"time": in_time(mocap, arguments.split), "held back": held_back(mocap), **tables}
+    for name in tables if arguments.only is None else arguments.only:
+        cases = [
+            case for case in tables[name] if all(text in case.name for text in arguments.cases)
         ]
-    except FileNotFoundError:  # git is not installed
-        return "unknown"
-    commit, changed = (each.stdout.strip() for each in runs)
-    return (commit or "unknown") + ("-changed" if changed else "")
-
-
-def begins(name: str, words: str) -> bool:
-    """Whether `name` begins with the given words."""
-    return f"{name} ".startswith(f"{words} ")
-
-
-def has_words(name: str, words: str) -> bool:
-    """Whether the name of a case contains all given words: "crowd 3 cameras" matches "crowd 6301 3
-    cameras 10 Hz".
-    """
-    there, wanted = (re.split(r"[\s,:]+", each.casefold()) for each in (name, words))
-    return set(wanted) <= set(there)
-
-
-def write_table(name: str, text: str, commit: str) -> bool:
-    """Write `text` between the marks of `name` on each page that has them; returns whether a page
-    has them.
-    """
-    marked = re.compile(rf"<!-- {re.escape(name)}( @[\w-]+)? -->\n.*?(<!-- end -->)", re.DOTALL)
-    pages = {
-        page: page.read_text(encoding="utf-8")
-        for page in (ROOT / "README.md", *sorted(DOCS.glob("*.md")))
-    }
-    pages = {page: old for page, old in pages.items() if marked.search(old) is not None}
-    for page, old in pages.items():
-        new = marked.sub(lambda found: f"<!-- {name} @{commit} -->\n\n{text}\n\n{found[2]}", old)
-        page.write_text(new, encoding="utf-8")
-    return len(pages) > 0
+        figures = []
+        for case in cases:
+            named = re.sub(r"[^\w+-]+", "_", f"{name} {arguments.split} {case.name}")
+            file = arguments.results / f"{named}.json"
+            if not file.is_file():
+                file.parent.mkdir(parents=True, exist_ok=True)
+                content = json.dumps(measure(case), indent=1)
+                file.write_text(content, encoding="utf-8")
+            figures.append(json.loads(file.read_text(encoding="utf-8")))
+        text = f"<!-- {name} -->\n\n{table(cases, figures)}\n\n<!-- end -->"
+        print(f"{text}\n", flush=True)
+        if arguments.update:
+            page, marks = PAGE.read_text(encoding="utf-8"), rf"<!-- {name}\b.*?<!-- end -->"
+            PAGE.write_text(re.sub(marks, lambda _, t=text: t, page, flags=re.DOTALL), "utf-8")
 
 
 if __name__ == "__main__":

@@ -68,7 +68,7 @@ DEFINITIONS = (
     AngleDefinition("elbow", ("flexion", "carrying", "pronation"), "ZXY", (1, 1, 1), ("elbow",),
                     ("shoulder", "elbow")),
 )  # fmt: skip
-"""The angles; docs/conventions.md describes them."""
+"""The angles; docs/joint_angles.md describes them."""
 _BONES_ALONG = {"hip": "knee", "knee": "ankle", "shoulder": "elbow", "elbow": "wrist"}
 """Bones with a long axis: the joint at its proximal end, and the one at its distal end."""
 _LIMBS = np.array([NUM_BETAS + 3 * SMPL_24.index(f"{side}_{joint}") + axis

@@ -28,6 +28,7 @@ from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.setup_check.diagnosis import build_of, put_right
+from shapepose_fg.setup_check.evidence import gather
 from shapepose_fg.setup_check.findings import SURE, Finding, Kind
 from shapepose_fg.setup_check.fit import difference
 from shapepose_fg.setup_check.small_errors import Problem
@@ -155,7 +156,7 @@ def refine(
     cameras.
     """
     freedom = Freedom() if freedom is None else freedom
-    given, right, findings = put_right(detections, rig, frames)
+    given, right, findings = put_right(gather(detections, frames, len(rig)), rig)
     footage, start = (
         Footage.of(detections, rig, times, frames),
         _found_again(findings, right.views, rig),

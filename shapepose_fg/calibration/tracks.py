@@ -45,7 +45,7 @@ class Tracks:
     rays: Array
     """(M, J, 3) directions in the world, smoothed; NaN where a joint is not seen."""
     speed: Array
-    """(M, J, 3) change of these directions per frame."""
+    """(M, J, 3) change of the rays' directions per frame."""
     size: Array
     """(M,) size of the person, rad."""
 

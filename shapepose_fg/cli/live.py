@@ -17,7 +17,7 @@ from shapepose_fg.cli.terminal import note
 from shapepose_fg.core.errors import InputError, naming
 
 if TYPE_CHECKING:
-    from shapepose_fg.live.online import OnlineReconstructor, Said
+    from shapepose_fg.live.online import CameraChange, OnlineReconstructor
 
 
 @grouped
@@ -46,10 +46,13 @@ def live(
     of people.
 
     Input: OpenPose's JSON of a frame in one line, with "camera" and "time_s" beside "people".
-    Output: "now" after each frame, and "settled" when its people have been refined. The command
-    ends with the input; invalid lines are skipped with a note. A socket accepts connections from
-    this machine only, unless an address is given (tcp://0.0.0.0:PORT). An .mcap file has ROS 2
-    messages. `rerun` starts the viewer; rerun+http://HOST:9876/proxy connects to a running one.
+
+    Output: "now" after each frame, and "settled" when its people have been refined.
+
+    The command ends with the input; invalid lines are skipped with a note. A socket accepts
+    connections from this machine only, unless an address is given (tcp://0.0.0.0:PORT). An .mcap
+    file has ROS 2 messages. `rerun` starts the viewer; rerun+http://HOST:9876/proxy connects to a
+    running one.
     """
     from shapepose_fg.core.skeleton import BODY_25
     from shapepose_fg.io.skeleton_file import find_skeleton
@@ -95,12 +98,12 @@ def live(
 
 
 def _say(
-    people: "OnlineReconstructor", last: "Said | None", note: Callable[[str], None]
-) -> "Said | None":
+    people: "OnlineReconstructor", last: "CameraChange | None", note: Callable[[str], None]
+) -> "CameraChange | None":
     """Print changes of the cameras' statuses since `last`, the last printed ones; returns the
     current ones.
     """
-    events = people.said()
+    events = people.camera_changes()
     if len(events) == 0 or events[-1] is last:
         return last
     new = next((n for n, each in enumerate(reversed(events)) if each is last), len(events))

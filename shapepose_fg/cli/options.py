@@ -106,7 +106,13 @@ def grouped(command: Callable[..., Any]) -> Callable[..., Any]:
     del called.__wrapped__
     cast(Any, called).__signature__ = inspect.Signature(parameters)
     called.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-    return called
+    return flowing(called)
+
+
+def flowing(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Join the lines of each paragraph of the docstring: the help would break them twice."""
+    command.__doc__ = re.sub(r"(?<=\S)\n(?=[^\s-])", " ", inspect.getdoc(command) or "")
+    return command
 
 
 def frames_option() -> Any:

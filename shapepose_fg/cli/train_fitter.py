@@ -8,12 +8,6 @@ from shapepose_fg.cli.terminal import note, progress, show, table, warn
 from shapepose_fg.core.errors import InputError, optional
 from shapepose_fg.core.storage.output_folder import prepare_output
 
-_DRAWN = 30_000
-"""Number of random poses if no recorded ones are given."""
-_WORSE = 1.1
-"""Ratio of the error to that of the plain optimiser above which weights are rejected (the learned
-fitter takes half the time)."""
-
 
 @grouped
 def train_fitter(
@@ -51,7 +45,8 @@ def train_fitter(
     file = adapted_file(model) if output is None else output
     prepare_output(file.parent, [file.name])
     if motions is None:
-        learnt, unseen = (drawn_motions(_DRAWN, 2 * seed + part) for part in (0, 1))
+        # Number of random poses if no recorded ones are given.
+        learnt, unseen = (drawn_motions(30_000, 2 * seed + part) for part in (0, 1))
     else:
         learnt, unseen = (load_motions(motions).of(split) for split in ("train", "validation"))
     for split, part in (("train", learnt), ("validation", unseen)):
@@ -73,7 +68,9 @@ def train_fitter(
     minutes = (time.perf_counter() - start) / 60
     caption = f"on unseen poses with some joints missing; training took {minutes:.0f} minutes"
     show(table(["fitter", "error, mm", "ms per fit"], rows, caption=caption))
-    if output is None and scores[TRAINED].joints_mm > _WORSE * scores[PLAIN].joints_mm:
+    # Ratio of the error to that of the plain optimiser above which weights are rejected
+    # (the learned fitter takes half the time).
+    if output is None and scores[TRAINED].joints_mm > 1.1 * scores[PLAIN].joints_mm:
         warn(
             f"the plain optimiser is more accurate on {body}, so these weights are not stored; "
             "give more --iterations"

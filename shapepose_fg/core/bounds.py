@@ -13,8 +13,6 @@ MetresOrNone = Annotated[float, Interval(ge=0, le=10)]
 """A distance, m, at least 0; the setting's docstring states what 0 means."""
 Seconds = Annotated[float, Interval(gt=0, le=60)]
 """A duration, s; above 0."""
-Speed = Annotated[float, Interval(gt=0, le=100)]
-"""A speed, m/s; above 0."""
 Share = Annotated[float, Interval(ge=0, le=1)]
 """A share, or a score, 0 to 1."""
 Factor = Annotated[float, Interval(gt=0, le=1e6)]

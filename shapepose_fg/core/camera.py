@@ -17,7 +17,6 @@ from shapepose_fg.core.trajectory import MOST_METRES, Carried, Trajectory
 Axis = Literal["x", "-x", "y", "-y", "z", "-z"]
 """A world axis, used to name the up direction of a calibration."""
 
-_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 _MOST_PIXELS, _MOST_DISTORTION, _LONGEST_NAME = 1_000_000, 1e6, 200
 """Upper bounds of the size of a picture, pixels, of distortion coefficients, and of the length of a
 name. Real values are smaller; larger ones would cause overflows."""
@@ -278,7 +277,7 @@ class Rig:
     @property
     def up_vector(self) -> Array:
         """(3,) unit vector that points up in the world."""
-        return np.array(_AXES[self.up[-1]]) * (-1.0 if self.up.startswith("-") else 1.0)
+        return np.eye(3)["xyz".index(self.up[-1])] * (-1.0 if self.up.startswith("-") else 1.0)
 
     @cached_property
     def K(self) -> Array:

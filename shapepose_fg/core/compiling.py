@@ -3,25 +3,20 @@
 import gc
 import logging
 import os
-import subprocess
-import sys
+import time
 from collections.abc import Iterator, Sequence
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from importlib import import_module
-from pathlib import Path
-from threading import Timer
+from threading import Thread, Timer
 from typing import Any
+
+from loky import ProcessPoolExecutor
 
 from shapepose_fg.core.kept_kernels import kept_folder, wanted_folder
 
 _BYTES_S = 1300
 """Bytes of Python bytecode that an average machine compiles in a second."""
-_WORTH_S = 3.0
-"""Compile time below which kernels are compiled in this process, s: starting a process takes a
-second."""
-_MOST = 8
-"""Maximum number of processes: the longest kernel takes an eighth of the total time, so more
-processes give no speed-up."""
 
 _tried = False
 """Whether this process has compiled the missing kernels; kernels that are missing later are
@@ -42,7 +37,11 @@ def compile_beside(kernels: Sequence[Any]) -> None:
     with _alone():
         missing = [each for each in kernels if not each.is_kept]
         lasts_s = _work(missing) / _BYTES_S
-        count = min(cores(), _MOST, len(missing)) if lasts_s > _WORTH_S and place is not None else 1
+        # Compile time below which kernels are compiled in this process, s: starting a
+        # process takes a second.
+        # Maximum number of processes: the longest kernel takes an eighth of the total
+        # time, so more processes give no speed-up.
+        count = min(cores(), 8, len(missing)) if lasts_s > 3.0 and place is not None else 1
         what = (
             f"compiling {len(missing)} functions for this machine, which takes about"
             f" {max(lasts_s / count, 1):.0f} s"
@@ -70,42 +69,43 @@ def _share_out(kernels: Sequence[Any], count: int) -> None:
         p for m in modules.values() for p in ([m] if _work(m) < bound else [[each] for each in m])
     ]
     groups.sort(key=_work, reverse=True)
-    words = [",".join(each.name for each in group) for group in groups]
-    # The same packages as in this process, whatever is in the working directory.
-    environment = os.environ | {
-        "PYTHONPATH": os.pathsep.join(each or str(Path.cwd()) for each in sys.path)
-    }
-    command = [sys.executable, "-P", "-c", f"from {__name__} import main; main()", *words]
-    started = list[subprocess.Popen[Any]]()
-    numbers, to = os.pipe()  # pipe of group numbers, two bytes each, from which all processes read
+    pool = ProcessPoolExecutor(count, initializer=_begin, initargs=(os.getpid(),))
     try:
-        os.write(to, b"".join(n.to_bytes(2) for n in range(len(groups))))
-        os.close(to)
-        for _ in range(count):
-            quiet: Any = dict.fromkeys(("stdout", "stderr"), subprocess.DEVNULL)
-            started.append(subprocess.Popen(command, env=environment, stdin=numbers, **quiet))
-        for each in started:
-            each.wait()
-    except OSError as error:  # without processes, kernels are compiled when they are called
+        waiting = [pool.submit(_load, [each.name for each in group]) for group in groups]
+        for each in waiting:
+            each.result()
+    except (OSError, BrokenProcessPool) as error:  # kernels are compiled when they are called
         logging.getLogger(__name__).debug("%r", error)
     finally:
-        os.close(numbers)
-        for each in started:
-            each.kill()
-            each.wait()
+        pool.shutdown(kill_workers=True)
 
 
-def main() -> None:
-    """Entry point of a process of `compile_beside`: the command line names groups of kernels, and
-    standard input has the numbers of the groups that this process compiles.
-    """
+def end_with(parent: int) -> None:
+    """End this process, even if busy, when its parent has ended or was killed."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(0.5)
+        os._exit(1)
+
+    Thread(target=watch, daemon=True).start()
+
+
+def _begin(parent: int) -> None:
+    """Prepare a process of `compile_beside`: it compiles what it is told, and prints nothing."""
     global _tried
     _tried = True
+    end_with(parent)
     gc.disable()
-    while number := os.read(0, 2):
-        for name in sys.argv[1 + int.from_bytes(number)].split(","):
-            module, _, function = name.partition(":")
-            getattr(import_module(module), function).load()
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+    os.dup2(nowhere, 2)
+
+
+def _load(names: Sequence[str]) -> None:
+    """Compile kernels, by `module:name`."""
+    for module, _, function in (name.partition(":") for name in names):
+        getattr(import_module(module), function).load()
 
 
 @contextmanager

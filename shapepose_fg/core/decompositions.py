@@ -12,9 +12,6 @@ from shapepose_fg.core.arrays import Array
 
 ROTATION_TOLERANCE = 1e-3
 """Tolerance for R Rᵀ minus the identity: calibration files have four to six digits."""
-_SIDE = np.sqrt([2.0, 3.0, 5.0])
-"""Reference direction for the signs of axes. It is not perpendicular to any axis of a symmetrical
-arrangement."""
 
 
 def is_rotation(R: Array) -> bool:
@@ -56,7 +53,9 @@ def principal_axes(covariance: Array) -> tuple[Array, Array]:
     that do not depend on the choice.
     """
     variances, axes = np.linalg.eigh(covariance)
-    axes = axes * np.where(np.einsum("i,...ia->...a", _SIDE, axes) < 0, -1.0, 1.0)[..., None, :]
+    # Reference direction for the signs of axes. It is not perpendicular to any axis of a
+    # symmetrical arrangement.
+    axes = axes * np.where(np.sqrt([2.0, 3.0, 5.0]) @ axes < 0, -1.0, 1.0)[..., None, :]
     axes[..., 0] *= np.sign(np.linalg.det(axes))[..., None]
     return variances, axes
 

@@ -30,14 +30,14 @@ class CameraClock:
 
 
 @dataclass(frozen=True)
-class Moments:
+class FrameSets:
     """The synchronised frame sets of a recording: one picture of each camera per set."""
 
     picture: Index
     """(T, V) index of each camera's picture; -1 if it has none within half a frame."""
     time_s: Array | None
-    """(T, V) times of these pictures, seconds; for a missing picture, the time of the set, or NaN
-    if start times are unknown. None without a clock."""
+    """(T, V) times of the pictures of each set, seconds; for a missing picture, the time of the
+    set, or NaN if start times are unknown. None without a clock."""
     notes: tuple[str, ...]
     """Notes on pictures that were left out, and on the time differences within a set."""
 
@@ -52,7 +52,7 @@ class Moments:
         )
 
 
-def align(clocks: Sequence[CameraClock], has_clock: bool, cure: str = "check --start") -> Moments:
+def align(clocks: Sequence[CameraClock], has_clock: bool, cure: str = "check --start") -> FrameSets:
     """Group the pictures of all cameras into synchronised frame sets.
 
     The sets have the times of the slowest camera (among equally slow ones, of that with most
@@ -100,10 +100,10 @@ def align(clocks: Sequence[CameraClock], has_clock: bool, cure: str = "check --s
             for v, each in enumerate(clocks)
         ]
         time_s = np.column_stack(taken)
-    return Moments(picture, time_s, tuple(notes))
+    return FrameSets(picture, time_s, tuple(notes))
 
 
-def own_frames(clocks: Sequence[CameraClock], has_clock: bool) -> Moments:
+def own_frames(clocks: Sequence[CameraClock], has_clock: bool) -> FrameSets:
     """Group pictures by number, counted from each camera's own first picture, because start times
     are unknown.
 
@@ -135,7 +135,7 @@ def own_frames(clocks: Sequence[CameraClock], has_clock: bool) -> Moments:
         "own numbers. Give start times with --start, or estimate them with `calibrate --times`, "
         "or with `synchronise` if the poses are known",
     )
-    return Moments(picture, time_s, notes if least < count else ())
+    return FrameSets(picture, time_s, notes if least < count else ())
 
 
 def _nearest(clock: CameraClock, moment: Array) -> tuple[Index, Array]:

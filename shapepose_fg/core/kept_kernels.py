@@ -22,6 +22,8 @@ from typing import Any, cast
 import numba
 from llvmlite.binding import get_host_cpu_features, get_host_cpu_name
 
+from shapepose_fg.core.storage.files import user_cache
+
 OPTIONS: dict[str, Any] = {
     "error_model": "numpy",
     "nogil": True,
@@ -34,19 +36,13 @@ NUMBA: Any = cast(Any, numba).config
 _GIVEN = "SHAPEPOSE_FG_KERNELS"
 """Environment variable by which a process passes the path of its temporary folder to its child
 processes."""
-_SPACE = 50_000_000
-"""Minimum free space on the disk, bytes: ten times the size of all kernels."""
-_VERSIONS = 16
-"""Maximum number of cached folders per module: for several checkouts, Python versions,
-processors."""
 
 
 def wanted_folder() -> Path:
     """The folder for compiled functions: below NUMBA_CACHE_DIR, or in the user's cache."""
     if given := os.environ.get("NUMBA_CACHE_DIR"):
         return Path(given).absolute() / "shapepose-fg"
-    base = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")  # noqa: PTH111
-    return Path(base).absolute() / "shapepose-fg" / "kernels"
+    return user_cache("kernels").absolute()
 
 
 @cache
@@ -76,7 +72,8 @@ def _can_keep(place: Path) -> bool:
     try:
         place.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=place).close()
-        return shutil.disk_usage(place).free > _SPACE
+        # Minimum free space on the disk, bytes: ten times the size of all kernels.
+        return shutil.disk_usage(place).free > 50_000_000
     except OSError:
         return False
 
@@ -114,7 +111,9 @@ def module_folder(module: str) -> Path | None:
 
 def _remove_old(place: Path, module: str) -> None:
     by_age = sorted(place.glob(f"{module}-*"), key=lambda each: each.stat().st_mtime, reverse=True)
-    for each in by_age[_VERSIONS:]:
+    # Maximum number of cached folders per module: for several checkouts, Python versions,
+    # processors.
+    for each in by_age[16:]:
         shutil.rmtree(each, ignore_errors=True)
 
 

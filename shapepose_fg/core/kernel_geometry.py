@@ -9,8 +9,6 @@ from shapepose_fg.core.compiled import part
 
 ROBUST = {None: 0, "none": 0, "huber": 1, "cauchy": 2, "geman_mcclure": 3, "tukey": 4}
 """Robust kernels by their number in compiled functions."""
-_STEPS = 3
-"""Number of iterations of reweighted triangulation."""
 
 
 @part
@@ -65,7 +63,8 @@ def triangulated(cameras, focal, uv, sure, scale_m, reach_m, least_depth, weight
     for v in range(len(sure)):
         weight[v] = sure[v]
     agree = 0
-    for _ in range(_STEPS):
+    # Number of iterations of reweighted triangulation.
+    for _ in range(3):
         xx = xy = xz = yy = yz = zz = right_x = right_y = right_z = 0.0
         for v in range(len(sure)):
             if sure[v] > 0:

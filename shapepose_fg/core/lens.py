@@ -13,11 +13,6 @@ Lens = Literal["perspective", "fisheye"]
 fisheye."""
 COEFFICIENTS: dict[str, tuple[int, ...]] = {"perspective": (5, 8, 12, 14), "fisheye": (4,)}
 """Numbers of coefficients that OpenCV's functions accept, for each kind of lens."""
-_UNDONE_PX = 0.5
-"""Maximum error when an undistorted point is distorted again, pixels. Above it, the distortion
-cannot be inverted at this point. If it can, OpenCV's iteration ends within 1e-6 px."""
-_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
-"""Number of iterations and accuracy, in normalised coordinates, for inverting a distortion."""
 
 
 def undistorted(xy: Array, K: Array, distortion: Array, lens: Lens) -> Array:
@@ -26,10 +21,23 @@ def undistorted(xy: Array, K: Array, distortion: Array, lens: Lens) -> Array:
         return xy
     rays = _normalised(xy, K).reshape(-1, 1, 2)
     undo = cv2.fisheye.undistortPoints if lens == "fisheye" else cv2.undistortPoints
-    ideal = np.asarray(undo(rays, np.eye(3), distortion, criteria=_CRITERIA), dtype=np.float64)
+    # Number of iterations and accuracy, in normalised coordinates, for inverting a
+    # distortion.
+    ideal = np.asarray(
+        undo(
+            rays,
+            np.eye(3),
+            distortion,
+            criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12),
+        ),
+        dtype=np.float64,
+    )
     pixels = ideal.reshape(-1, 2) @ K[:2, :2].T + K[:2, 2]
     with np.errstate(invalid="ignore", over="ignore"):
-        undone = np.abs(distorted(pixels, K, distortion, lens) - xy).max(axis=1) < _UNDONE_PX
+        # Maximum error when an undistorted point is distorted again, pixels. Above it,
+        # the distortion cannot be inverted at this point. If it can, OpenCV's iteration
+        # ends within 1e-6 px.
+        undone = np.abs(distorted(pixels, K, distortion, lens) - xy).max(axis=1) < 0.5
     pixels[~undone] = np.nan
     return pixels
 

@@ -212,7 +212,7 @@ class ObservationTable(Table):
         return {names[gate]: int(count[gate]) for gate in Gate if gate != Gate.NOT_SEEN}
 
     def save(self, file: str | Path) -> None:
-        """Write the table to `file` atomically; readable with NumPy (docs/conventions.md)."""
+        """Write the table to `file` atomically; readable with NumPy (docs/results.md)."""
         write_atomically(Path(file), lambda stream: write_npz(stream, self.columns()))
 
     @classmethod

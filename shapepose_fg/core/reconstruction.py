@@ -253,7 +253,7 @@ class Reconstruction(Table):
 
         `rig` are the cameras, by default `self.rig`; if both are None, an existing cameras.json
         stays. If the process is killed, each file is either the old or the new one, and `load`
-        refuses files of different runs (docs/conventions.md). Without `observations`, those of an
+        refuses files of different runs (docs/results.md). Without `observations`, those of an
         earlier result are removed. InputError if `load` would refuse the files, or if cameras.json
         belongs to another program; OSError if `folder` cannot be written; ValueError if `rig` does
         not have the cameras of the observations.

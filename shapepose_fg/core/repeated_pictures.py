@@ -67,6 +67,8 @@ def repeated_views(before: Detections, now: Detections, views: int) -> Mask:
     """
     there, was = (np.bincount(each.view, minlength=views) for each in (now, before))
     alike = (there == was) & (there >= _LEAST)
+    sums = (np.bincount(each.view, each.confidence, views) for each in (now, before))
+    alike &= np.equal(*sums)  # equal pictures have equal sums, different ones hardly ever
     if not alike.any():
         return alike
     one, other = (each.only(alike[each.view]) for each in (before, now))

@@ -89,7 +89,7 @@ class SubjectShapes(Table):
         return SubjectShapes.concatenate([self.rows(~np.isin(self.names, other.names)), other])
 
     def save(self, file: str | Path) -> None:
-        """Write the shapes as `.npz`, atomically (docs/conventions.md)."""
+        """Write the shapes as `.npz`, atomically (docs/project_files.md)."""
         write_atomically(Path(file), self.write)
 
     def write(self, stream: BinaryIO) -> None:

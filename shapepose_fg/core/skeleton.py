@@ -412,3 +412,8 @@ SMPL_24 = tuple(
     "left_elbow right_elbow left_wrist right_wrist left_hand right_hand".split()
 )
 """The 24 joints of SMPL's kinematic tree, in SMPL's order."""
+
+
+def smpl_joints(names: str) -> tuple[int, ...]:
+    """Indices in `SMPL_24` of joints, whose names are separated by spaces."""
+    return tuple(map(SMPL_24.index, names.split()))

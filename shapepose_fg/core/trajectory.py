@@ -27,9 +27,6 @@ rad."""
 _M_A_RAD, _M_A_S = 0.5, 0.05
 """Path length, m, to which a rotation by one radian, and a second at rest, are equivalent in the
 drift model."""
-_RAD_A_M = 0.5
-"""Error of rotation, rad, per metre of translational error of an odometry; both have the same
-effect after a straight path of 10 m."""
 MOST_VARIANCE = 1e18
 """Largest entry of a pose's covariance, rad² or m²: a larger one is equivalent to an unknown
 pose."""
@@ -155,7 +152,9 @@ class Trajectory:
             + _M_A_RAD * np.arccos(cosine)
             + _M_A_S * np.diff(time_s)
         )
-        sigmas = np.array([_RAD_A_M] * 3 + [1.0] * 3) * self.drift
+        # Error of rotation, rad, per metre of translational error of an odometry; both
+        # have the same effect after a straight path of 10 m.
+        sigmas = np.array([0.5] * 3 + [1.0] * 3) * self.drift
         return way[:, None, None] * np.diag(sigmas**2)
 
     def _between(self, values: Array, time_s: Array) -> Array:

@@ -17,16 +17,12 @@ Side = Annotated[int, Field(ge=16, le=4096)]
 """Side of a network's input, pixels."""
 _Share = Annotated[FiniteFloat, Field(gt=0, lt=1)]
 
-_GREY = 114
-"""Grey value of the padding if a picture has another aspect ratio than the network's input."""
 _STRIDES = (8, 16, 32)
 """Pixels per cell of the grids on which boxes are proposed."""
 _PERSON = 0
 """Index of people among COCO's classes."""
 _MOST_PEOPLE = 200
 """Maximum number of people in a picture; the boxes with the highest scores are kept."""
-_FARTHEST = 1e6
-"""Largest coordinate of a box, pixels of the input."""
 _LEAST, _LEAST_SUPPRESSED = 0.7, 0.3
 """Minimum scores of a box, as in rtmlib; the second if the network contains the non-maximum
 suppression."""
@@ -61,7 +57,9 @@ class BoxNetwork:
         size = np.array(self.form.size)
         scale = float((size / picture.shape[1::-1]).min())
         width, height = (max(int(side * scale), 1) for side in picture.shape[1::-1])
-        shown = np.full((size[1], size[0], 3), _GREY, dtype=np.uint8)
+        # Grey value of the padding if a picture has another aspect ratio than the
+        # network's input.
+        shown = np.full((size[1], size[0], 3), 114, dtype=np.uint8)
         shown[:height, :width] = cv2.resize(
             picture, (width, height), interpolation=cv2.INTER_LINEAR
         )
@@ -70,7 +68,8 @@ class BoxNetwork:
         )
         boxes, score, least = self._proposed(outputs)
         # Written so that NaN counts as below the minimum.
-        sound = (np.abs(boxes) < _FARTHEST).all(axis=1) & (boxes[:, 2:] > boxes[:, :2]).all(axis=1)
+        # Largest coordinate of a box, pixels of the input.
+        sound = (np.abs(boxes) < 1e6).all(axis=1) & (boxes[:, 2:] > boxes[:, :2]).all(axis=1)
         there = np.flatnonzero((score > (self.form.min_score or least)) & sound)
         there = there[np.argsort(-score[there], kind="stable")]
         boxes, score = boxes[there] / scale, score[there]

@@ -15,8 +15,6 @@ from shapepose_fg.io.detections.association_text import TextSkeleton
 
 _MIN_SCORE = 0.1
 """Minimum height of a peak; lower ones are noise."""
-_LINE_SAMPLES = 10
-"""Number of points along a limb at which the affinity field is sampled, as in OpenPose."""
 _MIN_ALONG = 0.05
 """Minimum component of the field along the limb at a point that supports it, as in OpenPose."""
 _MIN_SUPPORTED = 0.7
@@ -133,7 +131,8 @@ def line_integrals(fields: NDArray[np.float32], start: Array, end: Array, limb: 
     along = end - start
     length = np.linalg.norm(along, axis=1)
     direction = along / np.maximum(length, 1e-9)[:, None]
-    part = np.linspace(0.0, 1.0, _LINE_SAMPLES)
+    # Number of points along a limb at which the affinity field is sampled, as in OpenPose.
+    part = np.linspace(0.0, 1.0, 10)
     x = np.clip(start[:, :1] + along[:, :1] * part, 0, width - 1)
     y = np.clip(start[:, 1:] + along[:, 1:] * part, 0, height - 1)
     component = np.zeros(x.shape)

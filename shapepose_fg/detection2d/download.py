@@ -26,7 +26,6 @@ BASES = (
 """Addresses of the folders with the named networks, as rtmlib publishes them: OpenMMLab's, and its
 mirror."""
 
-_TIMEOUT_S = 30.0
 _INSIDE = "end2end.onnx"
 """Name of the network in its archive."""
 _BROKEN = (zipfile.BadZipFile, zlib.error, NotImplementedError)
@@ -113,7 +112,7 @@ def _fetched(file: str, progress: Callable[[int, int], object]) -> bytes:
     for base in BASES:
         try:
             with (
-                opener.open(f"{base}/{file}", timeout=_TIMEOUT_S) as answer,
+                opener.open(f"{base}/{file}", timeout=30.0) as answer,
                 tempfile.TemporaryFile() as archive,
             ):
                 total, done = int(answer.headers.get("Content-Length") or 0), 0

@@ -20,8 +20,6 @@ from shapepose_fg.io.write_detections import association_lines
 _STRIDE, _MULTIPLE = 8, 16
 """Pixels of the input per cell of the output, along each axis; and number by which both sides of
 the input are divisible."""
-_TRIAL = (64, 64)
-"""Width and height of the empty picture that a new network is tried on, pixels."""
 _LONG_SIDE = 656
 
 
@@ -96,7 +94,8 @@ class HeatMapNetwork:
         network = OnnxNetwork.open(
             file, backend or ("opencv" if device == "cpu" else "onnxruntime"), device
         )
-        width, height = network.size or _TRIAL
+        # Width and height of the empty picture that a new network is tried on, pixels.
+        width, height = network.size or (64, 64)
         shape = network.run(np.zeros((1, 3, height, width), dtype=np.float32))[0].shape
         fitting = [each for each in every.values() if layout in (None, each.name)]
         cells = (height // _STRIDE, width // _STRIDE)

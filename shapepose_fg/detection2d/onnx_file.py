@@ -17,8 +17,6 @@ _MOST_DEPTH = 100
 _MOST_FIELDS = 2**20
 """Maximum number of fields of the visited messages; networks have ten thousand to a hundred
 thousand."""
-_LONGEST = 2**31
-"""Size of a field, bytes, exclusive; protobuf's own limit."""
 _FIXED_BYTES = {1: 8, 5: 4}
 """Lengths, bytes, of protobuf's wire types with a fixed length."""
 
@@ -92,7 +90,8 @@ def _is_whole(content: memoryview) -> bool:
                 value, at = _varint(content, at, end)
             elif kind == 2:
                 length, at = _varint(content, at, end)
-                if length >= _LONGEST:
+                # Size of a field, bytes, exclusive; protobuf's own limit.
+                if length >= 2**31:
                     raise _Broken(f"the field at byte {start} ends beyond its message")
                 if field in inner:
                     waiting.append((inner[field], at, at + length, depth + 1))

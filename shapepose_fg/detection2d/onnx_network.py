@@ -29,8 +29,6 @@ cv2.dnn.readNetFromONNX(numpy.frombuffer(sys.stdin.buffer.read(), dtype=numpy.ui
 """
 _LOADS_S = 120
 """Longest time to load a network, s; 400 MB take a few seconds."""
-_BATCH = 32
-"""Maximum number of pictures in a batch, which bounds the memory for a crowd."""
 
 
 @dataclass(frozen=True)
@@ -193,7 +191,8 @@ def _with_onnxruntime(file: Path, content: bytes, device: str) -> tuple[Any, ...
 
     size = None if height is None or width is None else (width, height)
     names = [tuple(each.name for each in ends) for ends in (takes, session.get_outputs())]
-    return forward, size, *names, _BATCH if batch is None else 1
+    # Maximum number of pictures in a batch, which bounds the memory for a crowd.
+    return forward, size, *names, 32 if batch is None else 1
 
 
 def words(shape: Sequence[int]) -> str:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Camera
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.frame_sets import Moments
+from shapepose_fg.core.frame_sets import FrameSets
 from shapepose_fg.core.storage.files import inside, read_json, write_atomically, write_content
 from shapepose_fg.detection2d.decoding import Candidates
 from shapepose_fg.detection2d.opening import Network
@@ -70,7 +70,7 @@ class DetectionRun:
 
     cameras: Sequence[CameraDetector]
     """(V,) detector of each camera; all with the same network."""
-    moments: Moments
+    moments: FrameSets
     """Synchronised frame sets."""
     output: Path
     """The folder for the detections."""

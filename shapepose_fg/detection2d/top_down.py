@@ -23,8 +23,6 @@ from shapepose_fg.detection2d.upright import UprightView
 
 _Three = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 _Above0 = Annotated[FiniteFloat, Field(gt=0)]
-_AXES = {"simcc": [3, 3], "heat map": [4], "coordinates": [3]}
-"""Number of axes of each output, for each decoding."""
 
 
 class KeypointForm(BaseModel, extra="forbid"):
@@ -248,7 +246,9 @@ def _crop(
 
 def _decoded(network: OnnxNetwork, form: KeypointForm, blob: Blob) -> tuple[Array, Array]:
     """Positions (P, N, 2) of the network's joints in pixels of its input, and scores (P, N)."""
-    outputs, axes = network.run(blob), _AXES[form.decoding]
+    # Number of axes of each output, for each decoding.
+    axes = {"simcc": [3, 3], "heat map": [4], "coordinates": [3]}[form.decoding]
+    outputs = network.run(blob)
     if form.outputs is not None:
         outputs = [outputs[network.outputs.index(name)] for name in form.outputs]
     read = [each.astype(np.float64) for each in outputs[: len(axes)]]

@@ -15,9 +15,6 @@ from shapepose_fg.core.camera import Camera
 LEVEL_DEG = 5.0
 """Roll below which pictures are not rotated, degrees: people lean by as much, and rotation cuts off
 corners."""
-_LOOKS_DOWN = 0.17
-"""Length of the projected vertical (unit vector) below which the camera looks along the vertical,
-and no direction of the picture is up: the sine of 10 degrees."""
 
 
 def roll_of(camera: Camera, up: Array) -> float:
@@ -31,7 +28,9 @@ def roll_of(camera: Camera, up: Array) -> float:
     right, down, _ = np.linalg.solve(camera.K, [(width - 1) / 2, (height - 1) / 2, 1.0])
     # Motion of the projection of a point at the image centre when the point moves up.
     across, along = x - right * z, y - down * z
-    if np.hypot(across, along) < _LOOKS_DOWN:
+    # Length of the projected vertical (unit vector) below which the camera looks along the
+    # vertical, and no direction of the picture is up: the sine of 10 degrees.
+    if np.hypot(across, along) < 0.17:
         return 0.0
     return -float(np.degrees(np.arctan2(across, -along)))
 

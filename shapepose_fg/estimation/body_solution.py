@@ -44,13 +44,6 @@ from shapepose_fg.estimation.state import window_rows
 from shapepose_fg.estimation.user_factors import FactorFunction, add_factors, factors_of
 from shapepose_fg.estimation.window_solution import PersonGraph, WindowSolution, tied
 
-LASTS = 2.0
-"""Covariances over time are this many times those of errors that are new in every frame: detectors'
-errors last. It grows with the errors of the recording's detector, since those that last are not
-averaged over time.
-
-Solution and gates do not change: detections, bodies, motion and priors all are that much less
-certain."""
 GATE_M = 0.1
 """rho_2D of Eq. 2 in windows, as a length at the joint's depth, at the initial estimate and in
 every round; more for detectors with larger errors."""
@@ -98,14 +91,17 @@ def solve_bodies(
         try:
             state = window.solve(_filled(free, start.ok[rows], window.times_s))
             if len(rows) > 2 and len(feet) > 0:
-                state = window.hold(state, feet)
+                window.hold(state, feet)
             state = window.take(state, *gtsam_step(window, state))
             marginals = window.covariances(state)
         except np.linalg.LinAlgError:
             continue
         frames = observations.frame[rows].astype(np.int64)
         track = int(observations.track[rows[0]])
-        people.append(BodyGraph(window, state, track, frames, LASTS * noisy, rows))
+        # All covariances grow with the noise of the recording's detector, and by its lasting
+        # errors: solution and gates do not change.
+        widen = noisy * marginals.lasting()
+        people.append(BodyGraph(window, state, track, frames, widen, rows))
         spread.append(marginals)
         found.put(people[-1], marginals)
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import lapack
 
 from factors import DEFAULT_WIDTH_SIGMA, Motion
 from shapepose_fg.body.fitting.chains import Links
@@ -53,8 +54,16 @@ _PLACED_M = 0.05
 _STRAYS_M = 0.07
 """Standard deviation, m, of an unseen joint of the body at which its own deviation is as large:
 errors of poses that nothing shows are larger than their Gaussian when they are large."""
-_STEPS, _SETTLED_M = 8, 5e-4
-"""Most steps of the solver; it ends when joints move by less on average, metres."""
+LASTS = 1.1
+"""Factor on the covariances of a window, besides how much it averages (`Marginals.lasting`).
+Measured as that with which the 95 % regions hold in most recordings (docs/evaluation.md)."""
+_LOOKS = 8
+"""Number of frames, evenly over the window, from which it is taken how much it averages."""
+_STEPS, _SETTLED_M = 8, 2e-3
+"""Most steps of the solver; it ends when joints move by less on average, metres. GTSAM's last step
+then moves them by a tenth of that."""
+_ANYWHERE = 1e-3
+"""Information on the place and direction of a body in a frame by itself, 1/m² and 1/rad²."""
 HELD = 1e-6
 """Information on every unknown, so that what nothing determines stays where it is."""
 _DAMPING = 1e-3
@@ -149,6 +158,9 @@ class BodyWindow:
             np.zeros(shape := (*self.variance.shape, 3)), np.zeros((*shape, 3))
         )
         """Constraint on the joints of standing feet by other frames, metres in the world."""
+        self.walk = np.full((len(steps), self.sigmas_px.shape[1]), np.inf)
+        """(T - 1, J) density of the random walk of standing feet in each step, m²/s; infinite for
+        others."""
         self.links: Links | None = None
         self._asynchronous = bool(leads(observations, views).any())
 
@@ -196,29 +208,34 @@ class BodyWindow:
         self.last = here
         return state
 
-    def hold(self, state: BodyState, feet: Index) -> BodyState:
-        """The solution in which the joints `feet` (F,) stay in place between frames where they
-        stand; the state itself if none does.
+    def hold(self, state: BodyState, feet: Index) -> None:
+        """Hold the joints `feet` (F,) in place between frames where they stand, in the next steps
+        (`take`).
         """
         velocity = velocities(self.joints(state), self.times_s)[:, feet]
-        covariance = self.covariances(state).velocities()[:, feet]
+        covariance = self.covariances(state).velocities(feet)
         seen = np.asarray(self.last.evidence.sigma_m[:, feet] < _PLACED_M)
         velocity = np.where(seen[..., None], velocity, np.nan)
         density = standing_density(velocity, covariance, self.times_s)
         density = np.where(density > FREE_M2_S, np.inf, density)
         if not np.isfinite(density).any():
-            return state
+            return
         evidence = self.last.evidence
         told = np.where(seen[..., None, None], evidence.information[:, feet], 0.0)
         told = JointTargets(evidence.target[:, feet], told)
         information, pull = held_in_place(told, density, self.times_s)
         information[~seen], pull[~seen] = 0.0, 0.0
-        scale = np.trace(information, axis1=-2, axis2=-1)[..., None, None]
-        known = np.where(scale > 0, information + 1e-9 * scale * np.eye(3), np.eye(3))
-        self.standing.information[:, feet] = information
+        scale = np.trace(information, axis1=-2, axis2=-1)
+        known = information + 1e-9 * scale[..., None, None] * np.eye(3)
+        known = np.where(scale[..., None, None] > 0, known, np.eye(3))
         self.standing.xyz[:, feet] = (inverses(known) @ pull[..., None])[..., 0]
+        self.walk[:, feet] = np.where(seen[1:] & seen[:-1], density, np.inf)
+        # Detectors' errors last: all frames of a stance together say as much as one.
+        own = np.trace(told.information, axis1=-2, axis2=-1)
+        share = np.where(scale > 0, own / np.maximum(own + scale, 1e-9), 1.0)
+        self.standing.information[:, feet] = share[..., None, None] * information
+        self.sigmas_px[:, feet] /= np.sqrt(share)[..., None]
         self.last = self.around(state, self.last.bodies)
-        return self._descended(state)
 
     def take(self, state: BodyState, shape: Array, pose: Array) -> BodyState:
         """The state after another step of betas (10,) and poses (T, N) from the solution; the
@@ -412,7 +429,8 @@ class BodyWindow:
         after, arrows = np.zeros((n * N, n * N)), np.zeros((n * N, 10))
         for t in range(T - 1, -1, -1):
             L, ahead = kept[t, :N, :N], kept[t, N : N + n * N, :N]
-            inverse = np.linalg.inv(np.tril(L))
+            inverse, _ = lapack.dtrtri(L, lower=1)
+            inverse = np.tril(inverse)
             W = ahead @ inverse
             across = -after @ W  # of those after it with this one
             own = inverse.T @ inverse - W.T @ across
@@ -474,14 +492,40 @@ class Marginals:
         flat = slope.reshape(T, 3 * J, -1)
         return (flat @ whole).reshape(slope.shape) @ slope.mT
 
-    def velocities(self) -> Array:
-        """(T, J, 3, 3) covariances of velocities as in `in_time.velocities`, m²/s²; NaN for a
-        single frame.
+    def lasting(self) -> float:
+        """How many times larger covariances are because detectors' errors last.
+
+        Errors that are new in every frame are averaged over time, and leave the covariances of the
+        window. Those that last are not, and leave what the same views cause in a frame by itself.
+        The geometric mean of both is reported.
+        """
+        window, last = self.window, self.window.last
+        some = slice(None, None, max(len(window) // _LOOKS, 1))
+        seen = np.asarray(last.evidence.inlier.any(axis=-1)[some])
+        if not seen.any():
+            return LASTS
+        slope, gain = self.slopes[some, ..., 10:], last.gain[some]
+        variance = window.variance[some, ..., None, None]
+        (T, J), N = seen.shape, slope.shape[-1]
+        flat = slope.reshape(T, 3 * J, N)
+        views = flat.mT @ (gain / variance @ slope).reshape(flat.shape)
+        prior = _ANYWHERE * np.eye(N)
+        prior[3:-3, 3:-3] += window.energy.priors.precision
+        shown = np.linalg.inv(views + prior)
+        of_body = (flat @ (shown @ views @ shown)).reshape(slope.shape) @ slope.mT
+        kept = np.eye(3) - gain
+        alone = np.trace(kept @ of_body @ kept.mT + variance * kept, axis1=-2, axis2=-1)
+        over_time = np.trace(self.joints()[some], axis1=-2, axis2=-1)
+        return LASTS * float(np.exp(np.log(alone / over_time)[seen].mean() / 2))
+
+    def velocities(self, joints: Index | slice = slice(None)) -> Array:
+        """(T, J, 3, 3) covariances of the velocities of J `joints` as in `in_time.velocities`,
+        m²/s²; NaN for a single frame.
 
         Errors between distant frames are a Markov chain of those of consecutive ones, joint by
         joint, which is less correlated than they are.
         """
-        slope = self.slopes[..., 10:]
+        slope = self.slopes[:, joints, :, 10:]
         T, J = slope.shape[:2]
         flat = slope.reshape(T, 3 * J, -1)
         own = (flat @ self.poses).reshape(slope.shape) @ slope.mT
@@ -492,8 +536,12 @@ class Marginals:
         for k in range(int((last - first).max(initial=0))):
             there = np.minimum(first + k, T - 2)
             across = np.where((first + k < last)[:, None, None, None], goes[there] @ across, across)
-        found = own[first] + own[last] - across - across.mT
-        return found / lasts[:, None, None, None] ** 2
+        found = (own[first] + own[last] - across - across.mT) / lasts[:, None, None, None] ** 2
+        # Standing feet move no farther than their random walk.
+        walk = np.minimum(self.window.walk[:, joints], 1.0) * np.diff(self.window.times_s)[:, None]
+        moved = np.concatenate((np.zeros((1, J)), walk.cumsum(axis=0)))
+        density = (moved[last] - moved[first]) / lasts[:, None] ** 2
+        return found @ inverses(np.eye(3) + found / density[..., None, None])
 
 
 def nearest_keypoint(energy: BodyEnergy) -> Index:

@@ -10,8 +10,6 @@ import numpy as np
 from shapepose_fg.core.arrays import Array, Whole
 from shapepose_fg.core.storage.files import read_json
 
-LASTS_S = 0.25
-"""Standard deviation of the temporal smoothing of features, seconds; 0.5 and 1 s scored worse."""
 SURE_M = 0.02
 """Usual standard deviation of joints that views see, metres."""
 CARRIED_MOST = 3.0

@@ -116,19 +116,3 @@ def carried(values: Array, seen: Mask, times_s: Array) -> Array:
         nearest = frames[np.abs(times_s[:, None] - times_s[frames]).argmin(axis=1)]
         result[:, joint] = values[nearest, joint]
     return result
-
-
-def smoothed_in_time(
-    values: Array, times_s: Array, width_s: float, where: Mask | None = None
-) -> Array:
-    """Values (T, J, ...) smoothed by a Gaussian of `width_s`, one sigma, over frames with `where`
-    (T, J); over distant frames if there are no nearer ones.
-    """
-    where = np.ones(values.shape[:2], dtype=bool) if where is None else where
-    near = np.exp(-0.5 * ((times_s[:, None] - times_s) / width_s) ** 2) + 1e-9
-    total, flat = (
-        np.maximum(near @ where, 1e-9),
-        values.reshape(*where.shape, -1) * where[..., None],
-    )
-    whole = (near @ flat.reshape(len(near), -1)).reshape(flat.shape)
-    return (whole / total[..., None]).reshape(values.shape)

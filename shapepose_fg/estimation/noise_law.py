@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from shapepose_fg.core.arrays import Array, Mask
+from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.observations import Observations
@@ -259,31 +259,29 @@ class Residuals:
 
 
 def variance_ratio(
-    law: NoiseLaw, alone: Mask, scores: Array, sigma_m: Array, by_view: Array, body: Array
+    law: NoiseLaw, scores: Array, sigma_m: Array, by_view: Array, body: Array
 ) -> Array:
-    """(N, J) variance of joints under this `law`, relative to the variance by Eq. 1's weights.
+    """(N, J) variance of joints of single frames under this `law`, relative to the variance by Eq.
+    1's weights; at least 1.
 
     `scores` (N, J, V) are those of the observations, and `sigma_m` (N, J, V) their standard
     deviations by Eq. 1's weights, m. `by_view` (N, J, V, 3, 3) is the information of the used
     observations, and `body` (N, J, 3, 3) that of the body constraint, 1/m². The variance of the
-    body is scaled by the mean ratio of the person's detections; with temporal factors, which
-    average them, by the square root of this ratio. Gross errors count only in `alone` (N,) rows,
-    which have no temporal factors; in others, the calibration of covariances includes them.
+    body is scaled by the mean ratio of the person's detections.
     """
     core, gross_m2 = law.variances(scores)
-    ratio = core + np.where(alone[:, None, None], gross_m2 / sigma_m**2, 0.0)
+    ratio = core + gross_m2 / sigma_m**2
     if (ratio == 1.0).all():
         return np.ones(scores.shape[:2])
     used = by_view.any(axis=(-2, -1))
     count = used.sum(axis=(1, 2))
-    mean = np.where(
-        count > 0, np.where(used, ratio, 0.0).sum(axis=(1, 2)) / np.maximum(count, 1), 1.0
-    )
-    of_body = np.where(alone, mean, np.sqrt(mean))[:, None, None, None]
+    total = np.where(used, ratio, 0.0).sum(axis=(1, 2))
+    mean = np.where(count > 0, total / np.maximum(count, 1), 1.0)
     least = 1e-2 * np.eye(3)
     covariance = inverses(by_view.sum(axis=2) + body + least)
-    errors = np.einsum("njv,njvik->njik", ratio, by_view) + of_body * body + least
+    errors = np.einsum("njv,njvik->njik", ratio, by_view) + least
+    errors += mean[:, None, None, None] * body
     found = np.trace(covariance @ errors @ covariance, axis1=-2, axis2=-1) / np.trace(
         covariance, axis1=-2, axis2=-1
     )
-    return np.where(alone[:, None], np.maximum(found, 1.0), found)
+    return np.maximum(found, 1.0)

@@ -137,10 +137,7 @@ def _calibrated(state: State, X: Array, covariance: Array, final: ViewEvidence) 
     config, count = state.config.observations, state.inlier.sum(axis=-1)
     sigma_m = core_sigma_m(rows.confidence, config) * config.scatter(joints)[:, None]
     by_view = information_by_view(final, state.sigmas, state.views, config)
-    alone = np.ones(len(X), dtype=bool)
-    ratio = variance_ratio(
-        state.config.noise, alone, rows.confidence, sigma_m, by_view, body.information
-    )
+    ratio = variance_ratio(state.config.noise, rows.confidence, sigma_m, by_view, body.information)
     widened = ratio[..., None, None] * covariance
     of_body = np.nan_to_num(squared_distance(body, X, widened))
     association = association_spread(rows, state.sigmas, final, body, state.views, config)

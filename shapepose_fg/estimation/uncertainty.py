@@ -17,6 +17,7 @@ from shapepose_fg.core.decompositions import principal_axes, symmetric_root
 from shapepose_fg.core.errors import NotDetermined
 from shapepose_fg.core.reconstruction import BODY, Reconstruction
 from shapepose_fg.estimation.camera_pose_uncertainty import POSES_LAST_S, reported_with_poses
+from shapepose_fg.estimation.in_time import moments
 from shapepose_fg.estimation.linearisation import ObservationConfig
 from shapepose_fg.estimation.window_solution import PersonGraph
 
@@ -190,7 +191,8 @@ def marginal(
     """Joint distribution of joints of any people and frames.
 
     The covariance of each is as reported; errors of two joints of a person, in standard deviations,
-    have the measured correlation (`correlation`). With the `rig` of the reconstruction
+    have the measured correlation (`correlation`), which fades faster over time where the covariance
+    of the velocity says so. With the `rig` of the reconstruction
     (`cameras.json`), errors from poses of moving cameras are common to all that they see. With the
     `graphs` of a result (`window_solutions(people, rig)`, with `extra_factors=` for user factors),
     joints of one frame, and those that factors couple, also of two people, have the graph's
@@ -207,8 +209,10 @@ def marginal(
         shared = _of_poses(people, rig, rows, numbers, reported)
     roots = symmetric_root(reported - np.einsum("aiaj->aij", shared))
     names, time_s = [each.joint for each in joints], np.nan_to_num(people.time_s[rows])
-    rho = correlation(names, names) * _over_time(np.abs(time_s[:, None] - time_s))
-    rho *= people.person[rows][:, None] == people.person[rows]
+    pace = _paces(people, rows, numbers)
+    apart_s = np.abs(time_s[:, None] - time_s) * (pace[:, None] + pace) / 2
+    rho = correlation(names, names) * _over_time(apart_s)
+    rho = _definite(rho * (people.person[rows][:, None] == people.person[rows]))
     errors = np.einsum("ab,ij->aibj", rho, np.eye(3))
     found = _of_graphs(list(graphs), joints, numbers, errors)
     covariance = np.einsum("aik,akbl,bjl->aibj", roots, found, roots) + shared
@@ -246,10 +250,16 @@ def _of_graphs(
             found[a, :, b], found[b, :, a] = across, across.T
     if not tied:
         return errors
-    # Correlations from two sources are scaled so that the whole is positive semi-definite.
-    apart = found.reshape(3 * K, 3 * K) - np.eye(3 * K)
+    return _definite(found.reshape(3 * K, 3 * K)).reshape(K, 3, K, 3)
+
+
+def _definite(correlations: Array) -> Array:
+    """Correlations (N, N) from several sources, scaled so that the whole is positive
+    semi-definite.
+    """
+    apart = correlations - np.eye(len(correlations))
     least = np.linalg.eigvalsh(apart).min(initial=0.0)
-    return (np.eye(3 * K) + apart / max(1.0, -least)).reshape(K, 3, K, 3)
+    return np.eye(len(correlations)) + apart / max(1.0, -least)
 
 
 def _of_poses(
@@ -368,6 +378,27 @@ def _over_time(apart_s: Array) -> Array:
     """Correlation (...) of a joint's errors at time differences `apart_s` (...), seconds."""
     fading = apart_s / _FADES_S
     return (1 - _LASTS) * (1 + fading) * np.exp(-fading) + _LASTS * np.exp(-apart_s / _LASTS_S)
+
+
+def _paces(people: Reconstruction, rows: Index, joints: Index) -> Array:
+    """(K,) how many times faster than usual the errors of joints change, by row and joint.
+
+    The covariance of a velocity is that of the difference of two positions, and so says how
+    correlated their errors are: less than usual where a joint is fast and little is averaged. At
+    least 1, and 1 where there is no velocity.
+    """
+    lasts = np.full(len(people.person), np.nan)
+    for person in np.unique(people.person[rows]).tolist():
+        mine = np.flatnonzero(people.person == person)
+        mine = mine[np.argsort(people.time_s[mine], kind="stable")]
+        if len(mine) > 1 and (np.diff(people.time_s[mine]) > 0).all():
+            lasts[mine] = moments(people.time_s[mine])[2]
+    own = np.trace(people.covariance[rows, joints], axis1=-2, axis2=-1)
+    speed = np.trace(people.velocity_covariance[rows, joints], axis1=-2, axis2=-1)
+    said = 1 - speed * lasts[rows] ** 2 / (2 * own)
+    usual_s = np.geomspace(1e-4, 10.0, 200)
+    at_s = np.interp(-said, -_over_time(usual_s), usual_s)
+    return np.where(np.isfinite(said), np.maximum(at_s / lasts[rows], 1.0), 1.0)
 
 
 def _together(one: str, other: str) -> float:

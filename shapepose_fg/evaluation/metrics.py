@@ -141,12 +141,6 @@ def mean_distance(predicted: Array, truth: Array) -> Array:
 CORRECT_M = 0.2
 """Largest distance of a correct joint from the true one, m (the protocol of Zhang et al.)."""
 
-COVERAGE_LEVELS = (0.5, 0.9, 0.95)
-"""Probabilities for which `covariance_calibration` computes the coverage of the ellipsoids."""
-_LEAST_LOG_SCORE = -50.0
-"""Minimum log score of a joint in the mean, reached at an error of ten sigma, so that a single
-exchanged limb does not dominate the mean."""
-
 
 @dataclass(frozen=True)
 class JointMetrics:
@@ -194,13 +188,6 @@ class JointMetrics:
     def false_positives(self) -> int:
         """Number of unmatched predictions: duplicates, and people who do not exist."""
         return self.people_duplicated + self.people_invented
-
-    @property
-    def everyone_once(self) -> bool:
-        """Whether every person was found in every frame, exactly once, and there was no false
-        positive.
-        """
-        return self.people_missed == self.people_duplicated == self.people_invented == 0
 
 
 def joint_metrics(
@@ -266,13 +253,6 @@ class CovarianceCalibration:
     """Mean of the logarithm of the Gaussian's density, 1/m³, at the truth, each at least -50.
     Sigmas that are too large decrease it. NaN without joints."""
 
-    @property
-    def mean_nees(self) -> float:
-        """Mean NEES: 3 if the covariances are correct; more if they are too small; NaN without
-        joints.
-        """
-        return float(self.nees.mean()) if len(self.nees) else float("nan")
-
 
 def covariance_calibration(errors: Real, covariances: Real) -> CovarianceCalibration:
     """Compare `errors` (..., 3), metres, with their `covariances` (..., 3, 3), m².
@@ -291,14 +271,18 @@ def covariance_calibration(errors: Real, covariances: Real) -> CovarianceCalibra
         raise ValueError("a covariance is not positive definite") from None
     nees = np.sum(np.linalg.solve(root, error[..., None])[..., 0] ** 2, axis=1)
     # `2 gammaincinv(1.5, level)` is the quantile of chi-squared with 3 degrees of freedom.
+    # Probabilities for which `covariance_calibration` computes the coverage of the
+    # ellipsoids.
     inside = {
         level: share((nees <= 2 * gammaincinv(1.5, level)).sum(), len(nees))
-        for level in COVERAGE_LEVELS
+        for level in (0.5, 0.9, 0.95)
     }
     density = -0.5 * (nees + 3 * np.log(2 * np.pi)) - np.log(
         np.diagonal(root, axis1=1, axis2=2)
     ).sum(axis=1)
-    score = float(np.maximum(density, _LEAST_LOG_SCORE).mean()) if len(nees) > 0 else float("nan")
+    # Minimum log score of a joint in the mean, reached at an error of ten sigma, so that a
+    # single exchanged limb does not dominate the mean.
+    score = float(np.maximum(density, -50.0).mean()) if len(nees) > 0 else float("nan")
     return CovarianceCalibration(nees, inside, score)
 
 

@@ -22,8 +22,7 @@ from shapepose_fg.evaluation.metrics import (
     match_people,
     mean_distance,
 )
-from shapepose_fg.evaluation.shelf import ACTORS, LIMB_ENDS, shelf_joints
-from shapepose_fg.evaluation.shelf_annotation import SHELF_JOINTS
+from shapepose_fg.evaluation.shelf import ACTORS, LIMB_ENDS, SHELF_JOINTS, shelf_joints
 from shapepose_fg.evaluation.track_metrics import TrackFrame, TrackMetrics, track_metrics
 
 FIGURES = {

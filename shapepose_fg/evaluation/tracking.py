@@ -7,59 +7,24 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
 from shapepose_fg.body.model.body_model import BodyParameters
 from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation.metrics import (
-    MAX_DISTANCE_M,
     CovarianceCalibration,
     JointMetrics,
-    Matches,
     covariance_calibration,
     match_people,
-    mean_distance,
     metrics_of,
-    share,
 )
+from shapepose_fg.evaluation.track_metrics import TrackFrame, TrackMetrics, track_metrics
 from shapepose_fg.io.solved_setup import model_of
 
 WRISTS = [BODY_25.index("RWrist"), BODY_25.index("LWrist")]
-FAST_M_S = 1.5
-"""Speed of a wrist, m/s, above which too much smoothing becomes visible."""
-LONG_UNSEEN = 10
-"""Number of consecutive frames without a view, the current one included, from which a joint counts
-as long unseen."""
 UNMATCHED = np.iinfo(np.int64).min
 """Code for "no identity"; every other number may be an identity."""
-
-
-@dataclass(frozen=True)
-class IdentityMetrics:
-    """Result of `identity_metrics`, over all frames."""
-
-    true_positives: int
-    """IDTP: number of rows that belong to the person assigned to their identity for the whole
-    recording."""
-    rows: int
-    """Number of rows in the scored frames that have a joint."""
-    people_true: int
-    """Number of people in frames in which they have a joint."""
-    switches: int
-    """Number of times that a person is matched with another identity than the last time."""
-    tracks: int
-    """Number of identities."""
-    false_tracks: int
-    """Number of identities with at most half of their rows matched."""
-    longest_false_positive: int
-    """Largest number of unmatched rows of one identity."""
-
-    @property
-    def idf1(self) -> float:
-        """2 IDTP / (rows + true people); NaN if there are neither (Ristani et al., 2016)."""
-        return share(2 * self.true_positives, self.rows + self.people_true)
 
 
 @dataclass(frozen=True)
@@ -80,8 +45,8 @@ class TrackingScore:
 
     joints: JointMetrics
     """Precision, recall, F1 at 0.2 m, MPJPE, duplicates and other false positives."""
-    identities: IdentityMetrics | None
-    """IDF1, switches, tracks; None if `person` is not an identity."""
+    identities: TrackMetrics | None
+    """IDF1, MOTA, HOTA, switches; None if `person` is not an identity."""
     motion: MotionScore
     """The motion of the joints."""
     bodies: MotionScore
@@ -113,8 +78,7 @@ class TrackingScore:
             figures[f"{name}_log_score"] = calibration.log_score
             counts[f"joints_{name}"] = len(calibration.nees)
         if self.identities is not None:
-            names = ("tracks", "false_tracks", "longest_false_positive", "switches")
-            counts |= {name: getattr(self.identities, name) for name in names}
+            counts["switches"] = self.identities.switches
         return {name: float(v) if np.isfinite(v) else None for name, v in figures.items()} | counts
 
 
@@ -149,67 +113,30 @@ def score_tracks(
 
     views, error = views_used(found), found.joints - true[at]
     moving = found.velocity - velocities(true, fps)[at]
+    # Number of consecutive frames without a view, the current one included, from which a
+    # joint counts as long unseen.
     classes = {
         "seen": views >= 2,
         "one_view": views == 1,
         "no_view": views == 0,
-        "unseen": frames_unseen(views > 0, found.frame, identity) >= LONG_UNSEEN,
+        "unseen": frames_unseen(views > 0, found.frame, identity) >= 10,
     }
     calibration = {
         name: covariance_calibration(error[those], found.covariance[those])
         for name, those in classes.items()
     }
-    index = np.where(np.isin(people.frame, frames), people.frame - first, -1)
+    placed = people.rows(np.isfinite(people.joints.sum(axis=2)).any(axis=1))
+    by_frame = ((truth.rows(truth.frame == frame), placed.rows(placed.frame == frame))
+                for frame in frames)  # fmt: skip
+    tracks = track_metrics(TrackFrame.of(*pair) for pair in by_frame) if identities else None
     return TrackingScore(
         metrics_of(matches, people.joints, true),
-        identity_metrics(matches, index, people.person, people.joints, true)
-        if identities
-        else None,
+        tracks,
         motion=motion(found.joints),
         bodies=motion(body_joints(found)),
         velocity_error=_mean(np.linalg.norm(moving, axis=-1)),
         calibration=calibration
         | {"velocity": covariance_calibration(moving, found.velocity_covariance)},
-    )
-
-
-def identity_metrics(
-    matches: Matches, index: Whole, identity: Whole, joints: Array, truth: Array
-) -> IdentityMetrics:
-    """Compare the identities of rows with those of the truth (T, P, J, 3), NaN where a person is
-    absent.
-
-    Row n has `identity` (N,), `joints` (N, J, 3) in metres and belongs to frame `index` (N,) of the
-    truth, -1 for a frame that is not scored. For IDF1 identities and people are assigned one to one
-    for the whole recording, so that as many rows as possible are nearer than 0.5 m to theirs
-    (Ristani et al., "Performance Measures and a Data Set for Multi-Target, Multi-Camera Tracking",
-    2016). Switches are counted with `matches`, which are computed frame by frame.
-    """
-    scored = np.flatnonzero((index >= 0) & np.isfinite(joints.sum(axis=2)).any(axis=1))
-    present = np.isfinite(truth.sum(axis=3)).any(axis=2)
-    names, number = np.unique(identity[scored], return_inverse=True)
-    pairs = np.stack([index[scored], number], axis=1)
-    if len(np.unique(pairs, axis=0)) < len(pairs):
-        raise ValueError("an identity has two rows in one frame: give each person one row a frame")
-    together = np.zeros((len(names), truth.shape[1]), dtype=np.int64)
-    for person in range(truth.shape[1]):
-        near = mean_distance(joints[scored], truth[index[scored], person]) < MAX_DISTANCE_M
-        together[:, person] = np.bincount(number[near], minlength=len(names))
-    best = linear_sum_assignment(together, maximize=True)
-    matched = np.bincount(number[np.isin(scored, matches.row)], minlength=len(names))
-    length = np.bincount(number, minlength=len(names))
-    by_frame = np.full(truth.shape[:2], UNMATCHED)
-    by_frame[matches.frame, matches.person] = identity[matches.row]
-    return IdentityMetrics(
-        true_positives=int(together[best].sum()),
-        rows=len(scored),
-        people_true=int(present.sum()),
-        switches=sum(
-            int((np.diff(column[column != UNMATCHED]) != 0).sum()) for column in by_frame.T
-        ),
-        tracks=len(names),
-        false_tracks=int((2 * matched <= length).sum()),
-        longest_false_positive=int((length - matched).max(initial=0)),
     )
 
 
@@ -268,7 +195,8 @@ def velocities(truth: Array, fps: float) -> Array:
 def fast_wrist_errors(placed: Array, truth: Array, fps: float) -> Array:
     """(M,) errors in metres of the wrists with a true speed above 1.5 m/s (central differences)."""
     true = truth[:, :, WRISTS]
-    fast = np.linalg.norm(velocities(true, fps), axis=-1) > FAST_M_S
+    # Speed of a wrist, m/s, above which too much smoothing becomes visible.
+    fast = np.linalg.norm(velocities(true, fps), axis=-1) > 1.5
     error = np.linalg.norm(placed[:, :, WRISTS] - true, axis=-1)
     return error[fast & np.isfinite(error)]
 

@@ -22,7 +22,7 @@ from shapepose_fg.core.skeleton import SMPL_24
 from shapepose_fg.core.storage.files import read_bytes, read_json
 from shapepose_fg.core.storage.npz import NpzFile, read_npz
 from shapepose_fg.evaluation.metrics import PlainPeople
-from shapepose_fg.evaluation.shelf_annotation import SHELF_JOINTS, read_shelf_ground_truth
+from shapepose_fg.evaluation.shelf import SHELF_JOINTS, read_shelf_ground_truth
 from shapepose_fg.io.export.motion_files import OPEN_BODY
 from shapepose_fg.io.export.take import z_up
 
@@ -31,18 +31,14 @@ _PANOPTIC = (
     "RKnee RAnkle LEye LEar REye REar"
 ).split()
 """Joint order of CMU Panoptic (`joints19`)."""
-_PANOPTIC_15 = ("Neck", "Head", *_PANOPTIC[2:15])
-"""Joint order of the older files of CMU Panoptic (`joints15`)."""
-_PANOPTIC_M = 0.01
-"""Unit of CMU Panoptic, m."""
 _MOST_M = 1e6
 """Largest magnitude of a coordinate, m."""
+_SIZE_M = (0.1, 5.0)
+"""Diagonal of the box around the joints of a person, m; another median means another unit."""
+_SMPLX_VALUES = 165
+"""Values of a pose of SMPL-X, whose shape differs from SMPL's."""
 _MAT_BYTES = 2**26
 """Maximum size of a MATLAB variable in memory, bytes; Shelf's annotation has 5 MB."""
-_MAT_DEPTH = 6
-"""Maximum depth of nested cells."""
-_MAT_TYPES = dict(enumerate("i1 u1 i2 u2 i4 u4 f4 - f8 - - i8 u8".split(), start=1))
-"""NumPy's names of MATLAB's data types."""
 _CELL, _FLOATS, _MATRIX, _COMPRESSED = 1, (6, 7), 14, 15
 """Codes of MATLAB files: classes (cell; double and single), types (matrix; compressed matrix)."""
 
@@ -131,8 +127,16 @@ def _table(place: object, rows: list[tuple[int, int, Array]], names: tuple[str, 
     if count.max() > 1:
         at, who = pairs[count.argmax()]
         raise InputError(f"{place}: person {who} is twice in frame {at}; remove one of them")
-    if np.abs(joints[np.isfinite(joints)]).max(initial=0) > _MOST_M or np.isinf(joints).any():
-        raise InputError(f"{place}: joints must be metres, at most {_MOST_M:g}; check the unit")
+    known = np.isfinite(joints)
+    box = np.where(known, joints, -np.inf).max(axis=1) + np.where(known, -joints, -np.inf).max(1)
+    size = np.linalg.norm(box[np.isfinite(box).all(axis=1) & box.any(axis=1)], axis=1)
+    median = float(np.median(size)) if len(size) > 0 else 1.0
+    largest = np.abs(joints[~np.isnan(joints)]).max(initial=0)
+    if not (_SIZE_M[0] < median < _SIZE_M[1] and largest < _MOST_M):
+        raise InputError(
+            f"{place}: joints must be metres, but people are {median:.3g} m large and up to "
+            f"{largest:.3g} m from the origin; check the unit"
+        )
     return PlainPeople(frame, joints, person, names, **more)
 
 
@@ -147,10 +151,14 @@ def _panoptic(files: list[Path]) -> PlainPeople:
         try:
             for body in scene["bodies"]:
                 key = "joints19" if "joints19" in body else "joints15"
-                names = tuple(_PANOPTIC) if key == "joints19" else _PANOPTIC_15
+                # Joint order of the older files of CMU Panoptic (`joints15`).
+                names = (
+                    tuple(_PANOPTIC) if key == "joints19" else ("Neck", "Head", *_PANOPTIC[2:15])
+                )
                 values = np.array(body[key], dtype=np.float64).reshape(len(names), 4)
                 known = values[:, 3:] > 0  # -1 marks joints that were not reconstructed
-                xyz = np.where(known, _PANOPTIC_M * values[:, :3], np.nan)
+                # Unit of CMU Panoptic, m.
+                xyz = np.where(known, 0.01 * values[:, :3], np.nan)
                 rows.append((frames[-1], int(body["id"]), xyz))
         except (KeyError, TypeError, ValueError, OverflowError):
             raise InputError(
@@ -206,6 +214,10 @@ def _amass(files: list[Path], turn: Array, fps: float | None, body: Path | None)
             raise InputError(
                 f"{file}: must hold poses (F, 66 or more), trans (F, 3) and betas (10 or more); "
                 "give a motion of AMASS"
+            )
+        if poses.shape[1] == _SMPLX_VALUES:
+            raise InputError(
+                f"{file}: its shape belongs to SMPL-X; download the motion as SMPL+H instead"
             )
         numbers = data.get("frames", np.arange(count))
         rate = float(data.get("mocap_framerate", data.get("mocap_frame_rate", np.nan)))
@@ -272,10 +284,13 @@ def _value(content: bytes, depth: int = 0) -> Any:
     if len(parts) == 0:
         return np.zeros(0)
     kind, shape = parts[0][1][0], np.frombuffer(parts[1][1], "<i4").tolist()
-    if kind == _CELL and depth < _MAT_DEPTH:
+    # Maximum depth of nested cells.
+    if kind == _CELL and depth < 6:
         return [_value(part, depth + 1) for _, part in parts[3:]]
     if kind not in _FLOATS:
         raise ValueError("actor3D holds something else than cells and numbers")
     stored, values = parts[3] if len(parts) > 3 else (9, b"")
-    array = np.frombuffer(values, f"<{_MAT_TYPES[stored]}").astype(np.float64)
+    # NumPy's names of MATLAB's data types.
+    kinds = dict(enumerate("i1 u1 i2 u2 i4 u4 f4 - f8 - - i8 u8".split(), start=1))
+    array = np.frombuffer(values, f"<{kinds[stored]}").astype(np.float64)
     return array.reshape(shape, order="F")

@@ -14,9 +14,6 @@ from shapepose_fg.core.storage.kept_arrays import Arrays, KeptArrays
 
 BLOCK_FRAMES = 128
 """Number of frames that are read and stored together."""
-_AT_HAND = 4
-"""Number of blocks that stay in memory: windows are solved with a short delay after the frame that
-is read."""
 _KEPT: dict[str, Any] = {
     "view": np.int16,
     "joint": np.int16,
@@ -63,7 +60,9 @@ class DetectionTable:
             raise IndexError(f"frame {frame} is not among the {len(self)} frames")
         number, at = divmod(frame % len(self), BLOCK_FRAMES)
         if number not in self._at_hand:
-            while len(self._at_hand) >= _AT_HAND:
+            # Number of blocks that stay in memory: windows are solved with a short
+            # delay after the frame that is read.
+            while len(self._at_hand) >= 4:
                 del self._at_hand[next(iter(self._at_hand))]
             names = (*_KEPT, "candidate_start", "pair_start")
             self._at_hand[number] = {name: self.kept.array(_name(number), name) for name in names}

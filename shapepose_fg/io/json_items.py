@@ -18,9 +18,6 @@ from shapepose_fg.core.storage.files import (
 )
 
 _SPACE = " \t\n\r"
-_NEAR = 16
-r"""Number of characters at the end of the text read so far in which an error may be due to a
-truncated value, such as `\u00` of `\u00e9`."""
 
 
 class JsonItems:
@@ -131,9 +128,11 @@ class _Text:
             try:
                 value, end = self._decoder.raw_decode(self._left, self._at)
             except json.JSONDecodeError as error:
+                # Number of characters at the end of the text read so far in
+                # which an error may be due to a truncated value, such as `\u00`
+                # of `\u00e9`.
                 cut = (
-                    error.msg.startswith("Unterminated string")
-                    or error.pos >= len(self._left) - _NEAR
+                    error.msg.startswith("Unterminated string") or error.pos >= len(self._left) - 16
                 )
                 if cut and self._more():
                     continue

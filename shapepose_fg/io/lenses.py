@@ -26,11 +26,6 @@ _FORMATS = ("JPEG", "PNG", "TIFF")
 external programs."""
 _EXIF, _FOCAL_35MM = 0x8769, 0xA405
 """EXIF tags: the Exif directory in a photo, and FocalLengthIn35mmFilm in it."""
-_FILM_MM = (36.0, 24.0)
-_OFF_CENTRE = 0.05
-"""Maximum distance of a logged principal point from the middle, as a share of half the picture."""
-_USUAL = 65.0
-"""Typical field of view of a phone along the longer side of a video, degrees."""
 
 
 def lenses_of(detections: Path, fields: Sequence[str], size: tuple[int, int] | None) -> Rig:
@@ -64,7 +59,7 @@ def lenses_of(detections: Path, fields: Sequence[str], size: tuple[int, int] | N
                 "WIDTHxHEIGHT"
             )
         with naming(detections):
-            camera = _camera(name, picture, _USUAL if is_log(field) else _degrees(field))
+            camera = _camera(name, picture, 65.0 if is_log(field) else _degrees(field))
         cameras.append(of_log(camera, Path(field)) if is_log(field) else camera)
     with naming(detections):
         return Rig(tuple(cameras), "z")
@@ -83,7 +78,8 @@ def of_log(camera: Camera, log: Path) -> Camera:
     if K is None:
         raise InputError(f"{log}: has no intrinsics, columns fx fy cx cy; give degrees instead")
     size, (u, v) = np.array(camera.image_size), 2 * K[:2, 2]
-    if not ((np.abs([u, v] / size - 1) < _OFF_CENTRE).all() and min(K[0, 0], K[1, 1]) > 0):
+    # A principal point is within 5 % of half the picture from its middle.
+    if not ((np.abs([u, v] / size - 1) < 0.05).all() and min(K[0, 0], K[1, 1]) > 0):
         raise InputError(
             f"{log}: its lens belongs to pictures of about {u:.0f} x {v:.0f} pixels, but those of "
             f"camera {camera.name} have {size[0]} x {size[1]}; detect people in the pictures as "
@@ -94,8 +90,9 @@ def of_log(camera: Camera, log: Path) -> Camera:
 
 def pictures_only(names: Sequence[str], sizes: Sequence[tuple[int, int]]) -> Rig:
     """Upright cameras for which only the picture sizes (width, height) are known, without poses."""
+    # Typical field of view of a phone along the longer side of a video, degrees.
     return Rig(
-        tuple(_camera(name, size, _USUAL) for name, size in zip(names, sizes, strict=True)), "z"
+        tuple(_camera(name, size, 65.0) for name, size in zip(names, sizes, strict=True)), "z"
     )
 
 
@@ -149,4 +146,4 @@ def _focal_of_photo(file: Path) -> float:
             ) from None
     if not isinstance(found, int | float) or not 0 < found < 2000 or min(sides) < 1:
         raise InputError(f"{file}: its EXIF data have no FocalLengthIn35mmFilm; {cure}")
-    return float(found / np.hypot(*_FILM_MM) * np.hypot(*sides) / max(sides))
+    return float(found / np.hypot(36.0, 24.0) * np.hypot(*sides) / max(sides))

@@ -22,10 +22,6 @@ _POSES = ("pose-sync", "pose", "pose-associated")
 """Folders of 2D detections in order of preference: synchronised, as detected, and Pose2Sim's
 selection of one person. People are associated between cameras again, so that people dropped by
 Pose2Sim are not lost."""
-_MOST_KEYPOINTS = 1000
-"""Maximum id of a keypoint; a larger one is a mistake."""
-_RATE = 30.0
-"""Default frame rate, Hz, as in Pose2Sim, if neither Config.toml nor a video defines it."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +107,9 @@ def read_pose2sim_project(folder: Path) -> Pose2SimProject:
         fps, said = None, f"times from {times}"
     else:
         told = ((glance(video)[1], f" (from {video.name})") for video in videos)
-        assumed = _RATE, " are assumed, because project.frame_rate is 'auto' and there is no video"
+        # Default frame rate, Hz, as in Pose2Sim, if neither Config.toml nor a video
+        # defines it.
+        assumed = 30.0, " are assumed, because project.frame_rate is 'auto' and there is no video"
         given = rate != "auto"
         fps, origin = (
             (rate, f" (from {CONFIG})") if given else next((e for e in told if e[0] > 0), assumed)
@@ -191,7 +189,8 @@ def _joints_of_tree(tree: Any) -> dict[int, str]:
         place = (
             int(place) if isinstance(place, str) and place.isdecimal() and len(place) < 6 else place
         )
-        if type(place) is int and 0 <= place < _MOST_KEYPOINTS and isinstance(name, str):
+        # Maximum id of a keypoint; a larger one is a mistake.
+        if type(place) is int and 0 <= place < 1000 and isinstance(name, str):
             names[place] = name
     return names
 
@@ -246,7 +245,7 @@ def _calibration(session: Path, folder: Path) -> Path:
     found = next((each for each in (*files, rooms[0]) if is_calibration(each)), None)
     if found is None:
         there = listing(sorted(each.name for each in rooms[0].iterdir()))
-        cure = "run Pose2Sim's calibration, or put one of the formats of docs/conventions.md there"
+        cure = "run Pose2Sim's calibration, or put a format of docs/calibration_files.md there"
         raise InputError(
             f"{rooms[0]}: there is no calibration in a known format, only {there}; {cure}"
         )

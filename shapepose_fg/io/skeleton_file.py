@@ -65,7 +65,7 @@ def read_skeleton(path: str | Path) -> Skeleton:
     InputError, one sentence that names the file, the key and the cure.
     """
     path = Path(path)
-    file = validated(_File, read_toml(path), path, "docs/conventions.md describes the file")
+    file = validated(_File, read_toml(path), path, "docs/joints.md describes the file")
     # The body point of each joint, by the joint's name in the file.
     points = {
         joint: file.body.get(joint, joint) for joint in (*file.keypoints, *file.middles) if joint

@@ -12,7 +12,7 @@ import numpy as np
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.frame_sets import CameraClock, Moments, align
+from shapepose_fg.core.frame_sets import CameraClock, FrameSets, align
 from shapepose_fg.core.frame_times import MOST_FPS, FrameTimes
 from shapepose_fg.core.storage.files import write_content
 from shapepose_fg.io.number_table import MISSING, read_number_table
@@ -20,11 +20,9 @@ from shapepose_fg.io.validation import is_number
 
 _FRAME, _TIME = "frame", "time_s"
 """Columns with a special meaning; every other column belongs to a camera."""
-_LONGEST_STEP_S = 10.0
-"""Maximum time between frames, s; a longer one means that the file has another unit."""
 
 
-def read_timestamps(path: str | Path, rig: Rig, frames: int) -> tuple[FrameTimes, Moments | None]:
+def read_timestamps(path: str | Path, rig: Rig, frames: int) -> tuple[FrameTimes, FrameSets | None]:
     """The times of a recording of `frames` frames, from a text file (docs/conventions.md).
 
     Numbers are separated by commas or spaces. Without a header each line is a time in seconds,
@@ -50,7 +48,7 @@ def read_timestamps(path: str | Path, rig: Rig, frames: int) -> tuple[FrameTimes
         [own[place] for own, place in zip(number, found.picture.T, strict=True)]
     )
     notes = tuple(f"{path}: {each}" for each in found.notes)
-    return FrameTimes(cast(Array, found.time_s), source=str(path)), Moments(
+    return FrameTimes(cast(Array, found.time_s), source=str(path)), FrameSets(
         picture, found.time_s, notes
     )
 
@@ -158,7 +156,8 @@ def _clock(path: Path, name: str, time_s: Array, lines: Index) -> CameraClock:
         what = f"line {lines[int(np.argmax(steps <= 0)) + 1]} must be later than the frame before"
         raise InputError(f"{path}: {what}; sort frames by time")
     step = float(np.median(steps)) if len(steps) > 0 else np.inf
-    if len(steps) > 0 and not 1 / MOST_FPS <= step <= _LONGEST_STEP_S:
+    # Maximum time between frames, s; a longer one means that the file has another unit.
+    if len(steps) > 0 and not 1 / MOST_FPS <= step <= 10.0:
         raise InputError(f"{path}: frames are {step:.3g} s apart; write seconds")
     if len(there) > 0 and len(time_s) == 0:
         raise InputError(f"{path}: camera {name} has no times; leave it out with --without")

@@ -19,8 +19,6 @@ _LENS = ("fx", "fy", "cx", "cy")
 """Columns of the lens in a log, pixels."""
 _MATRIX = ("time_s", *(f"r{row}{column}" for row in "123" for column in "123t"))
 """Columns of ARKit Data Logger's ARKit_camera_pose.txt."""
-_LONGEST_STEP_S = 1e3
-"""Time between two poses above which times are nanoseconds, s."""
 
 
 def read_trajectory(path: str | Path, name: str = "") -> Trajectory:
@@ -147,7 +145,8 @@ def _of_phone(
         numbers = numbers[:, [0, 5, 6, 7, 1, 2, 3, 4]]
     else:
         return names, numbers, lines, np.eye(4)
-    if np.median(np.diff(numbers[:, 0])) > _LONGEST_STEP_S:
+    # Time between two poses above which times are nanoseconds, s.
+    if np.median(np.diff(numbers[:, 0])) > 1e3:
         numbers = numbers * np.r_[1e-9, np.ones(7)]
     later = np.append(True, np.diff(np.maximum.accumulate(numbers[:, 0])) > 0)
     return list(POSE), numbers[later], lines[later], bTc

@@ -22,10 +22,6 @@ from shapepose_fg.io.detections.association_text import TEXT_SKELETONS, TextSkel
 from shapepose_fg.io.detections.view_streams import MARGIN
 from shapepose_fg.proposal.people_2d import group_people
 
-SMALLEST_PERSON = 3
-"""Minimum number of joints of a group for it to count as a person, as in OpenPose's default
-settings."""
-
 
 def write_association(recording: DetectionSequence, rig: Rig, folder: str | Path) -> None:
     """Write calibration.json and detection/<camera>.txt into `folder`, as 4D Association reads
@@ -69,7 +65,7 @@ def write_openpose(recording: DetectionSequence, rig: Rig, folder: str | Path) -
     """Write <camera>/<camera>_000000000000_keypoints.json and so on into `folder`: people, as
     OpenPose does.
 
-    Candidates are grouped by `group_people`; groups of fewer joints than `SMALLEST_PERSON` are
+    Candidates are grouped by `group_people`; groups of fewer than three joints are
     false positives, and are left out. Positions are in pixels with three decimals. ValueError if
     the skeleton is not BODY_25 or if there is no frame; InputError if the folder of a camera
     already has frames.
@@ -81,7 +77,9 @@ def write_openpose(recording: DetectionSequence, rig: Rig, folder: str | Path) -
         each.mkdir(parents=True, exist_ok=True)
     for frame in range(len(recording)):
         found = recording[frame]
-        people = [members for members in group_people(found) if len(members) >= SMALLEST_PERSON]
+        # Minimum number of joints of a group for it to count as a person, as in
+        # OpenPose's default settings.
+        people = [members for members in group_people(found) if len(members) >= 3]
         for view, (camera, each) in enumerate(zip(rig.cameras, folders, strict=True)):
             listed = []
             for members in people:

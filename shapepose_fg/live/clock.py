@@ -9,12 +9,6 @@ Given = TypeVar("Given")
 JUMP_S = 2.0
 """Difference from the newest frame's time, s, above which a view's time is a jump; no lag is
 longer."""
-_AGREE_S = 1.0
-"""Maximum difference between the times of cameras that jump together, s."""
-_ALIVE = 4
-"""Number of recent views, per camera, among which a camera must have one to count as alive."""
-_PATIENCE = 2
-"""Number of views, per camera, during which active cameras may still confirm a jump."""
 
 
 @dataclass
@@ -49,7 +43,9 @@ class CommonClock(Generic[Given]):
         it is held back and the list is empty.
         """
         self._recent.append(camera)
-        if len(self._recent) > _ALIVE * self.cameras:
+        # Number of recent views, per camera, among which a camera must have one to
+        # count as alive.
+        if len(self._recent) > 4 * self.cameras:
             self._recent.popleft()
         if len(self._held) == 0:
             self._stay, self._passed = set(), 0
@@ -62,8 +58,11 @@ class CommonClock(Generic[Given]):
         self._stay.discard(camera)
         self._held[camera] = time_s, given
         self.off[camera] = self.off.get(camera, 0) + 1
-        agree = [each for each, (at_s, _) in self._held.items() if abs(at_s - time_s) <= _AGREE_S]
-        waited = self._passed >= _PATIENCE * self.cameras or set(self._recent) <= set(agree)
+        # Maximum difference between the times of cameras that jump together, s.
+        agree = [each for each, (at_s, _) in self._held.items() if abs(at_s - time_s) <= 1.0]
+        # Number of views, per camera, during which active cameras may still confirm a
+        # jump.
+        waited = self._passed >= 2 * self.cameras or set(self._recent) <= set(agree)
         if len(agree) < 2 or len(agree) <= len(self._stay) or not waited:
             return [], False
         taken = [

@@ -25,22 +25,16 @@ from shapepose_fg.tracking.tracker import Tracker, Tracks
 
 ON_TRIAL = -1
 """The identity of a track with insufficient evidence."""
-_SEARCH_S = 0.1
-"""Interval between searches for new people, seconds."""
 _SURE = 0.3
 """Evidence per second above which a new person is reported at once: probability 0.97
 (`track_selection.probability`)."""
 _WAITS_S = 1.0
 """Longest time for which a new track that may be a re-identification waits for its bone lengths,
 s."""
-_MOST_GONE = 256
-"""Maximum number of ended tracks that are remembered."""
-_LONGEST_S = 0.1
-"""Maximum duration of a frame's evidence, s, also after a longer gap between frames."""
 
 
 @dataclass(frozen=True)
-class Gone(Rows):
+class EndedTracks(Rows):
     """G tracks that ended and may be re-identified."""
 
     identity: Whole
@@ -48,13 +42,13 @@ class Gone(Rows):
     time_s: Array
     """(G,) times of the last detections, seconds."""
     place: Array
-    """(G, 3) centre of the core joints at that time, metres."""
+    """(G, 3) centre of the core joints when the track ended, metres."""
     bones: Array
     """(G, B) mean length of each bone between core joints, metres; NaN where unknown."""
 
 
 @dataclass(frozen=True)
-class Moment:
+class FilterState:
     """The state after a frame: A tracks, and ended ones. Arrays and numbers only, so that it can be
     saved.
     """
@@ -78,7 +72,7 @@ class Moment:
     """(A, B) sum of each bone's measured lengths, metres."""
     count: Array
     """(A, B) number of frames in which each bone was measured."""
-    gone: Gone
+    gone: EndedTracks
     """Tracks that ended."""
     sought_s: float = -np.inf
     """Time of the last search for new people, s."""
@@ -92,14 +86,14 @@ class Moment:
         """(A,) mask of the tracks that have an identity."""
         return self.identity != ON_TRIAL
 
-    def rows(self, index: NDArray) -> "Moment":
+    def rows(self, index: NDArray) -> "FilterState":
         """The state with some of the tracks."""
         own = {name: getattr(self, name)[index] for name in OF_TRACKS}
         return replace(self, tracks=self.tracks.rows(index), **own)
 
 
 OF_TRACKS = ("views", "identity", "running_s", "peak_s", "born_s", "place", "length_m", "count")
-"""Fields of a `Moment` with one row per track."""
+"""Fields of a `FilterState` with one row per track."""
 
 
 @dataclass(frozen=True)
@@ -112,19 +106,19 @@ class Filter:
     """Settings of re-identification."""
 
     @cached_property
-    def nobody(self) -> Moment:
+    def nobody(self) -> FilterState:
         """The state before the first frame."""
         J, B = (
             len(self.tracker.skeleton),
             self._trace(np.zeros((0, len(self.tracker.skeleton), 3))).bones.shape[1],
         )
         whole, real = np.zeros(0, np.int64), np.zeros(0)
-        gone = Gone(whole, real, np.zeros((0, 3)), np.zeros((0, B)))
+        gone = EndedTracks(whole, real, np.zeros((0, 3)), np.zeros((0, B)))
         per_bone = np.zeros((0, B)), np.zeros((0, B))
         own = np.zeros((0, J), np.int64), whole, real, real, real, np.zeros((0, 3)), *per_bone
-        return Moment(self.tracker.nobody(), *own, gone)
+        return FilterState(self.tracker.nobody(), *own, gone)
 
-    def step(self, before: Moment, given: Input) -> tuple[Moment, Index, Input]:
+    def step(self, before: FilterState, given: Input) -> tuple[FilterState, Index, Input]:
         """Process the next frame; returns the state, the detections (A, J, V) of its tracks, -1 for
         none, and the frame with left and right corrected.
 
@@ -135,26 +129,27 @@ class Filter:
         tracks, given = hold_now(tracker, before.tracks, given)
         tracks, candidate = tracker.step(tracks, given.detections, given.rig, time_s)
         now = replace(before, tracks=replace(tracks, time_s=time_s))
-        now, candidate = self._weighed(
-            now, candidate, given, min(max(time_s - last_s, 0.0), _LONGEST_S)
-        )
+        # Maximum duration of a frame's evidence, s, also after a longer gap between
+        # frames.
+        now, candidate = self._weighed(now, candidate, given, min(max(time_s - last_s, 0.0), 0.1))
         now, candidate = self._without_ended(now, candidate)
-        if not abs(time_s - now.sought_s) < _SEARCH_S:
+        # Interval between searches for new people, seconds.
+        if not abs(time_s - now.sought_s) < 0.1:
             now, candidate = self._with_newcomers(now, candidate, given)
         return self._with_names(now), candidate, given
 
-    def placed(self, now: Moment) -> Array:
+    def placed(self, now: FilterState) -> Array:
         """(A, J, 3) joints, metres; NaN where their uncertainty is too large."""
         joints = now.tracks.joints
         return np.where((joints.sigma_m < PLACED_M)[..., None], joints.position, np.nan)
 
-    def observations(self, now: Moment, candidate: Index, given: Input) -> Observations:
+    def observations(self, now: FilterState, candidate: Index, given: Input) -> Observations:
         """The rows of a frame for stage II: its tracks and their detections."""
         return observed(given, candidate, self.placed(now), now.tracks.ids)
 
     def _weighed(
-        self, now: Moment, candidate: Index, given: Input, lasts_s: float
-    ) -> tuple[Moment, Index]:
+        self, now: FilterState, candidate: Index, given: Input, lasts_s: float
+    ) -> tuple[FilterState, Index]:
         """Update the evidence for each track, and the lengths of its bones, with a frame."""
         if len(now.tracks) == 0:
             return now, candidate
@@ -175,7 +170,7 @@ class Filter:
             count=now.count + known,
         ), candidate
 
-    def _without_ended(self, now: Moment, candidate: Index) -> tuple[Moment, Index]:
+    def _without_ended(self, now: FilterState, candidate: Index) -> tuple[FilterState, Index]:
         """Remove tracks without recent evidence, and those whose missing evidence costs more than a
         new birth.
         """
@@ -187,10 +182,15 @@ class Filter:
         bones = np.where(known, left.length_m / np.maximum(left.count, 1), np.nan)
         centre = self._trace(self.placed(left)).centre
         recent = now.gone.rows(now.tracks.time_s - now.gone.time_s <= self.stitching.longest_gap_s)
-        gone = Gone.concatenate([recent, Gone(left.identity, left.tracks.evident_s, centre, bones)])
-        return replace(now.rows(stays), gone=gone.rows(slice(-_MOST_GONE, None))), candidate[stays]
+        gone = EndedTracks.concatenate(
+            [recent, EndedTracks(left.identity, left.tracks.evident_s, centre, bones)]
+        )
+        # Maximum number of ended tracks that are remembered.
+        return replace(now.rows(stays), gone=gone.rows(slice(-256, None))), candidate[stays]
 
-    def _with_newcomers(self, now: Moment, candidate: Index, given: Input) -> tuple[Moment, Index]:
+    def _with_newcomers(
+        self, now: FilterState, candidate: Index, given: Input
+    ) -> tuple[FilterState, Index]:
         """Add tracks of people found in unassigned detections."""
         tracker, tracks = self.tracker, now.tracks
         tracker.search(given.frame)
@@ -226,7 +226,7 @@ class Filter:
         )
         return now, np.concatenate([candidate, own])
 
-    def _with_names(self, now: Moment) -> Moment:
+    def _with_names(self, now: FilterState) -> FilterState:
         """Give identities to tracks with sufficient evidence: that of an ended track that fits in
         place, time and build, or a new one.
 
@@ -247,7 +247,7 @@ class Filter:
         gone = gone.rows(~np.isin(gone.identity, identity))
         return replace(now, identity=identity, next_identity=next_identity, gone=gone)
 
-    def _may_be_back(self, now: Moment, row: int) -> bool:
+    def _may_be_back(self, now: FilterState, row: int) -> bool:
         """Whether too few bones are measured to distinguish the track from ended tracks nearby."""
         if (
             now.tracks.time_s - now.born_s[row] > _WAITS_S
@@ -259,7 +259,7 @@ class Filter:
         near = (gap_s >= 0) & (gap_s <= self.stitching.longest_gap_s)
         return bool((near & (apart_m <= self.stitching.reach_m + 1.5 * gap_s)).any())
 
-    def _returned(self, now: Moment, ready: Index) -> dict[int, int]:
+    def _returned(self, now: FilterState, ready: Index) -> dict[int, int]:
         """Identities of the rows among `ready` that continue an ended track, found by
         `tracking.stitching`.
         """

@@ -29,12 +29,8 @@ a view."""
 Note = Callable[[str], None]
 _PIECE = 2**16
 """Maximum number of bytes read at a time."""
-_MOST_BAD = 10
-"""Number of consecutive unusable lines after which their sender is refused."""
 _RECONNECT_S = 2.0
 """Time for which a socket stays open after its last client has left, s: clients may reconnect."""
-_SILENT_S = 60.0
-"""Time of silence, s, after which a client may be disconnected to make room for another."""
 
 
 def feed(where: str | None, rig: Rig, skeleton: Skeleton, note: Note, push: Push) -> None:
@@ -107,7 +103,9 @@ class _Sender:
             view = read(place)
         except InputError as error:
             self._bad += 1
-            if self.good == 0 or self._bad >= _MOST_BAD:
+            # Number of consecutive unusable lines after which their sender is
+            # refused.
+            if self.good == 0 or self._bad >= 10:
                 raise
             self.given.note(f"{error}; the line is left out")
             return
@@ -216,7 +214,9 @@ def _from_socket(where: str, given: _Given) -> None:
             if len(clients) >= MOST_CLIENTS:
                 # The first to go is one without any accepted line, then the longest silent.
                 first = min(clients, key=lambda each: (each.sender.good > 0, each.heard_s))
-                if first.sender.good > 0 and client.heard_s - first.heard_s < _SILENT_S:
+                # Time of silence, s, after which a client may be disconnected
+                # to make room for another.
+                if first.sender.good > 0 and client.heard_s - first.heard_s < 60.0:
                     connection.close()
                     given.note(
                         f"{where}: {name} is rejected, because {MOST_CLIENTS} clients are "

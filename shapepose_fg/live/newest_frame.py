@@ -19,7 +19,7 @@ from shapepose_fg.estimation.camera_pose_uncertainty import carried_covariance
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.linearisation import linearise, observation_sigmas
 from shapepose_fg.estimation.motion_model import MotionModel
-from shapepose_fg.live.filtering import Moment
+from shapepose_fg.live.filtering import FilterState
 from shapepose_fg.tracking.global_hypotheses import PLACED_M
 from shapepose_fg.tracking.motion_filter import JointStates
 from shapepose_fg.tracking.tracker import Tracker
@@ -43,7 +43,7 @@ unseen joints in three stretches of split `tune`, and 92 and 86 % in crowds, whe
 95, 75 and 57 %."""
 
 
-def fed_back(tracker: Tracker, now: Moment, refined: Reconstruction) -> Moment:
+def fed_back(tracker: Tracker, now: FilterState, refined: Reconstruction) -> FilterState:
     """The state after a frame, with joints replaced by those of its `refined` rows where these are
     known.
     """
@@ -74,7 +74,7 @@ class Newest:
 
     frame: int
     """Number of the newest frame."""
-    moment: Moment
+    state: FilterState
     """The tracks, also those without an identity yet."""
     fitter: BodyFitter
     """Fits the bodies of the tracks."""
@@ -85,7 +85,7 @@ class Newest:
     None for nothing."""
 
     @cached_property
-    def people(self) -> tuple[Moment, Array, Array, BodyFit]:
+    def people(self) -> tuple[FilterState, Array, Array, BodyFit]:
         """Tracks with identities, covariances (P, J, 3, 3) of their joints, NaN where unknown,
         codes (P, J) of `Known`, and their bodies.
 
@@ -94,10 +94,10 @@ class Newest:
         follows from motion and the prior. Tracks without a known joint are left out.
         """
         named = np.flatnonzero(
-            self.moment.named & (self.moment.tracks.joints.sigma_m < PLACED_M).any(axis=1)
+            self.state.named & (self.state.tracks.joints.sigma_m < PLACED_M).any(axis=1)
         )
-        order = named[np.argsort(self.moment.identity[named], kind="stable")]
-        now = self.moment.rows(order)
+        order = named[np.argsort(self.state.identity[named], kind="stable")]
+        now = self.state.rows(order)
         joints, known = now.tracks.joints, now.tracks.joints.sigma_m < PLACED_M
         covariance = joints.covariance[..., :3, :3].copy()
         information = np.zeros_like(covariance)
@@ -159,7 +159,7 @@ def people_at(
 
 
 def later(
-    now: Moment, surely: Array, skeleton: Skeleton, motion: MotionModel, ahead_s: float
+    now: FilterState, surely: Array, skeleton: Skeleton, motion: MotionModel, ahead_s: float
 ) -> tuple[Array, Array]:
     """Position and velocity (A, J, 6) of all joints `ahead_s` later, and covariances (A, J, 6, 6)
     to report.

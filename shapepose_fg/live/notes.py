@@ -5,8 +5,6 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from types import TracebackType
 
-_BETWEEN_S = 1.0
-"""Shortest time between two notes, s; further ones are counted."""
 _AT_ONCE = 10
 """Number of notes that are passed on at once before the limit applies."""
 
@@ -27,7 +25,8 @@ class SparingNotes(AbstractContextManager["SparingNotes"]):
 
     def __call__(self, text: str) -> None:
         now_s = time.monotonic()
-        self._left = min(self._left + (now_s - self._said_s) / _BETWEEN_S, float(_AT_ONCE))
+        # One note a second; further ones are counted.
+        self._left = min(self._left + now_s - self._said_s, float(_AT_ONCE))
         self._said_s = now_s
         if self._left < 1:
             self._more += 1

@@ -31,7 +31,7 @@ from shapepose_fg.live.cameras import CameraState, CameraWatch
 from shapepose_fg.live.clock import JUMP_S, CommonClock
 from shapepose_fg.live.filtering import Filter
 from shapepose_fg.live.newest_frame import Newest, fed_back, of_poses, people_at
-from shapepose_fg.live.refining import LiveState, Refinery, Slot
+from shapepose_fg.live.refining import LiveState, Slot, WindowQueue
 from shapepose_fg.live.saving import read_state, setup_id, state_arrays, write_state
 from shapepose_fg.live.views import MOST_S, ViewsInStep, with_pose
 from shapepose_fg.pipeline.config import PipelineConfig
@@ -41,11 +41,6 @@ from shapepose_fg.proposal.thinning import thinned
 
 AHEAD_S = 1.0
 """Longest prediction after the newest frame, s."""
-_ROUNDS = 1
-"""Maximum rounds of reassociation in a window: the filter has assigned detections already, and two
-rounds take a seventh to a fifth more time for the same figures (Shelf, crossing)."""
-_KEPT_S = 10.0
-"""Time for which settled rows are kept if they are not collected, s."""
 _SETTLES = 2 / 3
 """Share of the lag that a window settles at least, where the lag has several frames."""
 _BEFORE = 7.0
@@ -55,20 +50,16 @@ of split `tune`)."""
 _BEHIND = 3.0
 """Age of a frame, in lags, at which it is settled without refinement, because solving does not keep
 up."""
-_MOST_SAID = 1000
 _OFF_CLOCK = 10
 """Number of consecutive views with a wrong time after which the camera is reported, and frames from
 `push` are accepted."""
 _STANDS = 30
 """Excess of views without a pose over views with one, after which a camera is taken to stand where
 the rig has it."""
-_BACK_S = 1.0
-"""Additional time for which poses of moving cameras are kept, beyond the longest wait of a frame,
-s."""
 
 
 @dataclass(frozen=True)
-class Said:
+class CameraChange:
     """A change of a camera's status during the run."""
 
     time_s: float
@@ -134,7 +125,10 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
             raise ValueError(
                 "live reconstruction tracks people over time; leave config.temporal at true"
             )
-        rounds = min(config.windows.again_over_time, _ROUNDS)
+        # Maximum rounds of reassociation in a window: the filter has assigned
+        # detections already, and two rounds take a seventh to a fifth more time for the
+        # same figures (Shelf, crossing).
+        rounds = min(config.windows.again_over_time, 1)
         config = replace(config, windows=replace(config.windows, again_over_time=rounds))
         source, noise = config.offsets.source, NoiseLaw.shipped()
         if source not in ("none", "recording"):
@@ -155,7 +149,7 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
         self._open = ExitStack()
         pool = self._open.enter_context(worker_processes(workers, setup))
         self._most_waiting = 1 if workers == 1 else 2 * workers
-        self._refinery = Refinery(pool, self._filter)
+        self._windows = WindowQueue(pool, self._filter)
         start = (
             CameraWatch.of(len(rig)),
             ViewsInStep(len(rig)),
@@ -164,7 +158,7 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
         )
         self._state = LiveState(rig, *start)
         self._behind = 0
-        self._said = deque[Said](maxlen=_MOST_SAID)
+        self._changes = deque[CameraChange](maxlen=1000)
         self._now = Newest(0, self._filter.nobody, fitter)
 
     @classmethod
@@ -305,7 +299,9 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
             raise ValueError(
                 f"camera {name} is fixed, because its earlier views had no pose; leave out its pose"
             )
-        since_s = max(state.views.done_s, time_s) - (1 + _BEHIND) * self.lag_s - _BACK_S
+        # Additional time for which poses of moving cameras are kept, beyond the longest
+        # wait of a frame, s.
+        since_s = max(state.views.done_s, time_s) - (1 + _BEHIND) * self.lag_s - 1.0
         rig = with_pose(state.rig, view, time_s, pose, covariance, since_s)
         rig.at(np.full(len(rig), time_s))
         return rig
@@ -338,7 +334,7 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
                 if off > 0
                 else CameraState(int(self._state.watch.state[view]))
             )
-            self._said.append(Said(self._state.views.done_s, self.rig.names[view], code))
+            self._changes.append(CameraChange(self._state.views.done_s, self.rig.names[view], code))
 
     def _jump(self, time_s: float) -> None:
         """Continue the common clock at `time_s`."""
@@ -356,7 +352,7 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
         state = self._state
         self._refine(last=True)
         if len(state.slots) > 0:
-            last = state.slots[-1].moment
+            last = state.slots[-1].state
             state.begin = replace(
                 self._filter.nobody, next_track=last.next_track, next_identity=last.next_identity
             )
@@ -372,7 +368,7 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
         Raises ValueError for any other time.
         """
         newest = self._now
-        newest_s = newest.moment.tracks.time_s
+        newest_s = newest.state.tracks.time_s
         ahead_s = 0.0 if time_s is None or not np.isfinite(newest_s) else time_s - newest_s
         if not -1e-9 <= ahead_s <= AHEAD_S + 1e-9:
             raise ValueError(
@@ -403,7 +399,7 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
 
     def save(self, path: Path | str) -> None:
         """Write the state for `load`, after waiting for windows in progress. The same state gives
-        the same bytes. Changes of cameras' statuses (`said`) are left out.
+        the same bytes. Changes of cameras' statuses (`camera_changes`) are left out.
         """
         with self._lock:
             self._collect(wait=True)
@@ -426,9 +422,9 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
         )
         return LiveReport(*counts, cameras)
 
-    def said(self) -> list[Said]:
+    def camera_changes(self) -> list[CameraChange]:
         """Changes of cameras' statuses, oldest first; the last thousand."""
-        return list(self._said)
+        return list(self._changes)
 
     def _check_time(self, time_s: Array) -> None:
         if not (np.abs(time_s) <= MOST_S).all():
@@ -468,17 +464,19 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
         last_s = slots[-1].time_s if len(slots) > 0 else time_s
         before, stands = self._state.watch, self._state.rig.at(times)
         watch, rig = before.seen(detections, self._state.before, stands, time_s)
-        last = slots[-1].moment if len(slots) > 0 else self._state.begin
+        last = slots[-1].state if len(slots) > 0 else self._state.begin
         given = Input(self._state.frames, times, _without(detections, rig), rig)
-        moment, candidate, given = self._filter.step(last, given)
+        state, candidate, given = self._filter.step(last, given)
         self._state.frames += 1
         self._state.before = detections
-        seen = (moment.views >= 2) & moment.named[:, None]
-        shown = np.where(seen[..., None], moment.tracks.joints.position, np.nan)
+        seen = (state.views >= 2) & state.named[:, None]
+        shown = np.where(seen[..., None], state.tracks.joints.position, np.nan)
         self._state.watch = watch.compared(detections, shown, stands, time_s - last_s)
         for view in np.flatnonzero(watch.state != before.state).tolist():
-            self._said.append(Said(time_s, self.rig.names[view], CameraState(watch.state[view])))
-        slots.append(Slot(given, moment, candidate))
+            self._changes.append(
+                CameraChange(time_s, self.rig.names[view], CameraState(watch.state[view]))
+            )
+        slots.append(Slot(given, state, candidate))
         self._refine()
         self._collect()
 
@@ -495,7 +493,7 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
         rig = self._state.watch.believed(detections, self._state.rig.at(times))
         given = Input(self._state.frames, times, _without(detections, rig), rig)
         slots.insert(
-            at, Slot(given, slots[at].moment, slots[at].candidate, settled=slots[at].settled)
+            at, Slot(given, slots[at].state, slots[at].candidate, settled=slots[at].settled)
         )
         self._state.frames, self._state.late = self._state.frames + 1, self._state.late + 1
         self._again(at)
@@ -527,10 +525,10 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
         """Track again from slot `first` on."""
         for at in range(first, len(self._state.slots)):
             slot = self._state.slots[at]
-            last = self._state.slots[at - 1].moment
-            slot.moment, slot.candidate, slot.given = self._filter.step(last, slot.given)
+            last = self._state.slots[at - 1].state
+            slot.state, slot.candidate, slot.given = self._filter.step(last, slot.given)
             if slot.refined is not None:
-                slot.moment = fed_back(self._filter.tracker, slot.moment, slot.refined)
+                slot.state = fed_back(self._filter.tracker, slot.state, slot.refined)
         self._show()
 
     def _restart(self, refined: Reconstruction) -> None:
@@ -542,7 +540,7 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
         if refined.frame[0] in frames:
             at = len(slots) - len(frames) + frames.index(refined.frame[0])
             slots[at].refined = refined
-            slots[at].moment = fed_back(self._filter.tracker, slots[at].moment, refined)
+            slots[at].state = fed_back(self._filter.tracker, slots[at].state, refined)
             self._again(at + 1)
 
     def _refine(self, *, last: bool = False) -> None:
@@ -559,9 +557,9 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
         first = int(settled.argmin())
         if first < len(slots) and (last or age_s[first] >= self.lag_s):
             stop = len(slots) if last else int((age_s >= around_s).sum())
-            if last or self._refinery.waiting < self._most_waiting:
+            if last or self._windows.waiting < self._most_waiting:
                 begin = int((age_s > age_s[first] + self.lag_s / _BEFORE).sum())
-                self._refinery.send(slots[begin:], first - begin, stop - first, self._state.rig)
+                self._windows.send(slots[begin:], first - begin, stop - first, self._state.rig)
                 for slot in slots[first:stop]:
                     slot.settled = True
                 first = stop
@@ -575,13 +573,14 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
 
     def _collect(self, *, wait: bool = False) -> None:
         """Collect the windows solved meanwhile: settled rows, and bodies for the newest frame."""
-        for refined in self._refinery.came(wait=wait):
+        for refined in self._windows.came(wait=wait):
             if len(refined.rows) > 0:
                 self._state.settled.append(refined.rows)
             if len(refined.newest) > 0:
                 self._restart(refined.newest)
         settled = self._state.settled
-        while len(settled) > _KEPT_S / (_SETTLES * self.lag_s):
+        # Time for which settled rows are kept if they are not collected, s.
+        while len(settled) > 10.0 / (_SETTLES * self.lag_s):
             self._state.not_taken += len(settled.popleft())
         self._show()
 
@@ -590,14 +589,12 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
         if len(self._state.slots) > 0:
             newest, rig, setup, added = self._state.slots[-1], self._state.rig, self._setup, None
             if rig.moves or newest.given.detections.mirrored.any():
-                rows = self._filter.observations(newest.moment, newest.candidate, newest.given)
-                joints = newest.moment.tracks.joints
+                rows = self._filter.observations(newest.state, newest.candidate, newest.given)
+                joints = newest.state.tracks.joints
                 added = mirrored_spread(joints.position, rows.mirrored, setup.skeleton.joints)
                 added += of_poses(rows, joints, rig, setup.estimator) if rig.moves else 0.0
             doubted = len(newest.given.rig.doubted) > 0
-            self._now = Newest(
-                newest.given.frame, newest.moment, self._setup.fitter, doubted, added
-            )
+            self._now = Newest(newest.given.frame, newest.state, self._setup.fitter, doubted, added)
 
 
 def _without(detections: Detections, rig: Rig) -> Detections:

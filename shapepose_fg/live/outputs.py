@@ -28,12 +28,6 @@ from shapepose_fg.live.sockets import MOST_CLIENTS, accept, listen
 
 Publish = Callable[[str, Reconstruction], None]
 """Function that takes the kind of the rows, `now` or `settled`, and the rows."""
-_MOST_WAITING = 2**23
-"""Maximum backlog of a client, bytes; a slower one is disconnected."""
-_LOOK_S = 0.2
-"""Longest wait for the thread that accepts clients, when the output ends, s."""
-_LAST_S = 2.0
-"""Longest wait for all clients together, when the output ends, s."""
 
 
 @contextmanager
@@ -160,7 +154,8 @@ class _Listeners:
         self._ended.set()
         self._thread.join()
         self._listening.close()
-        until_s = time.monotonic() + _LAST_S
+        # Longest wait for all clients together, when the output ends, s.
+        until_s = time.monotonic() + 2.0
         for client, waiting in self._waiting.items():
             with client:
                 try:
@@ -189,7 +184,8 @@ class _Listeners:
             except OSError:
                 self._part(client, "a reader disconnected")
                 continue
-            if sum(map(len, waiting)) > _MOST_WAITING:
+            # Maximum backlog of a client, bytes; a slower one is disconnected.
+            if sum(map(len, waiting)) > 2**23:
                 self._part(client, "a reader is too slow; its connection is closed")
 
     def _wait_for_readers(self) -> None:
@@ -199,7 +195,9 @@ class _Listeners:
         with selectors.DefaultSelector() as ready:
             ready.register(self._listening, selectors.EVENT_READ)
             while not self._ended.is_set():
-                if ready.select(_LOOK_S) and not self._welcome():
+                # Longest wait for the thread that accepts clients, when the
+                # output ends, s.
+                if ready.select(0.2) and not self._welcome():
                     self._ended.wait(1.0)
 
     def _welcome(self) -> bool:

@@ -16,7 +16,7 @@ from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.live.cameras import CameraWatch
 from shapepose_fg.live.clock import CommonClock
-from shapepose_fg.live.filtering import ON_TRIAL, Filter, Moment
+from shapepose_fg.live.filtering import ON_TRIAL, Filter, FilterState
 from shapepose_fg.live.views import ViewsInStep
 from shapepose_fg.pipeline.runs.parts import Part
 from shapepose_fg.pipeline.setup import Setup
@@ -30,7 +30,7 @@ class Slot:
 
     given: Input
     """The input that is used; its number counts frames in order of arrival."""
-    moment: Moment
+    state: FilterState
     """The state after the frame."""
     candidate: Index
     """(A, J, V) detections of the tracks; -1 for none."""
@@ -58,7 +58,7 @@ class LiveState:
     """Views that wait for the others of their frame."""
     clock: CommonClock[tuple[Any, ...]]
     """Views that wait until other cameras confirm their time. Not saved."""
-    begin: Moment
+    begin: FilterState
     """The state before the first frame: no tracks, and the next identity. Not saved."""
     without_pose: Counter[int] = field(default_factory=Counter)
     """By view: the excess of views without a pose over those with one. Not saved."""
@@ -101,7 +101,7 @@ class _Sent:
     start: int
 
 
-class Refinery:
+class WindowQueue:
     """Submits windows, and returns their solutions in order."""
 
     def __init__(self, pool: Pool[Setup], following: Filter) -> None:
@@ -117,13 +117,13 @@ class Refinery:
         """Submit a window that settles `own` slots from `start` on, with the cameras of `rig`."""
         names = dict[int, int]()
         for slot in window:
-            ids, who = slot.moment.tracks.ids.tolist(), slot.moment.identity.tolist()
+            ids, who = slot.state.tracks.ids.tolist(), slot.state.identity.tolist()
             names |= {track: name for track, name in zip(ids, who, strict=True) if name != ON_TRIAL}
         decided, tracks = [], np.array(sorted(names), dtype=np.int64)
         for n, slot in enumerate(window):
             # Frames are numbered by time, not by arrival.
             given = replace(slot.given, frame=n)
-            rows = self._filter.observations(slot.moment, slot.candidate, given)
+            rows = self._filter.observations(slot.state, slot.candidate, given)
             rows = rows.rows(np.isin(rows.track, tracks))
             # Each window numbers its tracks from 0: graph keys have a limited range, a service may
             # run without end.

@@ -24,7 +24,7 @@ from shapepose_fg.core.storage.schema import Column, checked_columns
 from shapepose_fg.core.trajectory import Trajectory
 from shapepose_fg.live.cameras import CameraState, CameraWatch
 from shapepose_fg.live.clock import CommonClock
-from shapepose_fg.live.filtering import OF_TRACKS, ON_TRIAL, Filter, Gone, Moment
+from shapepose_fg.live.filtering import OF_TRACKS, ON_TRIAL, EndedTracks, Filter, FilterState
 from shapepose_fg.live.refining import LiveState, Slot
 from shapepose_fg.live.views import MOST_S, SHORTEST_S, ViewsInStep
 from shapepose_fg.pipeline.config import PipelineConfig
@@ -96,7 +96,7 @@ def setup_id(rig: Rig, skeleton: Skeleton, config: PipelineConfig, lag_s: float)
 
 def slot_arrays(slots: Sequence[Slot]) -> dict[str, NDArray[Any]]:
     """One or more frames and the states after them, as arrays."""
-    moments, given = [slot.moment for slot in slots], [slot.given for slot in slots]
+    states, given = [slot.state for slot in slots], [slot.given for slot in slots]
     seen = [each.detections for each in given]
     views = len(given[0].rig)
     out = np.zeros((len(slots), views), dtype=np.int64)
@@ -104,28 +104,28 @@ def slot_arrays(slots: Sequence[Slot]) -> dict[str, NDArray[Any]]:
         row[list(each.rig.doubted)], row[list(each.rig.dark)] = 2, 1
     counts = [
         (
-            slot.given.frame, slot.settled, slot.moment.next_track, slot.moment.next_identity,
-            len(slot.moment.tracks), len(slot.given.detections), len(slot.given.detections.pairs),
-            len(slot.moment.gone.identity),
+            slot.given.frame, slot.settled, slot.state.next_track, slot.state.next_identity,
+            len(slot.state.tracks), len(slot.given.detections), len(slot.given.detections.pairs),
+            len(slot.state.gone.identity),
         )
         for slot in slots
     ]  # fmt: skip
     arrays: dict[str, NDArray[Any]] = {
         "slots": np.array(counts, dtype=np.int64),
-        "times": np.array([(each.tracks.time_s, each.sought_s) for each in moments]),
+        "times": np.array([(each.tracks.time_s, each.sought_s) for each in states]),
         "time_s": np.array([each.time_s for each in given]),
         "out": out,
         "candidate": np.concatenate([slot.candidate for slot in slots]),
-        "mean": np.concatenate([each.tracks.joints.mean for each in moments]),
-        "covariance": np.concatenate([each.tracks.joints.covariance for each in moments]),
+        "mean": np.concatenate([each.tracks.joints.mean for each in states]),
+        "covariance": np.concatenate([each.tracks.joints.covariance for each in states]),
     }
     for name in ("ids", "world", "evident_s"):
-        arrays[name] = np.concatenate([getattr(each.tracks, name) for each in moments])
+        arrays[name] = np.concatenate([getattr(each.tracks, name) for each in states])
     for name in OF_TRACKS:
-        arrays[name] = np.concatenate([getattr(each, name) for each in moments])
-    for each in fields(Gone):
+        arrays[name] = np.concatenate([getattr(each, name) for each in states])
+    for each in fields(EndedTracks):
         arrays[f"gone.{each.name}"] = np.concatenate(
-            [getattr(moment.gone, each.name) for moment in moments]
+            [getattr(state.gone, each.name) for state in states]
         )
     for name in _DETECTIONS:
         arrays[f"seen.{name}"] = np.concatenate([getattr(each, name) for each in seen])
@@ -149,7 +149,7 @@ def _carried(arrays: Mapping[str, NDArray[Any]], rig: Rig) -> Rig:
     return replace(rig, cameras=tuple(cameras), trajectories=tuple(found))
 
 
-def slots_of(arrays: Mapping[str, NDArray[Any]], rig: Rig, nobody: Moment) -> list[Slot]:
+def slots_of(arrays: Mapping[str, NDArray[Any]], rig: Rig, nobody: FilterState) -> list[Slot]:
     """The frames from the arrays of `slot_arrays`. Raises ValueError if they are invalid or of
     other cameras.
     """
@@ -205,11 +205,11 @@ def slots_of(arrays: Mapping[str, NDArray[Any]], rig: Rig, nobody: Moment) -> li
             raise ValueError("identities of its people must be below the next one")
         tracks = Tracks(time_s, found["ids"][a], found["world"][a], joints, found["evident_s"][a])
         own = {name: found[name][a] for name in OF_TRACKS}
-        gone = Gone(*(found[f"gone.{each.name}"][g] for each in fields(Gone)))
-        moment = Moment(
+        gone = EndedTracks(*(found[f"gone.{each.name}"][g] for each in fields(EndedTracks)))
+        state = FilterState(
             tracks, **own, gone=gone, sought_s=sought_s, next_track=track, next_identity=identity
         )
-        slots.append(Slot(given, moment, candidate, bool(settled)))
+        slots.append(Slot(given, state, candidate, bool(settled)))
     return slots
 
 

@@ -11,10 +11,6 @@ from shapepose_fg.core.trajectory import Trajectory
 from shapepose_fg.live.cameras import SILENT_S
 from shapepose_fg.live.clock import JUMP_S
 
-_ASSUMED_S = 1 / 30
-"""Assumed time between a camera's pictures until two have come, s."""
-_FRESH = 0.05
-"""Weight of a camera's last step in the running mean of its period."""
 SHORTEST_S = 1 / 250
 """Shortest time between a camera's pictures, s; closer ones are duplicates of one picture."""
 MOST_S = 1e12
@@ -38,7 +34,8 @@ class ViewsInStep:
     """(V,) time of the last view of each camera."""
     done_s: float = -np.inf
     """Time of the last complete frame, s."""
-    period_s: float = _ASSUMED_S
+    # Assumed time between a camera's pictures until two have come, s.
+    period_s: float = 1 / 30
     """Approximate time between pictures of a camera, s."""
 
     def __post_init__(self) -> None:
@@ -61,7 +58,8 @@ class ViewsInStep:
         found = self.rest() if view in self.waiting else []
         step_s = time_s - float(self.heard_s[view])
         if np.isfinite(step_s):
-            self.period_s += _FRESH * (
+            # Weight of a camera's last step in the running mean of its period.
+            self.period_s += 0.05 * (
                 min(max(step_s, SHORTEST_S), 3 * self.period_s) - self.period_s
             )
         self.heard_s[view] = time_s

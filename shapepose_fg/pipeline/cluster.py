@@ -21,12 +21,6 @@ from shapepose_fg.pipeline.workers import Pool, Processes, naming_lost_work, pac
 
 Shared = TypeVar("Shared")
 
-RETRIES = 2
-"""Maximum number of retries of an item after it failed or its process was lost."""
-_LEAST = 2
-"""Minimum number of submitted items, so that processes do not wait for the next one."""
-_SECONDS = 10
-"""Time limit for an answer of a cluster, s."""
 _ITSELF = "shapepose-fg itself"
 
 
@@ -57,8 +51,10 @@ def cluster(
 
 def pool_of(client: Any, call: tuple[Any, ...], ahead: float) -> Pool[Any]:
     """A pool of a client's processes, with `ahead` submitted items each, and a minimum in total."""
-    executor = client.get_executor(pure=False, retries=RETRIES)
-    return Pool(executor, call, lambda: max(_LEAST, ahead * len(client.nthreads())))
+    # Maximum number of retries of an item after it failed or its process was lost.
+    executor = client.get_executor(pure=False, retries=2)
+    # Minimum number of submitted items, so that processes do not wait for the next one.
+    return Pool(executor, call, lambda: max(2, ahead * len(client.nthreads())))
 
 
 @contextmanager
@@ -166,7 +162,8 @@ def _client(address: str) -> Iterator[Any]:
     import dask.config
 
     try:
-        client = Client(address, timeout=_SECONDS)
+        # Time limit for an answer of a cluster, s.
+        client = Client(address, timeout=10)
     except (OSError, ValueError, TimeoutError) as error:
         reason = " ".join(str(error).split())
         raise InputError(

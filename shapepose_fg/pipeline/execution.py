@@ -11,9 +11,6 @@ from shapepose_fg.pipeline.workers import Pool, suitable_workers, workers
 Shared = TypeVar("Shared")
 Progress = Callable[[int, int], None]
 """Called with the number of frames that are done and the number of all frames."""
-_FRAMES_WORTH_A_WORKER = 100
-"""Minimum number of frames of a recording per worker; work is distributed in windows of
-a hundred."""
 
 
 @dataclass(frozen=True)
@@ -38,11 +35,9 @@ class Execution:
         """Return a copy with a suitable number of workers for this many frames, if none
         is given.
         """
-        count = (
-            suitable_workers(frames, _FRAMES_WORTH_A_WORKER)
-            if self.workers is None
-            else self.workers
-        )
+        # Minimum number of frames of a recording per worker; work is distributed in
+        # windows of a hundred.
+        count = suitable_workers(frames, 100) if self.workers is None else self.workers
         return replace(self, workers=count)
 
     def pool(self, shared: Shared, frames: int) -> AbstractContextManager[Pool[Shared]]:

@@ -66,7 +66,7 @@ class _Spell(BaseModel):
     frames: tuple[int, int]
 
 
-class _Said(BaseModel):
+class _SetupFinding(BaseModel):
     """An entry of run.json's `setup.findings`."""
 
     cameras: list[str]
@@ -78,7 +78,7 @@ class _Setup(BaseModel):
 
     left_out: list[_Spell] = []
     doubted: list[_Spell] = []
-    findings: list[_Said] = []
+    findings: list[_SetupFinding] = []
 
 
 class _People(BaseModel):

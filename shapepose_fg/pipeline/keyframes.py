@@ -17,7 +17,6 @@ from shapepose_fg.core.observation_table import Gate
 from shapepose_fg.core.reconstruction import BODY, Known, Reconstruction, Status
 from shapepose_fg.estimation.motion_model import MotionModel
 
-_ROUNDING_S = 1e-6
 STRAY_M = 0.03
 """Deviation of a joint from the cubic between keyframes, m, above which a frame between becomes a
 keyframe."""
@@ -28,7 +27,7 @@ def spaced(time_s: Array, apart_s: float) -> Mask:
     `apart_s`.
     """
     chosen, at, last = np.zeros(len(time_s), dtype=bool), 0, len(time_s) - 1
-    reached = np.searchsorted(time_s, time_s + apart_s + _ROUNDING_S, side="right") - 1
+    reached = np.searchsorted(time_s, time_s + apart_s + 1e-6, side="right") - 1
     while at < last:
         chosen[at] = True
         at = max(int(reached[at]), at + 1)

@@ -1,7 +1,7 @@
 """Learns a detector's joint offsets and noise law from frames spread over a recording."""
 
 from collections.abc import Iterator
-from dataclasses import fields, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
@@ -31,8 +31,40 @@ _OFFSETS, _NOISE = "keypoint-offsets", "noise-law"
 NOISE_FRAMES = 60
 """Maximum number of frames for learning the noise law. Shorter recordings use the shipped law."""
 _ENOUGH = 10_000
-"""Number of detections that are enough for the noise law; a crowd has them in about 12 frames."""
-_GOLDEN = (5**0.5 - 1) / 2
+"""Number of detections that are enough for either; a crowd has them in about 12 frames."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """People in frames spread over a recording, found when they are first needed."""
+
+    setup: Setup
+    """The set-up of the run."""
+    detections: ThinnedFrames
+    """The recording."""
+    times: FrameTimes
+    """Times of its frames."""
+    _found: list[tuple[Detections, Observations]] = field(default_factory=list, init=False)
+
+    def people(self, most: int) -> Iterator[tuple[Detections, Observations]]:
+        """Detections and people of up to `most` frames."""
+        setup, first = self.setup, self.detections.first
+        config, rig, time_s = setup.config, setup.rig, self.times.of_views(len(setup.rig))
+        stage = StageOne(setup.skeleton, config.candidates, config.proposals, Notebook())
+        spread = max(NOISE_FRAMES, config.offsets.frames)
+        frames = first + np.array(spread_frames(len(self), spread), dtype=np.intp)
+        # In golden-ratio order, frames are spread over the whole recording even if it ends early.
+        order = np.argsort(np.arange(len(frames)) * ((5**0.5 - 1) / 2) % 1.0, kind="stable")
+        for n, frame in enumerate(frames[order[:most]].tolist()):
+            if n == len(self._found):
+                found = self.detections[frame]
+                people = stage(found, rig.at(time_s[frame]))
+                time = np.tile(time_s[frame], (len(people), 1))
+                self._found.append((found, replace(people, time_s=time)))
+            yield self._found[n]
+
+    def __len__(self) -> int:
+        return len(self.detections) - self.detections.first
 
 
 def estimate_offsets(
@@ -55,7 +87,8 @@ def estimate_offsets(
     config = replace(config, offsets=replace(config.offsets, source="recording"))
     thinned = ThinnedFrames(WithoutRepeats(detections, len(rig)), rig, config.candidates)
     times = FrameTimes.assumed(len(detections)) if times is None else times
-    offsets = offsets_of(Setup(rig, thinned.skeleton, config, fitter), thinned, times, Notebook())
+    setup = Setup(rig, thinned.skeleton, config, fitter)
+    offsets = offsets_of(Sample(setup, thinned, times), Notebook())
     if offsets is None:
         raise ValueError(
             f"offsets are known for {BODY_25.name} only, not for {detections.skeleton.name}"
@@ -63,57 +96,45 @@ def estimate_offsets(
     return offsets
 
 
-def kept_offsets(
-    kept: KeptArrays, setup: Setup, frames: ThinnedFrames, times: FrameTimes, book: Notebook
-) -> KeypointOffsets | None:
+def kept_offsets(kept: KeptArrays, sample: Sample, book: Notebook) -> KeypointOffsets | None:
     """The offsets stored when the run began; `offsets_of` if there are none yet."""
     columns = [each.name for each in fields(KeypointOffsets)]
     if len(kept.names(_OFFSETS)) > 0:
         with naming(kept.place(_OFFSETS), ANEW):
             return KeypointOffsets(**{name: kept.array(_OFFSETS, name) for name in columns})
-    offsets = offsets_of(setup, frames, times, book)
+    offsets = offsets_of(sample, book)
     if offsets is not None:
         kept.keep(_OFFSETS, {name: getattr(offsets, name) for name in columns})
     return offsets
 
 
-def kept_noise(
-    kept: KeptArrays, setup: Setup, frames: ThinnedFrames, times: FrameTimes, book: Notebook
-) -> NoiseLaw:
+def kept_noise(kept: KeptArrays, sample: Sample, book: Notebook) -> NoiseLaw:
     """The noise law stored when the run began; `noise_of` if there is none yet."""
     if len(kept.names(_NOISE)) > 0:
         with naming(kept.place(_NOISE), ANEW):
             return NoiseLaw.from_dict(
                 {name: kept.array(_NOISE, name).tolist() for name in NoiseLaw.COLUMNS}
             )
-    noise = noise_of(setup, frames, times, book)
+    noise = noise_of(sample, book)
     if noise != NoiseLaw.shipped():
         kept.keep(_NOISE, {name: np.array(getattr(noise, name)) for name in NoiseLaw.COLUMNS})
     return noise
 
 
-def noise_of(
-    setup: Setup, detections: ThinnedFrames, times: FrameTimes, book: Notebook
-) -> NoiseLaw:
+def noise_of(sample: Sample, book: Notebook) -> NoiseLaw:
     """The detector's noise law, from the same source as the offsets.
 
     A recording of fewer than `NOISE_FRAMES` frames uses the shipped law.
     """
+    setup = sample.setup
     source = setup.config.offsets.source
     if source not in ("none", "recording"):
         return NoiseLaw.load(source)
-    count = len(detections) - detections.first
-    if source == "none" or count < NOISE_FRAMES:
+    if source == "none" or len(sample) < NOISE_FRAMES:
         return NoiseLaw.shipped()
-    chosen, every = list[Observations](), list[Observations]()
+    chosen, every, learnt = list[Observations](), list[Observations](), 0
     with book.stage("noise"):
-        stage = StageOne(
-            setup.skeleton, setup.config.candidates, setup.config.proposals, Notebook()
-        )
-        frames, learnt = detections.first + np.array(spread_frames(count, NOISE_FRAMES)), 0
-        # In golden-ratio order, frames are spread over the whole recording even if it ends early.
-        order = np.argsort(np.arange(len(frames)) * _GOLDEN % 1.0, kind="stable")
-        for found, people in _people(stage, setup.rig, detections, frames[order].tolist(), times):
+        for found, people in sample.people(NOISE_FRAMES):
             whole = Observations.of(whole_people(people.candidate, found), found, people.initial)
             chosen.append(people)
             every.append(whole)
@@ -125,14 +146,12 @@ def noise_of(
         return Residuals.of(rows, whole, views, config, setup.skeleton.joints).law()
 
 
-def offsets_of(
-    setup: Setup, detections: ThinnedFrames, times: FrameTimes, book: Notebook
-) -> KeypointOffsets | None:
+def offsets_of(sample: Sample, book: Notebook) -> KeypointOffsets | None:
     """Offsets of the detector's joints; None without a source. Raises ValueError for an unsuitable
     file.
     """
-    config, rig, fitter = setup.config, setup.rig, setup.fitter
-    source = config.offsets.source
+    setup = sample.setup
+    config, fitter, source = setup.config, setup.fitter, setup.config.offsets.source
     if source == "none":
         return None
     if fitter.model is None or setup.skeleton != BODY_25:
@@ -142,24 +161,14 @@ def offsets_of(
     if source != "recording":
         return KeypointOffsets.load(source)
     with book.stage("offsets"):
-        spread = spread_frames(len(detections) - detections.first, config.offsets.frames)
-        # Joints that three views see well are wanted: people whose hips they see are enough, and
-        # found faster.
-        hips = StageOne(setup.skeleton, config.candidates, config.proposals, Notebook()).of_few()
-        frames = [detections.first + t for t in spread]
-        people = [each for _, each in _people(hips, rig, detections, frames, times)]
+        people, learnt = list[Observations](), 0
+        for _, each in sample.people(config.offsets.frames):
+            people.append(each)
+            learnt += int(each.seen.sum())
+            if learnt >= _ENOUGH:
+                break
         if len(people) == 0:
             return KeypointOffsets.identity()
-        targets = confident_targets(Observations.concatenate(people), rig, config.observations)
+        rows = Observations.concatenate(people)
+        targets = confident_targets(rows, setup.rig, config.observations)
         return learn_offsets(targets, fitter.model, config=config.body)
-
-
-def _people(
-    stage: StageOne, rig: Rig, detections: ThinnedFrames, frames: list[int], times: FrameTimes
-) -> Iterator[tuple[Detections, Observations]]:
-    """The detections of each of the `frames`, and the people that the `stage` finds in them."""
-    time_s = times.of_views(len(rig))
-    for frame in frames:
-        found = detections[frame]
-        people = stage(found, rig.at(time_s[frame]))
-        yield found, replace(people, time_s=np.tile(time_s[frame], (len(people), 1)))

@@ -31,8 +31,8 @@ from shapepose_fg.pipeline.bodies_over_time import Person, fit_everybody
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.execution import Execution
 from shapepose_fg.pipeline.keyframes import keyframes
+from shapepose_fg.pipeline.offsets import Sample, kept_noise, kept_offsets
 from shapepose_fg.pipeline.offsets import estimate_offsets as estimate_offsets
-from shapepose_fg.pipeline.offsets import kept_noise, kept_offsets
 from shapepose_fg.pipeline.runs.assembly import Assembly
 from shapepose_fg.pipeline.runs.parts import Parts
 from shapepose_fg.pipeline.setup import Setup
@@ -190,10 +190,11 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
     setup = _with_refined(
         kept, task, Setup(rig, skeleton, config, fitter, task.extra_factors), book
     )
-    offsets = kept_offsets(kept, setup, detections, times, book)
+    sample = Sample(setup, detections, times)
+    offsets = kept_offsets(kept, sample, book)
     if offsets is not None:
         setup = replace(setup, fitter=fitter.with_keypoint_offsets(offsets))
-    setup = replace(setup, noise=kept_noise(kept, setup, detections, times, book))
+    setup = replace(setup, noise=kept_noise(kept, sample, book))
     parts = Parts(kept)
     parts.check(skeleton.joints, rig.names, frames, times.frame_s)
     done = parts.notes().frames

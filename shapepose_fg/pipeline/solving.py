@@ -32,9 +32,6 @@ from shapepose_fg.pipeline.keyframes import looked_at, with_rows_like
 from shapepose_fg.pipeline.solve_window import solve_window
 from shapepose_fg.pipeline.windows import near_border, window_stop
 
-_OUTSIDE_PX = 1e6
-"""Coordinate of a detection that the result did not use, outside of all gates, px."""
-
 
 @dataclass(frozen=True)
 class Solver:
@@ -184,7 +181,9 @@ def _solved(
         observations = part.observations.observations(start, part.time_s)
         if again and extra_factors is None:
             used = part.observations.used[..., None] | ~observations.seen[..., None]
-            observations = replace(observations, xy=np.where(used, observations.xy, _OUTSIDE_PX))
+            # Coordinate of a detection that the result did not use, outside of all
+            # gates, px.
+            observations = replace(observations, xy=np.where(used, observations.xy, 1e6))
         views = Views.of(rig, observations.time_s)
         found = solve_window(
             observations, views, solver.fitter, settings, extra_factors=extra_factors

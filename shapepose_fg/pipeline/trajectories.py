@@ -30,8 +30,6 @@ from shapepose_fg.estimation.trajectory_graph import (
 from shapepose_fg.pipeline.solved_windows import SolvedWindows
 from shapepose_fg.pipeline.windows import Span
 
-_SAME_S = 1e-4
-"""Time within which a pose of the odometry coincides with a frame, s, and is dropped."""
 _KEPT = "trajectories"
 """Prefix of the names under which a run stores trajectories, followed by their number."""
 
@@ -249,7 +247,8 @@ def _refined(
     own = given.time_s[max(first - 1, 0) : last + 1]
     # Odometry poses that coincide with a frame are replaced by the frame's.
     place = np.clip(np.searchsorted(middle, own), 1, len(middle) - 1)
-    near = np.minimum(np.abs(middle[place] - own), np.abs(middle[place - 1] - own)) < _SAME_S
+    # Time within which a pose of the odometry coincides with a frame, s, and is dropped.
+    near = np.minimum(np.abs(middle[place] - own), np.abs(middle[place - 1] - own)) < 1e-4
     times = np.sort(np.concatenate([own[~near], middle]))
     correction = Trajectory(given.name, middle, poses @ np.linalg.inv(odometry))
     surely = Trajectory(given.name, middle, poses, covariance).covariance_at(times)

@@ -18,9 +18,6 @@ from shapepose_fg.core.compiled import kernel, part
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.kernel_geometry import project, solved
 
-_ANYWHERE_M = 10.0
-"""Gate that any pair of rays in a room passes, m."""
-
 
 @dataclass(frozen=True)
 class CandidateConfig(Settings):
@@ -66,8 +63,9 @@ class CandidateConfig(Settings):
 
         The paper does not give rho: 6 cm is the best of 5 to 12 on `tune`.
         """
+        # Gate that any pair of rays in a room passes, m.
         return cls(
-            gate_m=_ANYWHERE_M,
+            gate_m=10.0,
             min_angle_deg=1e-3,
             vote_radius_m=0.06,
             min_view_fraction=1e-3,

@@ -53,7 +53,8 @@ def group_people(found: Detections) -> list[Index]:
     has = np.zeros((count, joint.max(initial=-1) + 1), dtype=bool)
     chains = np.arange(count), np.full(count, -1), np.arange(count)
     groups = _group(pairs[np.argsort(-affinity, kind="stable")], joint, *chains, has, order, stop)
-    return np.split(order, stop[: groups - 1]) if count > 0 else []
+    ends = stop[:groups].tolist()
+    return [order[first:end] for first, end in zip([0, *ends], ends, strict=False)]
 
 
 def whole_people(chosen: Index, found: Detections) -> Index:

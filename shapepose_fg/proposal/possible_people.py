@@ -20,8 +20,9 @@ _FAR_M = 0.15
 """Maximum distance of a joint from the ray of its detection, m."""
 _SURE_AFFINITY = 0.5
 """Minimum mean affinity of a detection for a joint without a position."""
-_KERNEL_M = 0.03
-"""Scale of the Cauchy kernel for triangulation, m: the measured error of a detector."""
+DETECTOR_M = 0.03
+"""Measured error of a detector, m: the scale of the Cauchy kernel for triangulation, of the
+distances of rays from joints, and of the errors of bone lengths."""
 _ROUNDS = 2
 """Number of reweighted triangulations of a joint."""
 _STRETCH = (1.0, 0.9, 0.8)
@@ -43,7 +44,7 @@ class Frame:
 
     @cached_property
     def sight(self) -> Sight:
-        """The frame in the form that kernels take."""
+        """Detections and cameras of the frame as the arrays that compiled kernels take."""
         return Sight.of(self.detections, self.rig, self.skeleton)
 
     @cached_property
@@ -177,7 +178,7 @@ def _triangulate(chosen, rays, confidence, centres, weight, places, gap_m):
                     d = chosen[h, j, v]
                     if d >= 0:
                         gap_m[h, j, v] = _gap(rays[d], centres[v], places[h, j])
-                        off = (gap_m[h, j, v] if gap_m[h, j, v] < np.inf else 1.0) / _KERNEL_M
+                        off = (gap_m[h, j, v] if gap_m[h, j, v] < np.inf else 1.0) / DETECTOR_M
                         weight[v] = confidence[d] / (1 + off * off)
 
 

@@ -11,12 +11,8 @@ from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.proposal.candidates import PairPoints
 from shapepose_fg.proposal.nearby import LEAST_AFFINITY, own_affinity
 from shapepose_fg.proposal.pairs_of_people import pooled
-from shapepose_fg.proposal.possible_people import Frame, PossiblePeople, settled
+from shapepose_fg.proposal.possible_people import DETECTOR_M, Frame, PossiblePeople, settled
 
-_ROUNDS = 8
-"""Maximum number of searches, each among what the people found so far leave unexplained."""
-_PASSES = 2
-"""Number of reassignments of detections around the joints of selected people."""
 _SHARED = 0.2
 """Maximum share of its joints that a missing part may have in common with the person it
 completes."""
@@ -27,9 +23,6 @@ _PRIOR = -1.75
 """Log-odds of a hypothesis without evidence; the same fit (-1.2 in the operating room)."""
 PRIOR_WITH_BODY = -0.3
 """Log-odds of a hypothesis without evidence, after a body fit and reassociation of detections."""
-_GAP_M = 0.03
-"""A detection is weighted by a Gaussian of the distance from its ray to the joint. This is the
-standard deviation of the Gaussian, m."""
 _SINGLE = 0.1
 """Weight of a detection of a joint that no other view sees, since its depth is unknown."""
 _BESIDE = 0.5
@@ -51,8 +44,6 @@ _SPREAD, _PHANTOMS_SPREAD = 0.08, 0.35
 """Standard deviation of its logarithm, for people and for false positives."""
 _PHANTOMS_SHIFT = 0.08
 """Mean excess of the logarithm for false positives."""
-_PLACED_M = 0.03
-"""Standard deviation of a bone's length from the errors of its two joints, m."""
 _ASTRAY = 0.1
 """Share of people's bones distributed like those of false positives, because a joint is wrong. All
 these are from 5779 hypotheses of simulated crowds before two to six cameras."""
@@ -82,7 +73,7 @@ class Evidence:
         has, worth = chosen >= 0, np.zeros(chosen.shape)
         whose, which = np.ascontiguousarray(np.nonzero(has)[0]), chosen[has]
         affinity, neighbours = own_affinity(whose, which, chosen, frame.sight)
-        near = np.exp(-0.5 * (np.nan_to_num(people.gap_m[has], posinf=1.0) / _GAP_M) ** 2)
+        near = np.exp(-0.5 * (np.nan_to_num(people.gap_m[has], posinf=1.0) / DETECTOR_M) ** 2)
         worth[has] = (
             detections.confidence[which] * np.where(neighbours > 0, affinity, LEAST_AFFINITY) * near
         )
@@ -118,7 +109,7 @@ def _bones(people: PossiblePeople, frame: Frame) -> Array:
     core = [joint for joint in frame.skeleton.core if joint != root]
     known = (twice & twice[:, parents])[:, core]
     off = np.log(np.maximum(share[:, core], 1e-3) / _USUAL)
-    sigma = np.hypot(_SPREAD, _PLACED_M / (_USUAL * frame.longest_m[core]))
+    sigma = np.hypot(_SPREAD, DETECTOR_M / (_USUAL * frame.longest_m[core]))
     mine = np.exp(-0.5 * (off / sigma) ** 2) / sigma
     phantoms = np.exp(-0.5 * ((off - _PHANTOMS_SHIFT) / _PHANTOMS_SPREAD) ** 2) / _PHANTOMS_SPREAD
     # Far from both distributions `mine` vanishes, and `_ASTRAY` bounds the ratio.
@@ -138,7 +129,8 @@ def choose(points: PairPoints, frame: Frame, least: float) -> tuple[PossiblePeop
     probabilities (P,).
     """
     people, sure = PossiblePeople.none(frame), np.zeros(0)
-    for _ in range(_ROUNDS):
+    # Maximum number of searches, each among what the people found so far leave unexplained.
+    for _ in range(8):
         taken = np.zeros(len(frame.detections), dtype=bool)
         taken[people.chosen[people.chosen >= 0]] = True
         pool = pooled(points, ~taken, frame)
@@ -182,7 +174,8 @@ def _given_out(people: PossiblePeople, frame: Frame, least: float) -> tuple[Poss
     probable first.
     """
     while True:
-        people = settled(people.places, people.chosen, frame, _PASSES, exclusive=True)
+        # Number of reassignments of detections around the joints of selected people.
+        people = settled(people.places, people.chosen, frame, 2, exclusive=True)
         sure = existence(people, frame)
         if len(people) == 0 or sure.min() >= least:
             return people, sure

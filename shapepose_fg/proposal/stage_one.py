@@ -35,23 +35,14 @@ class StageOne:
     book: Notebook
     """Collects notes and timings."""
 
-    def by_hips(self) -> "StageOne":
-        """Return a variant that grows people from their hips, as in the paper, without scores by
-        evidence.
-        """
-        return replace(self, proposals=replace(self.proposals, evidence=False))
-
-    def of_few(self) -> "StageOne":
-        """Return `by_hips` for a search for few people: fewer points and candidates are kept."""
-        few = replace(
-            self.candidates, most_points=_POINTS_OF_FEW, most_candidates=_CANDIDATES_OF_FEW
-        )
-        return replace(self.by_hips(), candidates=few)
-
     def of_the_rest(self) -> "StageOne":
-        """Return `of_few` for what evidence leaves unexplained: hips seen by two views."""
-        few = self.of_few()
-        return replace(few, candidates=replace(few.candidates, min_votes=1))
+        """Return a variant for what evidence leaves unexplained: it grows people from hips that two
+        views saw, as in the paper, and expects few, so that fewer points and candidates are kept.
+        """
+        few = {"most_points": _POINTS_OF_FEW, "most_candidates": _CANDIDATES_OF_FEW}
+        candidates = replace(self.candidates, min_votes=1, **few)
+        proposals = replace(self.proposals, evidence=False)
+        return replace(self, candidates=candidates, proposals=proposals)
 
     def __call__(self, detections: Detections, rig: Rig) -> Observations:
         """Find the people of a frame."""

@@ -25,7 +25,7 @@ from shapepose_fg.setup_check.fit import difference
 from shapepose_fg.setup_check.hypotheses import GOOD_PAIR, Lag, lag_of, lags, mistake_of_cameras
 from shapepose_fg.setup_check.joint_order import order_of_joints
 from shapepose_fg.setup_check.matching import same_frame
-from shapepose_fg.setup_check.over_time import parted
+from shapepose_fg.setup_check.over_time import in_pieces, parted, restlessness
 from shapepose_fg.setup_check.small_errors import Problem
 
 _SAME_PX = 0.6
@@ -166,6 +166,14 @@ def build_of(points: Array, skeleton: Skeleton) -> Build:
     return Build(stature, up, int(enough.sum()))
 
 
+_FEW_FRAMES, _FEW_SIGHTINGS = 16, 300
+"""Frames, and sightings of people in them, that are enough if nothing in them is odd."""
+_FITTING, _STEADY, _UNLIKELY, _NEARLY = 0.5, 0.3, 0.1, 0.5
+"""Signs of a mistake in them: a camera's score below the first, a difference of its scores between
+pieces of the recording above the second, a probability of small mistakes above the third, or an
+offset in time with more than this share of what makes it significant."""
+_SHORT = 5
+"""Frames in such a piece."""
 _MOST_FINDINGS, _MOST_BIASED = 4, 3
 """Maximum number of findings, and of biased people, that are distinguished."""
 _UNFIT = 0.15
@@ -208,11 +216,8 @@ class Diagnosis:
     """Cameras that a reconstruction should exclude or doubt."""
 
 
-def put_right(
-    detections: DetectionSequence, rig: Rig, frames: range
-) -> tuple[Look, Look, list[Finding]]:
+def put_right(evidence: Evidence, rig: Rig) -> tuple[Look, Look, list[Finding]]:
     """The set-up as given, with gross mistakes of cameras corrected, and these mistakes."""
-    evidence = gather(detections, frames, len(rig))
     given = Look.given(evidence, rig)
     findings, evidence = _twice(given, rig)
     findings += _blind(given) + _stopped(given)
@@ -231,9 +236,51 @@ def put_right(
 
 
 def diagnose(detections: DetectionSequence, rig: Rig, frames: range | None = None) -> Diagnosis:
-    """Diagnose cameras and detections of a recording in `frames`, by default all."""
+    """Diagnose cameras and detections of a recording in `frames`, by default all.
+
+    A few frames are enough if nothing in them is odd.
+    """
     frames = range(len(detections)) if frames is None else frames
-    given, look, findings = put_right(detections, rig, frames)
+    evidence = gather(detections, frames, len(rig))
+    look = Look.given(evidence, rig)
+    often = len(look.sightings) / max(len(evidence.anchors), 1)
+    few = max(_FEW_FRAMES, round(_FEW_SIGHTINGS / max(often, 1.0)))
+    sound = _sound(replace(look, evidence=evidence.thinned(few)), detections, rig)
+    return _all_mistakes(evidence, detections, rig, frames) if sound is None else sound
+
+
+def _sound(look: Look, detections: DetectionSequence, rig: Rig) -> Diagnosis | None:
+    """The diagnosis of cameras and detections without any sign of a mistake; None if there is one,
+    or if too little is seen.
+    """
+    if (
+        len(look.sightings) < MIN_SIGHTINGS
+        or len(look.groups()) < MIN_SIGHTINGS
+        or min(look.scores) < (_FITTING if look.cameras_used > 2 else GOOD_PAIR)
+        or [*duplicates(rig, look.evidence), *_blind(look), *_stopped(look), *_unfit(look, set())]
+        or any(restlessness(in_pieces(look, v, _SHORT)[2]) > _STEADY for v in range(len(rig)))
+    ):
+        return None
+    problem = Problem.of(look)
+    refined = replace(look, views=problem.relaxed())
+    remaining, build = lags(refined), build_of(refined.structure()[1].points, detections.skeleton)
+    unlikely = sum(each.finding.sure for each in problem.causes if each.finding is not None)
+    odd = unlikely > _UNLIKELY or any(lag.exceeds(_NEARLY) for lag in remaining)
+    if (
+        odd
+        or build.count < MIN_SIGHTINGS
+        or _of_people(build, rig)
+        or order_of_joints(detections, refined)
+    ):
+        return None
+    return Diagnosis((), look, look, tuple(remaining), build)
+
+
+def _all_mistakes(
+    evidence: Evidence, detections: DetectionSequence, rig: Rig, frames: range
+) -> Diagnosis:
+    """The mistakes in all frames used, one after the other."""
+    given, look, findings = put_right(evidence, rig)
     if len(rig) < 2 or len(look.sightings) < MIN_SIGHTINGS:
         return Diagnosis(tuple(findings), given, look)
     if len(look.groups()) < MIN_SIGHTINGS // 2:

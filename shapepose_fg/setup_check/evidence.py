@@ -55,13 +55,13 @@ class Evidence:
     anchors: Index
     """(F,) frames used."""
     sightings: Sightings
-    """Sightings in these frames and their neighbours."""
+    """Sightings in the checked frames and their neighbours."""
     most_lag: int
     """Maximum time offset that can be detected, frames."""
     other_side: Index
     """(J,) core joint on the other side of the body; the joint itself if central."""
     stopped: Array
-    """(V,) share of these frames in which each camera repeats its previous picture."""
+    """(V,) share of the checked frames in which each camera repeats its previous picture."""
 
     def thinned(self, frames: int) -> "Evidence":
         """Return the evidence with about `frames` of the frames used."""

@@ -71,12 +71,17 @@ class Lag:
     """Agreement of people seen near enough both with and without the offset; when people occlude
     each other, others are near by chance at some offset."""
 
+    def exceeds(self, share: float) -> bool:
+        """Whether the offset exceeds a `share` of what makes it significant."""
+        plain = self.agreement > share * _AGREEMENT and self.gain > share * _LEAST_GAIN
+        small = abs(self.frames) <= _SMALL and self.likely > share * _LIKELY_LAG
+        there = self.followed > share * _FOLLOWED
+        return there and (plain or (self.agreement > 0 and small))
+
     @property
     def is_offset(self) -> bool:
         """Whether the offset is significant."""
-        plain = self.agreement > _AGREEMENT and self.gain > _LEAST_GAIN
-        small = abs(self.frames) <= _SMALL and self.likely > _LIKELY_LAG
-        return self.followed > _FOLLOWED and (plain or (self.agreement > 0 and small))
+        return self.exceeds(1.0)
 
 
 NONE = Lag(0, 0.0, 0.0, 0.0, 0.0)
@@ -127,7 +132,7 @@ class _Nearest:
     """Nearest sighting of each person at one offset."""
 
     there: Mask
-    """(P,) whether the camera has sightings in that frame."""
+    """(P,) whether the camera has sightings in the frame of each person."""
     sighting: Index
     """(P,) row of the sighting; -1 if none is within the gate."""
     error: Array

@@ -21,7 +21,7 @@ from shapepose_fg.setup_check.matching import GATE, Pinhole, Sightings
 
 _PIECES = 12
 _LEAST_PEOPLE = 6
-"""Minimum number of the others' people for a piece to be used."""
+"""Minimum number of the others' people for a piece to be used, and on either side of a step."""
 _RESTLESS = 0.1
 """Difference of a camera's score between pieces above which it is examined: 3 cm on people."""
 _THERE, _GOOD = 0.2, 0.45
@@ -55,21 +55,11 @@ def stories(look: Look, view: int, rng: np.random.Generator) -> Iterator[tuple[F
 
     Each comes with the corrected look, and the number of parameters.
     """
+    pieces, spans, score = in_pieces(look, view)
+    if restlessness(score) < _RESTLESS:
+        return
     others, seen, camera = look.others(view), look.seen_by(view), look.camera(view)
-    both = np.intersect1d(others.frame, seen.frame)
-    if min(len(others), len(seen)) < 4 * _LEAST_PEOPLE or len(both) == 0:
-        return
-    count = min(_PIECES, max(1, len(both) // _LEAST_PEOPLE))
-    ends = np.unique(np.quantile(both, np.linspace(0, 1, count + 1)).astype(np.intp))
-    ends[-1] += 1
-    spans = list(pairwise(ends.tolist()))
-    pieces = [_during(others, seen, *span) for span in spans]
-    matched = [match(*piece, camera) for piece in pieces]
-    enough = [n for n, each in enumerate(matched) if each.possible >= _LEAST_PEOPLE]
-    score = np.array([matched[n].score for n in enough])
-    if len(enough) < 3 or score.max() < _THERE or np.ptp(score) < _RESTLESS:
-        return
-    turns, scores = _turns([pieces[n] for n in enough], camera, int(score.argmax()), rng)
+    turns, scores = _turns(pieces, camera, int(score.argmax()), rng)
     usable = scores > _THERE
     if usable.sum() < 3:
         return
@@ -78,7 +68,8 @@ def stories(look: Look, view: int, rng: np.random.Generator) -> Iterator[tuple[F
     for columns in (TURN, POSE):
         lasting = match(others, seen, fit.refined(others, seen, camera, columns)).score
         before = max(before, likelihood(lasting, worth, len(columns)))
-    middle = np.array([(sum(spans[n]) - 1) / 2 for n in enough])[usable]
+    middle = (spans.sum(axis=1)[usable] - 1) / 2
+    both = np.intersect1d(others.frame, seen.frame)
     found = (
         _bumped(others, seen, camera, turns[usable]),
         _drifted(middle, turns[usable], both[0], both[-1]),
@@ -88,6 +79,35 @@ def stories(look: Look, view: int, rng: np.random.Generator) -> Iterator[tuple[F
         gain = likelihood(after, worth, freedom) - before
         if gain > _SURE and finding.amount > _LEAST_DEG:
             yield replace(finding, cameras=(view,)), _as_if_still(look, view, way), freedom
+
+
+def restlessness(score: Array) -> float:
+    """Difference of a camera's `score` (n,) between pieces of the recording; 0 if they are too few,
+    or if the camera fits in none.
+    """
+    return float(np.ptp(score)) if len(score) >= 3 and score.max() >= _THERE else 0.0
+
+
+def in_pieces(
+    look: Look, view: int, frames: int = _LEAST_PEOPLE
+) -> tuple[list[tuple[Others, Sightings]], Array, Array]:
+    """The n pieces, of at least so many `frames`, in which a camera sees enough of the others'
+    people: people and sightings, first frame and that after the last (n, 2), and the camera's score
+    (n,).
+    """
+    others, seen = look.others(view), look.seen_by(view)
+    both = np.intersect1d(others.frame, seen.frame)
+    if min(len(others), len(seen)) < 4 * _LEAST_PEOPLE or len(both) == 0:
+        return [], np.zeros((0, 2)), np.zeros(0)
+    count = min(_PIECES, max(1, len(both) // frames))
+    ends = np.unique(np.quantile(both, np.linspace(0, 1, count + 1)).astype(np.intp))
+    ends[-1] += 1
+    spans = np.array(list(pairwise(ends.tolist())))
+    pieces = [_during(others, seen, *span) for span in spans]
+    matched = [match(*piece, look.camera(view)) for piece in pieces]
+    enough = [n for n, each in enumerate(matched) if each.possible >= _LEAST_PEOPLE]
+    score = np.array([matched[n].score for n in enough])
+    return [pieces[n] for n in enough], spans[enough], score
 
 
 def _as_if_still(look: Look, view: int, way: Way) -> Look:
@@ -153,6 +173,9 @@ def _bumped(
         before = _settled(*_during(others, seen, -1, at), camera, before)
         after = _settled(*_during(others, seen, at, np.inf), camera, after)
     amount = fit.difference(_turned(camera, after).cTw, _turned(camera, before).cTw)[0]
+    parts = (_during(others, seen, *span) for span in ((-1, at), (at, np.inf)))
+    if min(match(*part, camera).possible for part in parts) < _LEAST_PEOPLE:
+        amount = 0.0  # what a few frames show may be lasting errors of the detector
     frames = (None, at) if np.linalg.norm(before) > np.linalg.norm(after) else (at, None)
     finding = Finding(Kind.BUMPED, (), amount, frames=frames)
     return (

@@ -3,6 +3,7 @@
 `check_setup` needs cameras and detections; `result_check` adds results of a reconstruction.
 """
 
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import combinations
@@ -33,7 +34,7 @@ class CameraFigures:
     people: int
     """Number of people seen in the frames used."""
     matched: float
-    """Share of these people that another camera sees too."""
+    """Share of the camera's people whom another camera sees, too."""
     median_px: float | None
     """Median reprojection error of all matched joints, pixels."""
     high_px: float | None
@@ -45,7 +46,7 @@ class CameraFigures:
     left_out_px: float | None
     """Median distance from joints triangulated by the other cameras only, pixels."""
     left_out_mm: float | None
-    """Median distance from these joints as a length, millimetres."""
+    """Median distance from where the other cameras place the joints, millimetres."""
     left_out_matched: float
     """Share of the possible matches with people of the others that the camera has."""
     late_frames: int
@@ -86,6 +87,8 @@ class SetupReport:
     notes: tuple[str, ...] = ()
     """Observations that are not necessarily mistakes: people with biased detections in one view, or
     of small stature."""
+    seconds: float = 0.0
+    """Time that the check took, s."""
 
     def with_consequences(self, rig: Rig) -> list[str]:
         """The warnings, with their consequences for a reconstruction."""
@@ -137,9 +140,10 @@ def check_setup(
     """Check whether cameras and detections of a recording are consistent, and diagnose the mistake
     if not.
 
-    Uses frames spread over `frames` (by default all) and needs no reconstruction; takes about a
-    second. `more` are findings from elsewhere.
+    Uses frames spread over `frames` (by default all), a few if nothing in them is odd, and needs no
+    reconstruction; takes about a second. `more` are findings from elsewhere.
     """
+    start = time.perf_counter()
     diagnosis = diagnose(detections, rig, frames)
     findings, build = (*diagnosis.findings, *more), diagnosis.build
     return SetupReport(
@@ -153,6 +157,7 @@ def check_setup(
         build.stature if build is not None and build.count > 0 else None,
         diagnosis.trust,
         (*(sentence(finding, rig) for finding in diagnosis.biased), *_children(build)),
+        time.perf_counter() - start,
     )
 
 
@@ -243,7 +248,7 @@ _MOST, _FEW = 0.5, 50
 _LOST, _LOST_SHARE = 0.5, 0.1
 """Minimum number of missing people per frame, and minimum share of them, for a warning."""
 _LOOKED_AT = 200
-"""Number of frames, spread over the recording, in which detections are counted for that."""
+"""Number of frames, spread over the recording, in which unused detections are counted."""
 _SHORT_S = 1.0
 """Duration, s, below which people seen by two cameras may lack evidence."""
 _REASONS = {

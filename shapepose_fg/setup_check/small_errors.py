@@ -36,7 +36,8 @@ unusual bias."""
 _KNOCKED = 3
 """Prior frequency of rotated or translated cameras, relative to other mistakes."""
 _PARTS = 8
-"""Number of parts of a recording at whose borders a camera may be bumped."""
+"""Maximum number of parts of a recording at whose borders a camera may be bumped; errors of a
+detector last for some frames, so a part has `_LEAST_OF_ONE` or more."""
 _MOST_PEOPLE = 160
 _LEAST_OF_ONE = 6
 """Minimum number of frames of a person; people with fewer are pooled for the biases."""
@@ -85,7 +86,8 @@ class Problem:
         frame = groups.frame
         often = np.bincount(who, minlength=1) >= _LEAST_OF_ONE
         person = np.unique(np.where(often[who], who, len(often)), return_inverse=True)[1]
-        ends = np.quantile(frame, np.arange(1, _PARTS) / _PARTS) if len(frame) > 0 else np.zeros(0)
+        parts = min(_PARTS, len(np.unique(frame)) // _LEAST_OF_ONE)
+        ends = np.quantile(frame, np.arange(1, parts) / parts) if parts > 1 else np.zeros(0)
         part = np.unique(
             np.searchsorted(np.unique(np.ceil(ends)), frame, side="right"), return_inverse=True
         )[1]
@@ -123,17 +125,16 @@ class Problem:
         done = np.zeros(to.shape[1])
         if before is not None:
             done[: len(sigma)] = before / sigma
-        found = []
-        for each in marginals:
-            H, g = to.T @ each.H @ to, to.T @ each.g
-            known = H + np.eye(len(H))
-            best = np.linalg.solve(known, g - done)
-            likely = each.log + 0.5 * float(
-                (g - done) @ best - done @ done - np.linalg.slogdet(known)[1]
-            )
-            found.append((likely, best[: len(sigma)] * sigma))
-        logs = np.nan_to_num([likely for likely, _ in found], nan=-np.inf)  # people behind a camera
-        return float(np.logaddexp.reduce(logs)), found[int(np.argmax(logs))][1]
+        there = np.flatnonzero(to.any(axis=1))
+        to = to[there]
+        H = to.T @ np.array([each.H[np.ix_(there, there)] for each in marginals]) @ to
+        g = np.array([each.g[there] for each in marginals]) @ to - done
+        known = H + np.eye(len(done))
+        best = np.linalg.solve(known, g[..., None])[..., 0]
+        gain = (g * best).sum(axis=1) - done @ done - np.linalg.slogdet(known)[1]
+        likely = np.array([each.log for each in marginals]) + 0.5 * gain
+        logs = np.nan_to_num(likely, nan=-np.inf)  # people behind a camera
+        return float(np.logaddexp.reduce(logs)), best[int(np.argmax(logs)), : len(sigma)] * sigma
 
     @cached_property
     def causes(self) -> list[Cause]:

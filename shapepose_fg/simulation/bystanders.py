@@ -14,8 +14,6 @@ from shapepose_fg.simulation.mocap import Clip, Mocap, blend
 from shapepose_fg.simulation.motion import along, left_of
 from shapepose_fg.simulation.performance import Figure, Performance, grounded, perform
 
-_SEAM_S = 0.5
-"""Length of the crossfade from the end of a clip to its beginning."""
 _STILL = (
     "basketball signal",
     "directing traffic",
@@ -28,16 +26,8 @@ _STILL = (
 """Actions of people who stay in place, as the recordings name them."""
 _STILL_M, _WALK_M = 0.75, 2.5
 """Radius within which standing people stay, and distance that walking people exceed, m."""
-_TRIES = 4
-"""Number of random paths, of which the best is used."""
-_DECISION_S = 0.1
-"""Interval between a walker's decisions, s."""
 _HORIZON_S = np.linspace(0.2, 2.0, 10)
 """Times ahead at which a walker predicts the others, s."""
-_TURNS = np.linspace(-1.9, 1.9, 15)
-"""Turning rates that a walker considers, rad/s."""
-_PACES = np.array([0.15, 0.45, 0.75, 1.0])
-"""Speeds that a walker considers, as shares of the walker's own."""
 
 
 def standing_clips(mocap: Mocap, *, without: frozenset[str]) -> list[int]:
@@ -74,7 +64,8 @@ def _clips(mocap: Mocap, frames: int, without: frozenset[str]) -> Iterator[tuple
 
 def endless(clip: Clip, frames: int, start: int = 0) -> Clip:
     """`clip` from frame `start` on, looped to `frames` frames with a crossfade at the end."""
-    seam = min(max(2, round(_SEAM_S * clip.fps)), len(clip) // 3)
+    # Length of the crossfade from the end of a clip to its beginning.
+    seam = min(max(2, round(0.5 * clip.fps)), len(clip) // 3)
     share: Array = np.linspace(0.0, 1.0, seam + 2)[1:-1]
     share = share**2 * (3 - 2 * share)
     head, tail = clip.between(0, seam), clip.between(len(clip) - seam, len(clip))
@@ -180,9 +171,8 @@ def way_through(
     """A path from wall to wall and back, with distance `distance_m` (K,) or a little more from
     `others` (T, K, 2).
     """
-    ways = [
-        _walk(others, frames, rng, fps, speed_mps, distance_m, half_room_m) for _ in range(_TRIES)
-    ]
+    # Number of random paths, of which the best is used.
+    ways = [_walk(others, frames, rng, fps, speed_mps, distance_m, half_room_m) for _ in range(4)]
     return max(ways, key=lambda way: comparable(_way_worth(way, others, distance_m)))
 
 
@@ -210,10 +200,14 @@ def _walk(
     """One random path: each decision takes the best turn and pace for the next two seconds (dynamic
     window).
     """
-    hold = max(1, round(_DECISION_S * fps))
+    # Interval between a walker's decisions, s.
+    hold = max(1, round(0.1 * fps))
     xy, heading, pace = _way_start(others, rng, half)
     goal = _way_goal(xy, rng, half)
-    turns, paces = (grid.ravel() for grid in np.meshgrid(_TURNS, _PACES))
+    # Turning rates that a walker considers, rad/s.
+    # Speeds that a walker considers, as shares of the walker's own.
+    grids = np.meshgrid(np.linspace(-1.9, 1.9, 15), [0.15, 0.45, 0.75, 1.0])
+    turns, paces = (grid.ravel() for grid in grids)
     rate, places, headings = 0.0, np.empty((frames, 2)), np.empty(frames)
     for frame in range(0, frames, hold):
         if np.linalg.norm(goal - xy) < 0.5:

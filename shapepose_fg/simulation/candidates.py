@@ -151,8 +151,6 @@ def _root(correlation: Array) -> Array:
 
 
 _A, _B = np.array(BODY_25.limbs).T
-_LEAST_LENGTH_PX = 8.0
-"""Minimum length of a limb in the image, pixels; for limbs seen along their axis."""
 
 
 @dataclass(frozen=True)
@@ -250,7 +248,6 @@ def _detour(found: Candidates, near: Index, far: Index, true_xy: Array) -> Array
     person = owner.argmax(axis=1)
     right_end = true_xy[view, person, found.joint[far]]
     length = np.linalg.norm(right_end - true_xy[view, person, found.joint[near]], axis=-1)
-    detour = np.linalg.norm(found.xy[far] - right_end, axis=-1) / np.maximum(
-        length, _LEAST_LENGTH_PX
-    )
+    # Minimum length of a limb in the image, pixels; for limbs seen along their axis.
+    detour = np.linalg.norm(found.xy[far] - right_end, axis=-1) / np.maximum(length, 8.0)
     return np.where(owner.any(axis=1), np.nan_to_num(detour, nan=np.inf), np.inf)

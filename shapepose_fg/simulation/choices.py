@@ -5,12 +5,10 @@ from numpy.typing import ArrayLike
 
 from shapepose_fg.core.arrays import Array
 
-_DECIMALS = 9
-
 
 def comparable(values: ArrayLike) -> Array:
     """Values rounded for comparisons, so that those that differ only by rounding become equal.
 
     Periodic or symmetric motions give many ties, of which the first is then chosen.
     """
-    return np.round(np.asarray(values, dtype=np.float64), _DECIMALS)
+    return np.round(np.asarray(values, dtype=np.float64), 9)

@@ -37,18 +37,12 @@ from shapepose_fg.simulation.visibility import (
 )
 
 _MIRROR = np.array(BODY_25.mirror)
-_MIRROR_APART_M = 0.12
-"""Minimum distance between left and right joint, projected, for a swap, m."""
-_LARGEST_ERROR_M = 0.25
-"""Maximum measured error, m; larger ones count as a miss and a false candidate."""
 
 _HIDDEN, _SEEN = 0.3, 0.7
 """Visible fraction below (above) which a joint counts as occluded (visible); linear in between."""
 _HALF_LOST, _WHOLLY_LOST = 1.96, 2.80
 """Increases in the probit of a miss that raise the miss rate from 1 in 40 to one half, and to four
 fifths."""
-_NEAR_M = 0.5
-"""Distance from a person's joint within which false candidates were counted as that person's, m."""
 
 
 @dataclass(frozen=True)
@@ -232,13 +226,15 @@ class Detector:
             confidence, seen, hidden_as, px_a_metre, noise[NoiseProcess.SCALE, reported]
         )
         error = noise[:2, reported].T * sigma_px[:, None] * table.joint_scale[group]
-        limit = _LARGEST_ERROR_M * px_a_metre / np.maximum(np.linalg.norm(error, axis=1), 1e-9)
+        # Maximum measured error, m; larger ones count as a miss and a false candidate.
+        limit = 0.25 * px_a_metre / np.maximum(np.linalg.norm(error, axis=1), 1e-9)
         owner = np.zeros((len(view), len(joints)), dtype=bool)
         owner[np.arange(len(view)), person] = True
         gap_px = np.linalg.norm(
             true_xy[view, person, joint] - true_xy[view, person, _MIRROR[joint]], axis=-1
         )
-        apart = gap_px > _MIRROR_APART_M * px_a_metre
+        # Minimum distance between left and right joint, projected, for a swap, m.
+        apart = gap_px > 0.12 * px_a_metre
         swap_rank = np.where(apart, ndtr(noise[NoiseProcess.SWAP, reported]), 1.0)
         swapped = swap_rank < config.swaps * table.swap
         owner[swapped] = False
@@ -350,7 +346,9 @@ class Detector:
         gap_m = (gap_px * depth[false.view]).min(
             axis=(1, 2), initial=np.inf, where=np.isfinite(gap_px)
         )
-        there &= near | (gap_m > _NEAR_M * focal_px[false.view])
+        # Distance from a person's joint within which false candidates were counted as
+        # that person's, m.
+        there &= near | (gap_m > 0.5 * focal_px[false.view])
         quantiles = np.where(near[:, None], table.false_near_confidence, table.false_far_confidence)
         found = Candidates(
             view=false.view,

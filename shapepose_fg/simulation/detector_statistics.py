@@ -39,8 +39,8 @@ class DetectorStatistics:
     buried_share: Array
     """(B,) shares of a person's joints in a view that are occluded by other people."""
     buried: Array
-    """(B,) increase of the probit of a miss, and decrease of that of the confidence, at these
-    shares."""
+    """(B,) increase of the probit of a miss, and decrease of that of the confidence, at the shares
+    `buried_share`."""
     lost: Array
     """(2,) share of people in a view with half, or four fifths, of the joints missed without
     occlusion."""
@@ -91,9 +91,9 @@ class DetectorStatistics:
     """Distance, px at `merge_height_px`, at which the same joint of two people is merged in half
     the cases."""
     merge_width_px: float
-    """Width of that transition, pixels."""
+    """Width of the transition from separate to merged people, pixels."""
     merge_height_px: float
-    """Image height of that measurement, pixels."""
+    """Height of the pictures in which merging was measured, pixels."""
     false_near: float
     """Number of false candidates near each person per view, without duplicates of joints."""
     false_far: float

@@ -17,7 +17,7 @@ from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.write_detections import refuse_leftovers, write_association, write_openpose
 from shapepose_fg.simulation import Scene, built_in_scene
 from shapepose_fg.simulation.mocap import Mocap
-from shapepose_fg.simulation.sequences import SEQUENCES, SequenceConfig, Split, sequence
+from shapepose_fg.simulation.sequences import SEQUENCES, Split, sequence
 
 Format = Literal["association", "openpose"]
 """Formats of simulated detections."""
@@ -40,26 +40,22 @@ def named_scene(
     frames: int = 0,
     seed: int = 0,
     mocap: Path | None = None,
-    config: SequenceConfig | None = None,
-    fps: float | None = None,
 ) -> Scene:
     """The scene called `name`. Raises InputError if an option is wrong or the motions are missing.
 
     `people` and `seed` apply to the built-in scene, which has 60 frames, or `frames` if that is
-    more. A sequence is defined by its name, or by `config`; `frames` limits it to its first frames
-    (0: all), without generating later segments. `fps` is the frame rate, by default 25 Hz for the
-    built-in scene and 30 Hz for a sequence.
+    more. `frames` limits a sequence to its first frames (0: all), without generating later
+    segments.
     """
     if name not in NAMES:
         raise InputError(f"{name}: must be one of {' '.join(NAMES)}")
     if not 2 <= cameras <= 12:
         raise InputError(f"--cameras {cameras}: must be 2 to 12")
-    rate: dict[str, Any] = {} if fps is None else {"fps": fps}
     if name == "demo":
         people = 4 if people is None else people
         if not 0 <= people <= 12:
             raise InputError(f"--people {people}: must be 0 to 12")
-        return built_in_scene(seed, people=people, cameras=cameras, frames=max(60, frames), **rate)
+        return built_in_scene(seed, people=people, cameras=cameras, frames=max(60, frames))
     if split not in get_args(Split):
         raise InputError(f"--split {split}: must be {' or '.join(get_args(Split))}")
     if people is not None:
@@ -69,7 +65,7 @@ def named_scene(
         )
     until = frames if frames > 0 else None
     motions = Mocap.load(_motions(mocap))
-    return sequence(name, split, motions, cameras=cameras, until=until, config=config, **rate)  # type: ignore[arg-type]
+    return sequence(name, split, motions, cameras=cameras, until=until)  # type: ignore[arg-type]
 
 
 def truth_of(scene: Scene) -> Reconstruction:

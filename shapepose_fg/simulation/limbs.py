@@ -11,17 +11,17 @@ from scipy.spatial.transform import Rotation
 
 from shapepose_fg.body.model.smpl_file import SMPL_PARENTS
 from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.skeleton import smpl_joints
 
-PELVIS, SPINE, NECK, HEAD = 0, (3, 6, 9), 12, 15
-LEGS = ((1, 4, 7), (2, 5, 8))
+PELVIS, NECK, HEAD = smpl_joints("pelvis neck head")
+SPINE = smpl_joints("spine1 spine2 spine3")
+SIDES = ("left", "right")
+LEGS = tuple(smpl_joints(f"{side}_hip {side}_knee {side}_ankle") for side in SIDES)
 """Hip, knee, ankle: left, right."""
-ARMS = ((13, 16, 18, 20), (14, 17, 19, 21))
+ARMS = tuple(
+    smpl_joints(f"{side}_collar {side}_shoulder {side}_elbow {side}_wrist") for side in SIDES
+)
 """Collar, shoulder, elbow, wrist: left, right."""
-_KNEE_HINGE = np.array([1.0, 0.0, 0.0])
-_ELBOW_HINGE = (np.array([0.0, -1.0, 0.0]), np.array([0.0, 1.0, 0.0]))
-_REACH = 0.995
-"""Maximum extension of a limb, as a share of its length; keeps the direction of its
-bend defined."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,13 @@ def pose(puppet: Puppet, rest: Array) -> tuple[Array, Array, Array]:
         grow(hip)
         pole = turned[:, PELVIS] @ np.array([0.12 * (1, -1)[side], 0.0, 1.0])
         _two_bones(
-            turned, position, bones, (hip, knee, ankle), puppet.ankles[:, side], pole, _KNEE_HINGE
+            turned,
+            position,
+            bones,
+            (hip, knee, ankle),
+            puppet.ankles[:, side],
+            pole,
+            np.eye(3)[0],
         )
         turned[:, ankle] = _facing(puppet.foot_heading[:, side]) @ turned_about(
             "x", puppet.foot_pitch[:, side]
@@ -99,7 +105,15 @@ def pose(puppet: Puppet, rest: Array) -> tuple[Array, Array, Array]:
         pole = (1 - raised) * (0.4 * sign, -0.5, -1.0) + raised * (sign, -0.6, -0.3)
         pole = np.einsum("tij,tj->ti", turned[:, SPINE[2]], pole)
         chain = (shoulder, elbow, wrist)
-        _two_bones(turned, position, bones, chain, target, pole, _ELBOW_HINGE[side])
+        _two_bones(
+            turned,
+            position,
+            bones,
+            chain,
+            target,
+            pole,
+            np.array([0.0, (-1.0, 1.0)[side], 0.0]),
+        )
         turned[:, wrist] = turned[:, wrist + 2] = turned[:, elbow]
     local = np.swapaxes(turned[:, SMPL_PARENTS[1:]], -1, -2) @ turned[:, 1:]
     axis_angle = Rotation.from_matrix(local.reshape(-1, 3, 3)).as_rotvec().reshape(count, 23, 3)
@@ -166,7 +180,9 @@ def _two_bones(
     line = target - position[:, first]
     reach = np.linalg.norm(line, axis=1, keepdims=True)
     u = line / reach
-    distance = np.clip(reach, abs(upper - lower) + 0.1, (upper + lower) * _REACH)
+    # Maximum extension of a limb, as a share of its length; keeps the direction of its bend
+    # defined.
+    distance = np.clip(reach, abs(upper - lower) + 0.1, (upper + lower) * 0.995)
     v = pole - (pole * u).sum(axis=1, keepdims=True) * u
     v /= np.linalg.norm(v, axis=1, keepdims=True)
     along = (upper**2 - lower**2 + distance**2) / (2 * distance)  # law of cosines

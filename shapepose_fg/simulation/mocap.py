@@ -26,26 +26,12 @@ _OF_CLIP = (
 )
 _ARRAYS = {"poses": ("N", 24, 3), "trans": ("N", 3), **dict.fromkeys(_OF_CLIP, ("S",))}
 _ARRAYS |= {"pairs": ("K", 2), "parents": (24,)}
-_GLITCH_RAD_S = np.radians(900.0)
-"""Angular speed, rad/s, above which a marker has jumped; joints of walkers and dancers
-are slower."""
 
 COLLARS, SHOULDERS, *_ = zip(*ARMS, strict=True)
 """Left and right collar, and shoulder, as indices of SMPL's joints."""
 _SETTING = np.radians(30.0)
 """Elevation of the arm, rad, below which only the glenohumeral joint moves (Inman, Saunders and
 Abbott 1944)."""
-_RISE = 0.2
-"""Elevation of the clavicle per elevation of the arm beyond `_SETTING`: 30 degrees with the arm
-overhead. There, a third of the arm's elevation is due to the scapula (1:2), and half of that to the
-clavicle; the other half, at the outer end of the clavicle, hardly moves the shoulder's centre, and
-SMPL's tree has no joint for it."""
-_REST = np.radians(60.0)
-"""Elevation of the arm, rad, at which the collar is as in the T-pose: T-poses of body files are
-made from bodies with half raised arms by rotating the arms only."""
-_SWEEP = 0.22
-"""Rotation of the collar, rad, forwards if the raised arm points forwards, and backwards if it
-points back."""
 
 
 @dataclass(frozen=True)
@@ -159,8 +145,10 @@ def _bridged(rotations: Array, pelvis: Array, fps: float) -> tuple[Array, Array]
     if len(pelvis) < 3:
         return rotations, pelvis
     trace = np.einsum("tjab,tjab->tj", rotations[:-1], rotations[1:])  # of R^T R': 1 + 2 cos
+    # Angular speed, rad/s, above which a marker has jumped; joints of walkers and dancers
+    # are slower.
     jumps = np.flatnonzero(
-        (np.arccos(np.clip((trace - 1) / 2, -1, 1)) > _GLITCH_RAD_S / fps).any(axis=1)
+        (np.arccos(np.clip((trace - 1) / 2, -1, 1)) > np.radians(900.0) / fps).any(axis=1)
     )
     if len(jumps) == 0:
         return rotations, pelvis
@@ -232,9 +220,17 @@ def _collar(along: Array, sign: float) -> Array:
     frame.
     """
     elevation = np.arccos(np.clip(-along[:, 1], -1.0, 1.0))  # 0 hanging, pi overhead
-    rise = _RISE * (_ramp(elevation - _SETTING) - _ramp(np.array([_REST - _SETTING])))
+    # Elevation of the clavicle per elevation of the arm beyond `_SETTING`: 30 degrees with
+    # the arm overhead. There, a third of the arm's elevation is due to the scapula (1:2),
+    # and half of that to the clavicle; the other half, at the outer end of the clavicle,
+    # hardly moves the shoulder's centre, and SMPL's tree has no joint for it.
+    # Elevation of the arm, rad, at which the collar is as in the T-pose: T-poses of body
+    # files are made from bodies with half raised arms by rotating the arms only.
+    rise = 0.2 * (_ramp(elevation - _SETTING) - _ramp(np.array([np.radians(60.0) - _SETTING])))
     raised = np.sin(np.clip(elevation, 0.0, np.pi / 2)) ** 2
-    sweep = _SWEEP * raised * along[:, 2] - 0.35 * np.maximum(rise, 0.0)
+    # Rotation of the collar, rad, forwards if the raised arm points forwards, and backwards
+    # if it points back.
+    sweep = 0.22 * raised * along[:, 2] - 0.35 * np.maximum(rise, 0.0)
     return Rotation.from_euler("yz", np.stack([-sign * sweep, sign * rise], axis=1)).as_matrix()
 
 

@@ -23,8 +23,6 @@ _PADDING_S = 3.0
 steps."""
 _STANCE = 0.6
 """Share of a stride for which a foot stands."""
-_WIDTH_M = 0.19
-"""Distance between the feet, m."""
 Path = Callable[[Array], tuple[Array, Array]]
 """Function from times (...,), seconds, to the pelvis on the floor: positions (..., 2), metres;
 headings (...,), radians, unwrapped."""
@@ -301,7 +299,8 @@ def _footsteps(
 def _plant(path: Path, number: Array, offset: Array, stride_s: float) -> tuple[Array, Array]:
     """Position (T, 2, 2) and heading (T, 2) of the feet in stance `number` (T, 2)."""
     xy, heading = path((number + _STANCE / 2 - offset) * stride_s)
-    side = np.array([0.5, -0.5]) * _WIDTH_M
+    # Distance between the feet, m.
+    side = np.array([0.5, -0.5]) * 0.19
     return xy + left_of(heading) * side[:, None], heading + np.array([0.12, -0.12])
 
 

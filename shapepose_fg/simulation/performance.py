@@ -12,26 +12,17 @@ from scipy.spatial.transform import Rotation
 from shapepose_fg.body.model.body_model import BodyModel, accumulate
 from shapepose_fg.body.model.smpl_file import SMPL_PARENTS
 from shapepose_fg.core.arrays import Array
-from shapepose_fg.simulation.limbs import turned_about
+from shapepose_fg.core.skeleton import smpl_joints
+from shapepose_fg.simulation.limbs import ARMS, SPINE, turned_about
 from shapepose_fg.simulation.mocap import Clip, shoulder_rhythm
 from shapepose_fg.simulation.motion import Motion
 
-_FEET = (7, 8, 10, 11)
+_FEET = smpl_joints("left_ankle right_ankle left_foot right_foot")
 """Ankles and balls of the feet, left and right."""
-_RELAXED_HAND = 0.25
-"""Bend of the fingers of a hand that was not recorded, rad."""
-_JUMP_M = 0.12
-"""Height, m, above the floor around a person above which it is a jump; less is recording error."""
 _Z_UP = Rotation.from_rotvec([np.pi / 2, 0.0, 0.0]).as_matrix()
-_ARMS = ((13, 16, 18, 20, 22), (14, 17, 19, 21, 23))
-"""Collar, shoulder, elbow, wrist, hand: left, right."""
 _HELD_M, _FREE_M = 0.17, 0.27
 """Distance between hands, m, below which they are held, and above which they are free: differences
 in limb lengths leave 10 to 20 cm between hands that touched in the recording."""
-_TOUCH_M = 0.07
-"""Distance between the knuckles of two held hands, m."""
-_STRETCH = 0.995
-"""Maximum extension of an arm, as a share of its length."""
 
 
 @dataclass(frozen=True)
@@ -114,8 +105,9 @@ def perform(
     rotations = shoulder_rhythm(clip.rotations)
     if not clip.wrist_valid:
         rotations[:, 20:22] = np.eye(3)
-    for hand, sign in ((22, -1.0), (23, 1.0)):
-        rotations[:, hand] = Rotation.from_rotvec([0.0, 0.0, sign * _RELAXED_HAND]).as_matrix()
+    for hand, sign in zip(smpl_joints("left_hand right_hand"), (-1.0, 1.0), strict=True):
+        # Bend of the fingers of a hand that was not recorded, rad.
+        rotations[:, hand] = Rotation.from_rotvec([0.0, 0.0, sign * 0.25]).as_matrix()
     rotations[:, 0] = _Z_UP @ rotations[:, 0]
     pelvis = clip.pelvis * (ratio if scale is None else scale)
     pelvis[:, 1] = (clip.pelvis[:, 1] - clip.floor_y) * ratio
@@ -163,7 +155,9 @@ def _floor(lowest: Array, fps: float) -> Array:
     opened = maximum_filter1d(
         minimum_filter1d(lowest, reach, mode="nearest"), reach, mode="nearest"
     )
-    flies = (lowest - opened).max() > _JUMP_M
+    # Height, m, above the floor around a person above which it is a jump; less is recording
+    # error.
+    flies = (lowest - opened).max() > 0.12
     floor = gaussian_filter1d(opened if flies else lowest, 0.1 * fps, mode="nearest")
     below = np.maximum(floor - lowest - 0.015, 0.0)  # lift people deep in the floor
     wide = maximum_filter1d(below, 2 * max(1, round(0.15 * fps)) + 1, mode="nearest")
@@ -199,9 +193,8 @@ def hold_hands(
         hands = [person.joints[:, [22, 23]] for person in (lead, follow)]
         apart = hands[1][:, None] - hands[0][:, :, None]  # (T, 2, 2, 3) lead's hands to follow's
         gap = np.linalg.norm(apart, axis=-1)
-        step = (pull * np.maximum(1.0 - _TOUCH_M / np.maximum(gap, 1e-6), 0.0) / 2)[
-            ..., None
-        ] * apart
+        # Distance between the knuckles of two held hands, m.
+        step = (pull * np.maximum(1.0 - 0.07 / np.maximum(gap, 1e-6), 0.0) / 2)[..., None] * apart
         lead = _reach(lead, step.sum(axis=2))
         follow = _reach(follow, -step.sum(axis=1))
     return lead, follow
@@ -225,9 +218,10 @@ def _reach(person: Performance, steps: Array) -> Performance:
     """Move the hands by `steps` (T, 2, 3) metres, left and right, as far as the arms reach."""
     rotations, joints = person.rotations.copy(), person.joints.copy()
     world = rotations[:, 0]
-    for joint in (3, 6, 9):
+    for joint in SPINE:
         world = world @ rotations[:, joint]
-    for side, (collar, shoulder, elbow, wrist, hand) in enumerate(_ARMS):
+    hands = smpl_joints("left_hand right_hand")
+    for side, (collar, shoulder, elbow, wrist) in enumerate(ARMS):
         girdle = world @ rotations[:, collar]
         upper = girdle @ rotations[:, shoulder]
         fore = upper @ rotations[:, elbow]
@@ -243,7 +237,7 @@ def _reach(person: Performance, steps: Array) -> Performance:
         bones = (
             (shoulder, elbow, upper),
             (elbow, wrist, fore),
-            (wrist, hand, fore @ rotations[:, wrist]),
+            (wrist, hands[side], fore @ rotations[:, wrist]),
         )
         for parent, joint, turned in bones:
             joints[:, joint] = joints[:, parent] + turned @ (
@@ -260,7 +254,8 @@ def _bend(upper: Array, lower: Array, distance: Array) -> Array:
     axis = np.cross(upper, lower)
     size = np.linalg.norm(axis, axis=1)
     now = np.arctan2(size, (upper * lower).sum(axis=1))
-    length = np.clip(distance, np.abs(a - b) + 0.12, _STRETCH * (a + b))
+    # Maximum extension of an arm, as a share of its length.
+    length = np.clip(distance, np.abs(a - b) + 0.12, 0.995 * (a + b))
     then = np.arccos(np.clip((length**2 - a**2 - b**2) / (2 * a * b), -1.0, 1.0))
     # The bending axis of a straight arm is undefined: such an arm is not bent.
     weight = np.clip(size / (a * b) / 0.05, 0.0, 1.0)

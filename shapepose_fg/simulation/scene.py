@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Camera, Rig
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.simulation.motion import Build, Motion, close_motion
 from shapepose_fg.viz.rendering import look_at
 
@@ -19,7 +20,7 @@ if TYPE_CHECKING:  # not needed by visibility workers
     from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 
 UP = np.array([0.0, 0.0, 1.0])
-_FEET = (19, 20, 21, 22, 23, 24)
+_FEET = [n for n, name in enumerate(BODY_25.joints) if name.endswith(("Toe", "Heel"))]
 """Toes and heels in BODY_25."""
 
 

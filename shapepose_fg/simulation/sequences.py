@@ -14,6 +14,7 @@ import numpy as np
 
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.skeleton import smpl_joints
 from shapepose_fg.simulation.bystanders import (
     stand,
     standing_clips,
@@ -28,23 +29,17 @@ from shapepose_fg.simulation.motion import Motion
 from shapepose_fg.simulation.performance import Figure, Performance, hold_hands, perform, together
 from shapepose_fg.simulation.scene import Scene, ring_of_cameras
 
-_TORSO = (0, 6, 9, 12)
+_TORSO = smpl_joints("pelvis spine2 spine3 neck")
 """Pelvis, spine and neck: joints from which other people must keep a distance."""
 _HALF_ROOM_M = 1.75
 """Maximum distance of pelvises from the centre of the room, in x and in y, m."""
-_LIMBS_M = 0.12
-"""Minimum distance of a standing person's joints from those of others, if space permits, m."""
-_TORSO_M = 0.2
-"""Minimum distance of another person's joints from pelvis, spine and neck, m."""
-_MIDDLES, _LIMBS = (0, 9), (18, 19, 20, 21, 22, 23, 4, 5)
-"""Pelvis and chest; elbows, wrists, hands, knees."""
+_MIDDLES = smpl_joints("pelvis spine3")
+_LIMBS = smpl_joints(
+    "left_elbow right_elbow left_wrist right_wrist left_hand right_hand left_knee right_knee"
+)
 _SPOTS, _PAIR_OPTIONS, _TRIED = 150, 60, 30
 """Number of random positions for standing people and for pairs, and number of them that
 are tested."""
-_PACE_MPS = 1.35
-"""Maximum speed of walking people in a crowded room, m/s."""
-_ARM_M = 0.3
-"""Distance of walking people from others' limbs, m."""
 
 
 @dataclass(frozen=True)
@@ -160,13 +155,15 @@ class Room:
         """Add a person who walks through, between and around all others."""
         middles, limbs = self.points(_MIDDLES), self.points(_LIMBS)
         speed = float(np.linalg.norm(clip.pelvis[-1] - clip.pelvis[0]) / len(clip) * clip.fps)
+        # Maximum speed of walking people in a crowded room, m/s.
+        # Distance of walking people from others' limbs, m.
         path, heading = way_through(
             np.concatenate([middles, limbs], axis=1),
             self.frames,
             self.rng,
             fps=self.fps,
-            speed_mps=min(speed, _PACE_MPS),
-            distance_m=np.repeat([self.config.close_m, _ARM_M], [middles.shape[1], limbs.shape[1]]),
+            speed_mps=min(speed, 1.35),
+            distance_m=np.repeat([self.config.close_m, 0.3], [middles.shape[1], limbs.shape[1]]),
             half_room_m=_HALF_ROOM_M,
         )
         start = self.rng.uniform()
@@ -227,8 +224,11 @@ class Room:
     def _gap(self, one: Performance, other: Performance) -> float:
         """Distance of two people minus the required one, metres."""
         a, b = one.joints[::5], other.joints[::5]
-        limbs = np.linalg.norm(a[:, :, None] - b[:, None], axis=-1).min() - _LIMBS_M
-        trunks = clearance_m(a, b).min() - _TORSO_M
+        # Minimum distance of a standing person's joints from those of others, if space
+        # permits, m.
+        limbs = np.linalg.norm(a[:, :, None] - b[:, None], axis=-1).min() - 0.12
+        # Minimum distance of another person's joints from pelvis, spine and neck, m.
+        trunks = clearance_m(a, b).min() - 0.2
         hips = np.linalg.norm((a - b)[:, 0, :2], axis=-1).min() - self.config.close_m
         return float(min(limbs, trunks, hips))
 
@@ -263,10 +263,6 @@ DANCERS = frozenset({"60", "61"})
 """Subjects of the salsa takes; no network is trained on them."""
 TAKES: dict[str, range] = {"tune": range(1, 8), "report": range(9, 16)}
 """Numbers of the takes of each split."""
-_APART_M = 1.3
-"""Maximum distance of the dancers at the ends of the used part of a take, m."""
-_SHAPE_SPREAD = 0.8
-"""Standard deviation of the betas over people; smaller within a pair."""
 _IMAGE_PX_A_M = 259.0
 """Size of people in the image, pixels per metre, for all distances of the cameras."""
 
@@ -387,7 +383,8 @@ def _together_in(
     """The segments of a take in which both are close together."""
     lead, follow = (mocap.clip(index).resampled(fps) for index in pair)
     gap = np.linalg.norm((lead.pelvis - follow.pelvis)[:, [0, 2]], axis=1)
-    near = np.flatnonzero(gap < _APART_M)
+    # Maximum distance of the dancers at the ends of the used part of a take, m.
+    near = np.flatnonzero(gap < 1.3)
     if len(near) < fps:
         return []
     first, last = int(near[0]), int(near[-1]) + 1
@@ -398,7 +395,8 @@ def _together_in(
 
 def _shapes(config: SequenceConfig, rng: np.random.Generator) -> Array:
     """(P, 10) betas; similar within a pair, so that the hands still meet."""
-    betas = rng.normal(0.0, _SHAPE_SPREAD, (config.people, 10))
+    # Standard deviation of the betas over people; smaller within a pair.
+    betas = rng.normal(0.0, 0.8, (config.people, 10))
     for lead in range(0, 2 * config.pairs, 2):
         betas[lead : lead + 2] = 0.6 * betas[lead] + rng.normal(0.0, 0.25, (2, 10))
     return np.clip(betas, -1.8, 1.8)

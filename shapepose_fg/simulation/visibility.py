@@ -86,7 +86,7 @@ class Skin:
     vertices: Index
     """(M,) indices of the used vertices of the body's mesh."""
     faces: NDArray[np.int32]
-    """(G, 3) triangles between these vertices."""
+    """(G, 3) triangles between the vertices of the surface."""
     shows: Mask
     """(M, J) whether at least half of a vertex's weight is on the joint's own or adjacent bones."""
 

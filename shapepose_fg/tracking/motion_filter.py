@@ -48,7 +48,7 @@ class JointStates(Rows):
     @property
     def sigma_m(self) -> Array:
         """(A, J) standard deviation of the position, root mean square over the axes, metres."""
-        return np.sqrt(np.trace(self.covariance[..., :3, :3], axis1=-2, axis2=-1) / 3)
+        return np.sqrt(sum(self.covariance[..., k, k] for k in range(3)) / 3)
 
     @classmethod
     def at(cls, position: Array, sigma_m: Array, start: Sequence[float]) -> "JointStates":

@@ -72,29 +72,26 @@ class _Compared:
         if len(ids) == 0:
             return cls((), ids[:0], np.zeros((0, len(states))))
         groups = [group for group in group_people(found) if len(group) >= len(skeleton.core) // 2]
-        who, log = np.full(len(groups), -1), np.zeros((len(groups), len(states)))
+        rows = np.concatenate([np.zeros(0, dtype=np.intp), *groups])
+        count = np.array([len(group) for group in groups], dtype=np.intp)
+        view, joint = found.view[rows], found.joint[rows]
         xy, depth = rig.project(joints.position)  # (V, A, J, 2), (V, A, J)
         unit_px = (
             rig.focal_px[:, None, None] / np.maximum(depth, 0.2) * np.hypot(_NEAR_M, joints.sigma_m)
         )
-        for number, group in enumerate(groups):
-            view, joint = int(found.view[group[0]]), found.joint[group]
-            apart = [
-                np.square((xy[view][:, each] - found.xy[group]) / unit_px[view][:, each, None]).sum(
-                    axis=-1
-                )
-                for each in (joint, mirror[joint])
-            ]
-            of_part = np.eye(states.shape[1] + 1)[part[joint]]
-            same, turned = (
-                np.minimum(np.nan_to_num(apart, nan=_FARTHEST), _FARTHEST) @ of_part
-            )  # (A, parts)
-            apart_of = np.minimum(same, turned).sum(axis=1) / len(group)
-            best = int(apart_of.argmin())
-            if apart_of[best] < _FITS:
-                who[number] = ids[best]
-                log[number] = _prior(len(states)) + states @ (same - turned)[best, 1:] / 2
-                log[number] -= np.logaddexp.reduce(log[number])
+        # Sums over the joints of each part (G, parts, A), with the sides as they are, or exchanged.
+        same, turned = np.zeros((2, len(groups), states.shape[1] + 1, len(ids)))
+        for total, each in ((same, joint), (turned, mirror[joint])):
+            apart = (xy[view, :, each] - found.xy[rows, None]) / unit_px[view, :, each][..., None]
+            apart = np.square(apart).sum(axis=-1)
+            apart = np.minimum(np.nan_to_num(apart, nan=_FARTHEST), _FARTHEST)
+            np.add.at(total, (np.repeat(np.arange(len(groups)), count), part[joint]), apart)
+        apart_of = np.minimum(same, turned).sum(axis=1) / count[:, None]
+        number, best = np.arange(len(groups)), apart_of.argmin(axis=1)
+        fits = apart_of[number, best] < _FITS
+        log = _prior(len(states)) + (same - turned)[number, 1:, best] @ states.T / 2
+        log -= np.logaddexp.reduce(log, axis=1, keepdims=True)
+        who, log = np.where(fits, ids[best], -1), np.where(fits[:, None], log, 0.0)
         return cls(groups, who, log)
 
     def exchanged(self, skeleton: Skeleton) -> Mask:
@@ -129,7 +126,7 @@ class _Compared:
         for group, who, exchanged in zip(
             self.groups, self.who.tolist(), self.exchanged(skeleton), strict=True
         ):
-            if who >= 0:
+            if who >= 0 and (who in own or exchanged.any()):
                 of, (turned, doubt) = part[found.joint[group]], own.get(who, (right, right))
                 if who in own:
                     mirrored[group] = np.append(0.0, doubt)[of]

@@ -81,7 +81,7 @@ class Ends:
     time_s: Array
     """(G, 2) times of the first and the last row, seconds."""
     place: Array
-    """(G, 2, 3) centre of the core joints at these times, metres."""
+    """(G, 2, 3) centre of the core joints at the track's start and end, metres."""
     bones: Array
     """(G, B) median length of each bone between core joints, metres; NaN where unknown."""
 

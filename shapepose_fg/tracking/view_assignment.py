@@ -15,7 +15,7 @@ depth, m."""
 _FAR_M = 0.12
 """Distance, plus twice the prediction's sigma, up to which a detection is near, m."""
 FARTHEST_M = 0.5
-"""Upper limit of that distance for any uncertainty, m."""
+"""Maximum distance of a detection from its predicted joint, m, however uncertain that is."""
 _REACH_M = 0.8
 """Maximum distance of a detection from a predicted joint of arms or legs, m; for a lost joint, from
 its neighbour on the skeleton. Detections that are not near need affinities to a person with a trunk

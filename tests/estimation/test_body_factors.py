@@ -9,6 +9,7 @@ import pytest
 from factors import isotropic
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.body_window_graph import BodyGraph, ordering
+from shapepose_fg.estimation.condensed_graph import gtsam_step
 from shapepose_fg.estimation.estimator_config import WindowGraphConfig
 from shapepose_fg.estimation.factor_solution import solve_with_factors
 from shapepose_fg.estimation.graph_covariances import graph_covariances
@@ -21,7 +22,10 @@ CONFIG = WindowGraphConfig()
 
 def person(seed: int, number: int = 0) -> BodyGraph:
     window, _, start = _person(seed)
-    return BodyGraph(window, window.solve(start), number, FRAMES, widen=2.0)
+    state = window.solve(start)
+    return BodyGraph(
+        window, window.take(state, *gtsam_step(window, state)), number, FRAMES, widen=2.0
+    )
 
 
 def moved(one: BodyGraph, expected: np.ndarray, asked: list[int]) -> float:

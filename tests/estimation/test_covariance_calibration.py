@@ -3,12 +3,10 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.estimation.covariance_calibration import LASTS_S, Calibration, CovarianceFeatures
-from shapepose_fg.estimation.in_time import smoothed_in_time
+from shapepose_fg.estimation.covariance_calibration import Calibration, CovarianceFeatures
 from shapepose_fg.estimation.linearisation import squared_distance
 
 I3 = np.eye(3)
@@ -90,32 +88,3 @@ def test_disagreement_is_the_distance_in_both_sigmas():
         [[4.0, 0, 0]],
         atol=1e-12,
     )
-
-
-def test_doubt_lasts_and_is_carried_through_a_gap():
-    """One doubtful frame among eleven; then ten without a view, which have the doubt of those
-    nearest to them.
-    """
-    times = np.arange(21) / 20
-    spread, seen = np.zeros((21, 1, 3, 3)), np.ones((21, 1), dtype=bool)
-    spread[10, 0], seen[11:] = np.eye(3) * 1e-4, False
-    found = smoothed_in_time(spread, times, LASTS_S, seen)[:, 0, 0, 0]
-    weight = np.exp(-0.5 * ((times[5] - times[:11]) / LASTS_S) ** 2)
-    np.testing.assert_allclose(found[5], 1e-4 * weight[10] / weight.sum(), rtol=1e-6)
-    assert (np.diff(found) > 0).all(), "the farther on from the frames that were certain, the more"
-    assert found[-1] < 1e-4
-    np.testing.assert_allclose(
-        smoothed_in_time(spread[10:11], times[10:11], LASTS_S, seen[10:11]), spread[10:11]
-    )
-
-
-@pytest.mark.parametrize("per_s", [10, 60])
-def test_what_lasts_is_the_same_at_any_rate(per_s):
-    """Doubt over half a second of three, in its middle and a second after."""
-    times = np.arange(3 * per_s) / per_s
-    values = ((times >= 1.0) & (times < 1.5)).astype(float)[:, None]
-    found = smoothed_in_time(values, times, LASTS_S)[:, 0]
-    assert found[np.searchsorted(times, 1.25)] == pytest.approx(0.68, abs=0.06), (
-        "one sigma on either side"
-    )
-    assert found[np.searchsorted(times, 2.5)] < 1e-3

@@ -85,30 +85,25 @@ def test_few_detections_keep_what_ships(five_cameras):
     np.testing.assert_allclose(nothing.law().gross, shipped.gross, atol=1e-4)
 
 
-def ratio(law, *, views=2, body=0.0, alone=False, score=0.85):
+def ratio(law, *, views=2, body=0.0, score=0.85):
     """Of a joint at 10 m that `views` see, each to 1 cm, and of which the body says `body` 1/m²."""
     by_view = np.zeros((1, 1, 3, 3, 3))
     by_view[0, 0, :views] = 1e4 * np.eye(3)
     scores, sigma_m = np.full((1, 1, 3), score), np.full((1, 1, 3), 0.02)
     of_body = body * np.eye(3)[None, None]
-    return variance_ratio(law, np.array([alone]), scores, sigma_m, by_view, of_body)[0, 0]
+    return variance_ratio(law, scores, sigma_m, by_view, of_body)[0, 0]
 
 
 def test_covariances_follow_the_law():
     shipped = NoiseLaw.shipped()
     twice = replace(shipped, times=tuple(2 * np.array(shipped.times)))
     half = replace(shipped, times=tuple(0.5 * np.array(shipped.times)))
-    assert ratio(shipped) == ratio(shipped, alone=True) == 1.0
+    assert ratio(shipped) == 1.0
     assert ratio(twice) == pytest.approx(4.0, rel=1e-3)
-    assert ratio(half) == pytest.approx(0.25, rel=1e-3)
-    assert ratio(half, alone=True) == 1.0, "the graph of one frame is the least"
-    assert 1.0 < ratio(twice, body=1e5) < 4.0, "the body's errors average over time"
-    assert ratio(twice, body=1e5, alone=True) == pytest.approx(4.0, rel=1e-3)
-    assert ratio(shipped, score=0.2) == 1.0, (
-        "over time, covariances are calibrated with gross errors"
-    )
+    assert ratio(half) == 1.0, "the graph of one frame is the least"
+    assert ratio(twice, body=1e5) == pytest.approx(4.0, rel=1e-3)
     gross = (np.array(shipped.gross)[1] - np.array(shipped.gross)[4:].mean()) * GROSS_M**2 / 0.02**2
-    assert ratio(shipped, score=0.2, alone=True) == pytest.approx(1 + gross, rel=0.05)
+    assert ratio(shipped, score=0.2) == pytest.approx(1 + gross, rel=0.05)
     assert ratio(twice, views=0, body=1e4) == 1.0, "nothing of the person was seen"
 
 
@@ -179,18 +174,18 @@ def test_a_run_learns_it_once_and_keeps_it(noisy, of_few_frames, monkeypatch):
     scene, recording, times = noisy
     setup, frames = set_up(scene, recording)
     kept = InMemory()
-    law = offsets.kept_noise(kept, setup, frames, times, Notebook())
+    law = offsets.kept_noise(kept, offsets.Sample(setup, frames, times), Notebook())
     found, usual = np.array([law.times, NoiseLaw.shipped().times])[:, 3:6]
     assert (found > 1.4 * usual).all() and (found < 2.4 * usual).all()
     monkeypatch.setattr(offsets, "noise_of", None)
-    assert offsets.kept_noise(kept, setup, frames, times, Notebook()) == law
+    assert offsets.kept_noise(kept, offsets.Sample(setup, frames, times), Notebook()) == law
 
 
 def test_a_short_recording_keeps_what_ships(noisy, monkeypatch):
     scene, recording, times = noisy
     monkeypatch.setattr(offsets, "NOISE_FRAMES", 21)
     setup, frames = set_up(scene, recording)
-    assert offsets.noise_of(setup, frames, times, Notebook()) == NoiseLaw.shipped()
+    assert offsets.noise_of(offsets.Sample(setup, frames, times), Notebook()) == NoiseLaw.shipped()
 
 
 @pytest.mark.slow

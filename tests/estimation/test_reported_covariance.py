@@ -5,12 +5,10 @@ wrong.
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
 
 from shapepose_fg.body.fitting.fitter import BodyFit
 from shapepose_fg.core.reconstruction import Known
 from shapepose_fg.estimation.draft import drafted
-from shapepose_fg.estimation.in_time import smoothed_in_time
 from shapepose_fg.estimation.linearisation import ViewEvidence
 from shapepose_fg.estimation.reported_covariance import how_known, problems
 
@@ -153,10 +151,3 @@ def test_a_draft_without_a_body_is_the_views_and_without_both_nothing():
     assert np.isnan(at[0, 2]).all() and np.isnan(covariance[0, 2]).all(), (
         "determined to a metre, or not at all"
     )
-
-
-def test_smoothing_in_time_is_a_gaussian_mean():
-    values, times = np.array([[0.0], [1.0], [4.0]]), np.array([0.0, 0.07, 0.24])
-    weight = np.exp([0.0, -0.5 * 0.7**2, -0.5 * 2.4**2])  # 0, 0.7 and 2.4 widths off
-    smooth = smoothed_in_time(values, times, 0.1)
-    assert smooth[0, 0] == pytest.approx((weight[1] + 4 * weight[2]) / weight.sum())

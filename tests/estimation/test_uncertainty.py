@@ -56,6 +56,24 @@ def test_blocks_are_what_is_reported(people):
     assert not apart.block(0, 1).any()
 
 
+def test_errors_of_fast_joints_last_less(people):
+    """Where the covariance of a velocity says that errors at its two ends hardly correlate, those
+    of neighbouring frames do not either; where it says nothing, or more than usual, they are as
+    usual.
+    """
+    who = int(people.person[0])
+    ends, ratio = (JointAt(who, "RWrist", 2), JointAt(who, "RWrist", 3)), []
+    step_s = np.diff(np.unique(people.time_s)).min()
+    for share in (np.nan, 0.0, 0.2, 1.0):
+        # 2 (1 - rho) C = V dt², over the two frames between which a velocity is taken.
+        speed = 2 * share * people.covariance / (2 * step_s) ** 2
+        both = marginal(replace(people, velocity_covariance=speed), *ends)
+        ratio.append(np.trace(both.block(0, 1)) / np.trace(both.block(0, 0)))
+        assert np.linalg.eigvalsh(both.covariance).min() >= -1e-12
+    assert ratio[0] == pytest.approx(ratio[1]) and ratio[0] > 0.9
+    assert ratio[1] > ratio[2] > 0.8 > ratio[3] > -0.01
+
+
 def test_correlation_is_the_product_along_the_limbs():
     rho = correlation(BODY_25.joints, BODY_25.joints)
     np.testing.assert_array_equal(np.diag(rho), 1)

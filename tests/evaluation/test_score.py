@@ -13,7 +13,7 @@ from shapepose_fg.core.joint_names import keypoint_names
 from shapepose_fg.core.skeleton import BODY_25, SKELETONS, SMPL_24
 from shapepose_fg.evaluation.metrics import PlainPeople
 from shapepose_fg.evaluation.score import aligned, score
-from shapepose_fg.evaluation.shelf_annotation import SHELF_JOINTS
+from shapepose_fg.evaluation.shelf import SHELF_JOINTS
 from shapepose_fg.evaluation.truth import read_people
 from shapepose_fg.io.export.registry import FORMATS, export_result
 from shapepose_fg.simulation import built_in_scene
@@ -143,14 +143,15 @@ def write_actors(path, frames):
     for n, actor in enumerate(frames):
         cells = np.empty((len(actor), 1), dtype=object)
         for frame, joints in enumerate(actor):
-            cells[frame, 0] = np.zeros((1, 0)) if joints is None else joints
+            absent = np.zeros((1, frame % 2))  # both forms occur
+            cells[frame, 0] = absent if joints is None else joints
         actors[0, n] = cells
     savemat(path, {"actor3D": actors, "other": np.eye(3)}, do_compression=True)
 
 
 def test_actors_of_shelf_and_campus(tmp_path):
     rng = np.random.default_rng(0)
-    joints = rng.normal(size=(2, 3, 14, 3))
+    joints = 0.3 * rng.normal(size=(2, 3, 14, 3))
     file = tmp_path / "actorsGT.mat"
     write_actors(file, [[joints[0, 0], None, joints[0, 2]], [None, *joints[1, 1:]]])
     people = read_people(file)
@@ -158,6 +159,87 @@ def test_actors_of_shelf_and_campus(tmp_path):
     assert people.joint_names == SHELF_JOINTS and not people.complete
     np.testing.assert_allclose(people.joints[3, :14], joints[1, 2])
     np.testing.assert_allclose(people.joints[3, 14], joints[1, 2, 2:4].mean(axis=0))
+
+
+SIDES = {"R": -0.2, "L": 0.2}
+
+
+def standing(names):
+    """A person who faces +y with z up, left towards -x, in metres; joints by name."""
+    heights = {"Head": 1.75, "HeadTop": 1.8, "Nose": 1.6, "Eye": 1.65, "Ear": 1.64, "Neck": 1.45}
+    heights |= {"Shoulder": 1.4, "Elbow": 1.15, "Wrist": 0.9, "Hip": 0.95, "MidHip": 0.95}
+    heights |= {"Knee": 0.5, "Ankle": 0.1}
+    forward = {"Nose": 0.15, "Eye": 0.12}
+    xyz = []
+    for name in names:
+        part = name if name in heights else name[1:]
+        xyz.append([-SIDES.get(name[0] if part != name else "", 0.0), forward.get(part, 0.0),
+                    heights[part]])  # fmt: skip
+    return np.array(xyz)
+
+
+def test_published_orders_of_joints(tmp_path):
+    """Files written by hand, joint by joint in the order of the data set's own description."""
+    ankles_first = np.array([
+        [0.2, 0, 0.1], [0.2, 0, 0.5], [0.2, 0, 0.95],           # right ankle, knee, hip
+        [-0.2, 0, 0.95], [-0.2, 0, 0.5], [-0.2, 0, 0.1],        # left hip, knee, ankle
+        [0.2, 0, 0.9], [0.2, 0, 1.15], [0.2, 0, 1.4],           # right wrist, elbow, shoulder
+        [-0.2, 0, 1.4], [-0.2, 0, 1.15], [-0.2, 0, 0.9],        # left shoulder, elbow, wrist
+        [0, 0, 1.45], [0, 0, 1.8],                              # bottom and top of the head
+    ])  # fmt: skip
+    write_actors(tmp_path / "actorsGT.mat", [[ankles_first, None], [None, None]])
+    people = read_people(tmp_path / "actorsGT.mat")
+    np.testing.assert_allclose(people.joints[0], standing(people.joint_names), atol=1e-9)
+
+    # Panoptic: x, y, z in cm and a confidence for each joint; y points down. Neck, nose, middle of
+    # the hips, left arm, left leg, right arm, right leg, left eye and ear, right eye and ear.
+    scene = [0, -145, 0, 0.7, 0, -160, 15, 0.6, 0, -95, 0, 0.4,
+             -20, -140, 0, 0.6, -20, -115, 0, 0.6, -20, -90, 0, 0.6,
+             -20, -95, 0, 0.4, -20, -50, 0, 0.5, -20, -10, 0, 0.5,
+             20, -140, 0, 0.6, 20, -115, 0, 0.6, 0, 0, 0, -1,
+             20, -95, 0, 0.3, 20, -50, 0, 0.4, 20, -10, 0, 0.5,
+             -20, -165, 12, 0.5, -20, -164, 0, 0.5,
+             20, -165, 12, 0.4, 20, -164, 0, 0.5]  # fmt: skip
+    text = {"version": 0.7, "univTime": 53541.542, "fpsType": "hd_29_97",
+            "bodies": [{"id": 3, "joints19": scene}]}  # fmt: skip
+    (tmp_path / "body3DScene_00000120.json").write_text(json.dumps(text))
+    people = read_people(tmp_path)
+    turned = people.joints[0] @ np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
+    wrist = people.joint_names.index("RWrist")
+    assert people.person.tolist() == [3] and np.isnan(turned[wrist]).all()
+    there = [joint for joint in range(19) if joint != wrist]
+    np.testing.assert_allclose(turned[there], standing(people.joint_names)[there], atol=1e-9)
+
+    # Human3.6M: hip, right leg, left leg, spine, thorax, nose, head, left arm, right arm.
+    order = ("MidHip RHip RKnee RAnkle LHip LKnee LAnkle Neck Neck Nose Head LShoulder LElbow "
+             "LWrist RShoulder RElbow RWrist").split()  # fmt: skip
+    np.savez(tmp_path / "h36m.npz", joints=standing(order)[None], layout="h36m")
+    people = read_people(tmp_path / "h36m.npz")
+    for name in ("RAnkle", "LKnee", "LWrist", "RElbow", "MidHip"):
+        np.testing.assert_allclose(people.joints[0, people.joint_names.index(name)],
+                                   standing([name])[0])  # fmt: skip
+    np.savez(tmp_path / "h36m.npz", joints=1000 * standing(order)[None], layout="h36m")
+    with pytest.raises(InputError, match="check the unit"):
+        read_people(tmp_path / "h36m.npz")
+
+
+def test_a_motion_of_amass(tmp_path):
+    """SMPL+H's 156 values, z up, at 120 Hz: the root's rotation is first, and the body stands."""
+    poses = np.zeros((8, 156))
+    poses[:, :3] = [np.pi / 2, 0, 0]  # SMPL's y up to the file's z up: faces -y
+    motion = {"poses": poses, "trans": np.tile([1.0, 2.0, 1.2], (8, 1)), "betas": np.zeros(16),
+              "gender": "neutral", "mocap_framerate": 120.0, "dmpls": np.zeros((8, 8))}  # fmt: skip
+    np.savez(tmp_path / "walk_poses.npz", **motion, body="shapepose-fg open body")
+    people = read_people(tmp_path / "walk_poses.npz", up="z", fps=30.0)
+    assert people.frame.tolist() == [0, 1]
+    at = dict(zip(people.joint_names, people.joints[0], strict=True))
+    assert at["Neck"][2] - at["LAnkle"][2] > 1.1  # it stands,
+    assert at["LShoulder"][0] - at["RShoulder"][0] > 0.2 and at["Nose"][1] < at["Neck"][1]
+    assert np.linalg.norm(at["MidHip"][:2] - [1, 2]) < 0.2
+    newer = {**motion, "poses": np.zeros((8, 165)), "mocap_frame_rate": 120.0}
+    np.savez(tmp_path / "walk_stageii.npz", **newer, body="shapepose-fg open body")
+    with pytest.raises(InputError, match="SMPL-X"):
+        read_people(tmp_path / "walk_stageii.npz", up="z")
 
 
 def test_a_damaged_matlab_file_is_one_sentence(tmp_path):

@@ -5,8 +5,12 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation.metrics import PlainPeople
 from shapepose_fg.evaluation.score import score
-from shapepose_fg.evaluation.shelf import LIMB_ENDS, shelf_joints
-from shapepose_fg.evaluation.shelf_annotation import SHELF_JOINTS, read_shelf_ground_truth
+from shapepose_fg.evaluation.shelf import (
+    LIMB_ENDS,
+    SHELF_JOINTS,
+    read_shelf_ground_truth,
+    shelf_joints,
+)
 
 UPRIGHT = dict(
     RAnkle=(0.09, 0, 0.1),

@@ -5,13 +5,11 @@ import pytest
 
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.evaluation.metrics import match_people
 from shapepose_fg.evaluation.tracking import (
     acceleration_errors,
     body_joints,
     fast_wrist_errors,
     frames_unseen,
-    identity_metrics,
     joints_by_frame,
     score_tracks,
 )
@@ -29,13 +27,6 @@ def standing(places_m, frames):
     person = np.stack([np.zeros(J), np.zeros(J), 0.02 * np.arange(J)], axis=1)
     at = np.stack([places_m, np.zeros(len(places_m)), np.zeros(len(places_m))], axis=1)
     return np.broadcast_to(at[:, None] + person, (frames, len(places_m), J, 3)).copy()
-
-
-def identities(truth, rows):
-    """`identity_metrics` of rows (frame, identity, joints)."""
-    frame, identity = (np.array([row[i] for row in rows], dtype=int) for i in (0, 1))
-    joints = np.array([row[2] for row in rows]).reshape(-1, J, 3)
-    return identity_metrics(match_people(frame, joints, truth), frame, identity, joints, truth)
 
 
 def result(frame, identity, joints, sigma_m=0.02):
@@ -73,71 +64,6 @@ def noisy(truth, sigma_m=0.02, seed=0):
         joints=truth.joints + rng.normal(0, sigma_m, truth.joints.shape),
         covariance=covariance,
     )
-
-
-def test_perfect_identities():
-    truth = standing([0.0, 2.0], 4)
-    found = identities(truth, [(t, 7 + p, truth[t, p]) for t in range(4) for p in range(2)])
-    assert found.idf1 == 1.0
-    assert (found.switches, found.tracks, found.false_tracks) == (0, 2, 0)
-
-
-def test_a_swap_after_six_of_ten_frames():
-    """Each identity is its person in 6 of 10 frames: IDTP 12 of 20 rows and 20 people, two
-    switches.
-    """
-    truth = standing([0.0, 2.0], 10)
-    found = identities(
-        truth, [(t, p if t < 6 else 1 - p, truth[t, p]) for t in range(10) for p in range(2)]
-    )
-    assert found.idf1 == pytest.approx(0.6)
-    assert found.switches == 2
-
-
-def test_a_gap_and_a_new_identity_after_it():
-    """Frames 0-3 as identity 1, 4-5 nobody, 6-9 as identity 2: IDTP 4 (one identity only), rows 8,
-    truth 10.
-    """
-    truth = standing([0.0], 10)
-    found = identities(
-        truth, [(t, 1 if t < 4 else 2, truth[t, 0]) for t in (0, 1, 2, 3, 6, 7, 8, 9)]
-    )
-    assert found.idf1 == pytest.approx(2 * 4 / 18)
-    assert (found.switches, found.tracks) == (1, 2)
-
-
-def test_a_gap_in_the_truth_costs_nothing():
-    truth = standing([0.0], 6)
-    truth[2:4] = np.nan
-    found = identities(truth, [(t, 1, truth[t, 0]) for t in (0, 1, 4, 5)])
-    assert found.idf1 == 1.0
-    assert found.people_true == 4
-
-
-def test_the_assignment_of_identities_is_global():
-    """Identity 0 is person A in 3 frames and B in 2, identity 1 is A in 2 frames: A-1 and B-0 (4)
-    beat A-0 (3).
-    """
-    truth = standing([0.0, 2.0], 5)
-    rows = [(t, 0, truth[t, 0]) for t in range(3)] + [(t, 0, truth[t, 1]) for t in (3, 4)]
-    rows += [(t, 1, truth[t, 0]) for t in (3, 4)]
-    assert identities(truth, rows).true_positives == 4
-
-
-def test_a_phantom_is_a_false_track():
-    truth = standing([0.0], 5)
-    rows = [(t, 0, truth[t, 0]) for t in range(5)] + [
-        (t, 9, truth[t, 0] + [5.0, 0, 0]) for t in range(2)
-    ]
-    found = identities(truth, rows)
-    assert found.idf1 == pytest.approx(10 / 12)
-    assert (found.tracks, found.false_tracks) == (2, 1)
-
-
-def test_an_identity_twice_in_a_frame_is_refused():
-    truth = standing([0.0, 2.0], 1)
-    with pytest.raises(ValueError, match="two rows in one frame"):
-        identities(truth, [(0, 3, truth[0, 0]), (0, 3, truth[0, 1])])
 
 
 def test_a_person_who_jumps_by_3_cm_in_one_frame():
@@ -252,7 +178,7 @@ def test_duplicates_phantoms_and_missed(truth, scene):
     rows = Reconstruction.concatenate([people.rows(people.person != 2), double])
     score = score_tracks(rows, truth, scene.fps)
     assert (score.joints.false_positives, score.joints.people_missed) == (20, 20)
-    assert (score.identities.false_tracks, score.identities.longest_false_positive) == (1, 20)
+    assert (score.identities.false_positives, score.identities.misses) == (20, 20)
     assert score.identities.idf1 == pytest.approx(40 / 60)
 
 

@@ -24,7 +24,7 @@ from shapepose_fg.core.rig_file import POSE
 from shapepose_fg.core.skeleton import BODY_25, COCO_17
 from shapepose_fg.detection2d.opening import read_form
 from shapepose_fg.estimation.motion_model import MotionConfig, MotionModel
-from shapepose_fg.evaluation.shelf_annotation import read_shelf_ground_truth
+from shapepose_fg.evaluation.shelf import read_shelf_ground_truth
 from shapepose_fg.evaluation.truth import read_people
 from shapepose_fg.io.calibration import read_rig, write_rig
 from shapepose_fg.io.config import read_config, toml_text

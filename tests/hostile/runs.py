@@ -34,7 +34,7 @@ from shapepose_fg.io.export.registry import FORMATS, export_result
 from shapepose_fg.pipeline.bodies_over_time import fit_everybody
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.execution import Execution
-from shapepose_fg.pipeline.offsets import kept_offsets
+from shapepose_fg.pipeline.offsets import Sample, kept_offsets
 from shapepose_fg.pipeline.pipeline import Task, reconstruct_parts
 from shapepose_fg.pipeline.runs import manifest
 from shapepose_fg.pipeline.runs.assembly import Assembly
@@ -178,7 +178,7 @@ def parts_of(
             made = Assembly(parts, joints, own.rig.names)
             if "bodies-0.safetensors" in valid:
                 known = SubjectShapes.empty("body")
-                kept_offsets(kept, setup, detections, times, Notebook())
+                kept_offsets(kept, Sample(setup, detections, times), Notebook())
                 made = replace(
                     made, bodies=fit_everybody(made.rows_of, made.person, list, kept, known)
                 )

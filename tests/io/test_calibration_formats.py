@@ -615,7 +615,7 @@ def written_bytes(path: Path, content: bytes) -> Path:
 
 
 def test_the_way_out_of_opencap_s_pickles(tmp_path, monkeypatch):
-    """The program in docs/conventions.md, on pickles with the keys, shapes and units of OpenCap."""
+    """The program in docs/calibration_files.md, on pickles like OpenCap's."""
     for each in TRUTH.cameras:
         folder = tmp_path / "Videos" / f"Cam_{each.name}"
         folder.mkdir(parents=True)
@@ -627,10 +627,10 @@ def test_the_way_out_of_opencap_s_pickles(tmp_path, monkeypatch):
             "translation": 1000 * each.cTw[:, 3:],
         }
         (folder / "cameraIntrinsicsExtrinsics.pickle").write_bytes(pickle.dumps(content))
-    page = (Path(__file__).parents[2] / "docs" / "conventions.md").read_text()
+    page = (Path(__file__).parents[2] / "docs" / "calibration_files.md").read_text()
     (block,) = re.findall(r"```python\n(import pickle.*?)```", page, flags=re.DOTALL)
     monkeypatch.chdir(tmp_path)
-    exec(compile(block, "docs/conventions.md", "exec"), {})
+    exec(compile(block, "docs/calibration_files.md", "exec"), {})
     rig = read_rig(tmp_path / "rig.json")
     assert rig.up == "-y" and rig.names == ("Cam_alpha", "Cam_beta", "Cam_gamma")
     assert_same(renamed(rig, NAMES), TRUTH)

@@ -437,7 +437,7 @@ def test_a_skeleton_of_the_user_s_own(tmp_path, rig):
 
 
 def test_the_skeleton_of_the_documents(tmp_path):
-    page = (Path(__file__).parents[2] / "docs" / "conventions.md").read_text()
+    page = (Path(__file__).parents[2] / "docs" / "joints.md").read_text()
     (block,) = re.findall(r"```toml\n(name = .*?)```", page, flags=re.DOTALL)
     (tmp_path / "ours.toml").write_text(block)
     skeleton = read_skeleton(tmp_path / "ours.toml")
@@ -459,7 +459,7 @@ BAD_SKELETONS = [
         'anchor = ["r_sho", "l_sho"]',
         "an anchor of two joints must be the hips",
     ),
-    ('name = "ours"', "", "name is missing; docs/conventions.md describes the file"),
+    ('name = "ours"', "", "name is missing; docs/joints.md describes the file"),
     ('neck = "Neck"', 'nick = "Neck"', "body.nick is not a keypoint of ours; it has head"),
     ('r_wri = "RWrist"', 'r_wri = "LWrist"', "joint LWrist occurs twice"),
     ("limbs = [", "limbs = ", "cannot be read as TOML"),

@@ -65,11 +65,10 @@ def test_the_nodes_package_names_what_it_uses():
     assert used | {"hri_msgs", "sensor_msgs", "std_msgs", "visualization_msgs"} <= given
     assert given - {"launch", "launch_ros"} <= used | sent
     setup = (NODE / "setup.py").read_text()
-    (name, module) = re.findall(r'"(\w+) = shapepose_ros\.(\w+):main"', setup)[0]
+    (module,) = re.findall(r'"\w+ = shapepose_ros\.(\w+):main"', setup)
     assert (NODE / "shapepose_ros" / f"{module}.py").is_file()
     for file in re.findall(r'\["((?:launch|config|package)[^"]*)"\]', setup):
         assert (NODE / file).is_file()
-    assert f'executable="{name}"' in (NODE / "launch" / "people.launch.py").read_text()
     versions = [ElementTree.parse(each).findtext("version") for each in ROS2.glob("*/package.xml")]
     assert len(set(versions)) == 1 and f'version="{versions[0]}"' in setup
 
@@ -169,10 +168,58 @@ def detections(rig, xy, view: int, time_s: float) -> SimpleNamespace:
 def test_parameters_are_those_of_the_files(people_node):
     text = (NODE / "config" / "people.yaml").read_text()
     assert yaml.safe_load(text)["/**"]["ros__parameters"] == people_node.PARAMETERS
-    launch = (NODE / "launch" / "people.launch.py").read_text()
-    passed = set(re.findall(r'"(\w+)": ParameterValue', launch))
-    assert passed - {"use_sim_time"} <= people_node.PARAMETERS.keys() and "use_sim_time" in passed
-    assert passed <= set(re.findall(r'DeclareLaunchArgument\(\s*"(\w+)"', launch))
+
+
+class Recorded(SimpleNamespace):
+    """An object of `launch` or `launch_ros`: what it was made from."""
+
+    def __init__(self, *given, **named) -> None:
+        super().__init__(given=given, **named)
+
+    def perform(self, context: dict) -> str:
+        """The value of a launch configuration."""
+        return context[self.given[0]]
+
+
+def test_the_launch_file_starts_the_node_with_its_parameters(people_node, monkeypatch):
+    """Run with a `launch` that only remembers: own arguments override the file of parameters, and
+    those that are not given leave it alone.
+    """
+    names = {
+        "launch": "LaunchDescription LaunchContext",
+        "launch.actions": "DeclareLaunchArgument OpaqueFunction",
+        "launch.substitutions": "LaunchConfiguration PathJoinSubstitution",
+        "launch_ros": "",
+        "launch_ros.actions": "Node",
+        "launch_ros.parameter_descriptions": "ParameterValue",
+        "launch_ros.substitutions": "FindPackageShare",
+    }
+    for module, classes in names.items():
+        made = ModuleType(module)
+        vars(made).update({each: type(each, (Recorded,), {}) for each in classes.split()})
+        monkeypatch.setitem(sys.modules, module, made)
+    file = NODE / "launch" / "people.launch.py"
+    scope: dict = {"__name__": "people_launch"}
+    exec(compile(file.read_text(), str(file), "exec"), scope)
+    (actions,) = scope["generate_launch_description"]().given
+    *arguments, opened = actions
+    declared = {each.given[0]: each.default_value for each in arguments}
+    (share, *path) = declared.pop("parameters").given[0]
+    known = {**people_node.PARAMETERS, "use_sim_time": False}
+    given = {"calibration": "/my/rig.json", "skeleton": "COCO_17", "use_sim_time": "true"}
+    assert set(declared.values()) == {""} and declared.keys() == given.keys() <= known.keys()
+    for context in ({**declared, "calibration": "/my/rig.json"}, given, declared):
+        (node,) = opened.function(context)
+        manifest = ElementTree.parse(NODE / "package.xml")
+        assert node.package == manifest.findtext("name")
+        assert f'"{node.executable} = ' in (NODE / "setup.py").read_text()
+        settings, *own = node.parameters
+        assert settings.given == ("parameters",)
+        assert share.given == (node.package,) and NODE.joinpath(*path).is_file()
+        passed = own[0] if own else {}
+        assert passed.keys() == {name for name, value in context.items() if value}
+        for name, value in passed.items():
+            assert value.given[0].given == (name,) and value.value_type is type(known[name])
 
 
 @pytest.mark.slow

@@ -34,7 +34,7 @@ def run(rig, frames, each=lambda live: None):
         for n, detections in enumerate(frames):
             live.push(detections, n / FPS)
             each(live)
-        return live.said(), live.report(), live.people()
+        return live.camera_changes(), live.report(), live.people()
 
 
 def test_a_camera_that_falls_silent_is_named_and_comes_back(five_cameras, steps):

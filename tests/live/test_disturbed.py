@@ -86,7 +86,7 @@ def test_a_camera_whose_clock_is_set_is_left_out_and_named(live, five_cameras, s
         each[2] += shift_s if each[0] == five_cameras.names[2] else 0.0
     play(live, given)
     assert live.report().frames == FRAMES and live.report().jumps == 0
-    said = [(each.camera, each.state) for each in live.said()]
+    said = [(each.camera, each.state) for each in live.camera_changes()]
     assert (
         five_cameras.names[2],
         CameraState.OFF_CLOCK,
@@ -95,7 +95,7 @@ def test_a_camera_whose_clock_is_set_is_left_out_and_named(live, five_cameras, s
     for each in again:
         each[2] += shift_s if each[0] == five_cameras.names[2] else 0.0
     play(live, again)
-    said = [(each.camera, each.state) for each in live.said()]
+    said = [(each.camera, each.state) for each in live.camera_changes()]
     assert (five_cameras.names[2], CameraState.OFF_CLOCK) in said
     two_people_are_there(live, (2 * FRAMES - 1) / HZ)
 

@@ -240,13 +240,13 @@ def test_the_tracker_goes_on_from_refined_joints(start, dance):
     for frame in range(9):
         live.push(dance.recording[frame], frame / 30)
     slots, before = live._state.slots, live.people()
-    at = slots[-3].moment
+    at = slots[-3].state
     row = int(np.flatnonzero(at.identity == 1)[0])
     joints = before.joints + np.array([0.05, 0.0, 0.0])
     joints[:, 4] = np.nan
     refined = replace(before, joints=joints, frame=np.full(len(before), slots[-3].given.frame))
     live._restart(refined.rows(before.person == 1))
-    there = slots[-3].moment.tracks.joints.position
+    there = slots[-3].state.tracks.joints.position
     known = np.arange(25) != 4
     assert np.array_equal(there[row][known], joints[before.person == 1][0][known])
     assert np.array_equal(there[row][4], at.tracks.joints.position[row][4])
@@ -269,5 +269,5 @@ def test_a_late_frame_leaves_what_was_refined_after_it(start, dance):
     live.push(dance.recording[6], 6 / 30)
     slot = live._state.slots[-2]
     assert slot.given is given and live.report().late == 1
-    rows = [slot.moment.identity.tolist().index(who) for who in people.person.tolist()]
-    np.testing.assert_array_equal(slot.moment.tracks.joints.position[rows], joints)
+    rows = [slot.state.identity.tolist().index(who) for who in people.person.tolist()]
+    np.testing.assert_array_equal(slot.state.tracks.joints.position[rows], joints)

@@ -17,7 +17,7 @@ from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.detector_offsets import OffsetConfig
 from shapepose_fg.evaluation.metrics import joint_metrics
 from shapepose_fg.evaluation.score import score as score_of
-from shapepose_fg.evaluation.shelf_annotation import read_shelf_ground_truth
+from shapepose_fg.evaluation.shelf import read_shelf_ground_truth
 from shapepose_fg.evaluation.truth import people_of
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections

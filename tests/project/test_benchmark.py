@@ -33,6 +33,24 @@ def test_a_long_recording_goes_back_and_forth(script):
     ]
 
 
+def test_the_exponent_of_growth_is_that_of_the_time_beyond_a_frame(script, monkeypatch, tmp_path):
+    """A command that takes a second, and one more for the square of the number of people."""
+
+    def spent(tree, options, output):
+        people = 0 if "0:1" in options else made[-1]
+        return script.Spent(1.0 + people**2, 0.0, 100.0, {})
+
+    made = list[int]()
+    monkeypatch.setattr(script, "_USUAL", script._USUAL | {"frames": 2, "cameras": 2})
+    monkeypatch.setattr(script, "_GROWTH", {"people": (1, 2, 3)})
+    monkeypatch.setattr(
+        script, "simulate", lambda scene, config: made.append(scene.people) or simulate(scene)
+    )
+    monkeypatch.setattr(script, "spend", spent)
+    exponents = [*script.growth(tmp_path).columns[2].cells]
+    assert exponents == ["", "2.00", "2.00"]
+
+
 @pytest.mark.slow
 def test_a_command_that_fails_is_shown_with_what_it_said(script, tmp_path):
     with pytest.raises(SystemExit, match=r"(?s)--detections here .*failed.*here"):

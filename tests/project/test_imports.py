@@ -13,14 +13,15 @@ import pytest
 ROOT = Path(__file__).parents[2]
 
 LEVELS = (
-    "factors core.arrays core.kept_kernels core.errors core.rows",
-    "core.compiling core.decompositions",
+    "factors core.arrays core.errors core.rows",
+    "core.storage.files core.decompositions",
+    "core.kept_kernels core.bounds",
+    "core.compiling",
     "core.compiled",
     "core.skeleton core.kernel_geometry core.assignment core.lens core.trajectory",
     "core.joint_names",
     "core.camera",
     "core.drawing",
-    "core.storage.files core.bounds",
     "core.storage.npz",
     "core.storage.schema",
     "core.storage.output_folder core.storage.kept_arrays core.shapes core.provenance"

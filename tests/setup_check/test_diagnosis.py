@@ -58,6 +58,8 @@ def test_nothing_is_said_where_nothing_is_wrong(recording, room):
     # Bones of the three are 0.94, 0.99 and 1.04 times those of a figure of 1.7 m; ratios of bones
     # vary by 10 %.
     assert diagnosis.build.stature == pytest.approx(1.7, abs=0.17)
+    odd = diagnose(recording, turned(room, 2, 5.0, np.array([0.0, 1.0, 0.0])))
+    assert len(diagnosis.look.evidence.anchors) < len(odd.look.evidence.anchors) / 2
     np.testing.assert_allclose(diagnosis.build.up, [0, 0, 1], atol=0.03)
 
 

@@ -14,6 +14,7 @@ from shapepose_fg.core.trust import Trust, Trusted
 from shapepose_fg.pipeline.pipeline import reconstruct
 from shapepose_fg.setup_check.findings import Kind
 from shapepose_fg.setup_check.report import check_setup, result_check
+from shapepose_fg.simulation import built_in_scene, simulate
 from tests.setup_check.spoiled_setups import mirrored, seen_as, turning
 from tests.setup_check.test_diagnosis import some_cameras
 
@@ -179,3 +180,10 @@ def test_people_whom_two_cameras_see_and_who_are_not_found_are_counted(recording
     assert len(words) == 1 and f"but {found:.1f} are found" in words[0] and found == seen - 1
     everybody = result_check(report, people, recording, room, range(20))
     assert not any("two cameras" in each for each in everybody.warnings)
+
+
+@pytest.mark.parametrize("frames", [12, 20])
+def test_a_second_of_film_accuses_no_camera(frames):
+    """What a few frames show may be lasting errors of the detector."""
+    scene = built_in_scene(people=2, frames=frames)
+    assert check_setup(simulate(scene), scene.rig).findings == ()

@@ -92,7 +92,7 @@ class Evaluated(FitRows):
     step: Array
     """(B, P) the Newton step."""
     left: Array
-    """(B,) predicted decrease of the energy by that step."""
+    """(B,) predicted decrease of the energy by the next step."""
 
     def move(self, where: Mask, free: Array, slope: Linear) -> None:
         """Move the rows `where` (B,) to `free` (B, P) with the gradient there; the factored Hessian

@@ -42,7 +42,7 @@ _BELONGS = {
 }  # fmt: skip
 """SMPL joints near which keypoints must lie."""
 _FARTHEST = 0.15
-"""Maximum distance of these keypoints, as a share of the body's height."""
+"""Maximum distance of a keypoint from its SMPL joint, as a share of the body's height."""
 _RISING = ("ankle", "knee", "hip", "shoulder")
 """Joints in ascending order of height in T-pose."""
 

@@ -40,10 +40,6 @@ from shapepose_fg.pipeline.execution import Execution
 from shapepose_fg.pipeline.runs.manifest import PARTS
 from shapepose_fg.pipeline.workers import Processes
 
-ATTEMPTS = 2
-"""Maximum number of attempts for a recording."""
-_PATIENCE_S = 20.0
-"""Maximum time for a coordinator to stop, s."""
 _LEAST, _USUAL = 0.1, 2.0
 """Bytes of results per byte of detections: minimum, for many cameras and for files with hands and
 faces; and typical value."""
@@ -157,7 +153,8 @@ class BatchRunner:
             self._done(leader, told, batch_status)
             watcher.ended(name, failed=None, again=False)
         else:
-            now = batch_status.of[name].failed(told, time.monotonic() - leader.began, ATTEMPTS)
+            # Maximum number of attempts for a recording.
+            now = batch_status.of[name].failed(told, time.monotonic() - leader.began, 2)
             batch_status.set(name, now)
             watcher.ended(name, failed=told, again=now.status == "waiting")
         return True
@@ -195,7 +192,8 @@ class Leader:
         """Wait for the process to end, and terminate it if necessary; returns the last `Ended`
         message, if there is one.
         """
-        wait_for([self._end], _PATIENCE_S)
+        # Maximum time for a coordinator to stop, s.
+        wait_for([self._end], 20.0)
         self._process.shutdown()
         found = None
         try:

@@ -297,7 +297,9 @@ class _Run:
             if report is None
             else result_check(report, people, task.detections, rig, looked_at)
         )
-        result = result if checked is None else result.with_run(**checked.as_run())
+        if checked is not None:
+            spent = {"set-up check": checked.report.seconds} | result.run["seconds"]
+            result = result.with_run(**checked.as_run(), seconds=spent)
         people = people.with_run(**result.run)
         note(*set_aside(output))
         result.save(output)

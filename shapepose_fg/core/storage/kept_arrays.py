@@ -52,7 +52,7 @@ class KeptArrays:
         self._sets[name] = (_mapped(arrays), about)
 
     def drop(self, name: str) -> None:
-        """Remove a set, if it exists."""
+        """Remove a named set of arrays, if it exists."""
         self._sets.pop(name, None)
 
     def about(self, name: str) -> Any:

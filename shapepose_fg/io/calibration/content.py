@@ -34,17 +34,9 @@ _TOML_LINE = re.compile(
     r"""\s*(\[\[?\s*[\w."' -]*[A-Za-z_."'][\w."' -]*\]\]?\s*(#.*)?$|[\w."'-]+\s*=)"""
 )
 _YAML_LINE = re.compile(r"\s*(- )?[\w/.\"' -]+:(\s|$)")
-_MOST_OF_A_LINE = 1000
-"""Number of characters that are used to recognise the syntax; the time of the patterns is quadratic
-in it."""
 _XML_DECLARATION = re.compile(r"<!(DOCTYPE|ENTITY)")
 _YAML_VERSION = re.compile(r"\A%YAML[^\n]*\n")
 _ARRAY_TAGS = ("opencv-matrix", "opencv-nd-matrix")
-_MOST_CHARACTERS = 2**23
-"""Maximum number of characters of a calibration file; a camera takes about a thousand."""
-_MOST_DIGITS = 100
-"""Maximum number of digits of a number: the time to parse YAML's base-60 numbers is quadratic in
-it."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +65,9 @@ def load(path: Path) -> Content:
     lines = [
         line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")
     ]
-    first = lines[0][:_MOST_OF_A_LINE] if lines else ""
+    # Number of characters that are used to recognise the syntax; the time of the patterns
+    # is quadratic in it.
+    first = lines[0][:1000] if lines else ""
     if first.lstrip().startswith("<"):
         root = _parse_xml(path, text)
         storage = root.tag == "opencv_storage"
@@ -123,7 +117,8 @@ def _parse_yaml(path: Path, text: str) -> Any:
 
 
 def _refuse_long(path: Path, text: str) -> None:
-    if len(text) > _MOST_CHARACTERS:
+    # Maximum number of characters of a calibration file; a camera takes about a thousand.
+    if len(text) > 2**23:
         raise InputError(
             f"{path}: the file has {len(text)} characters, too many for a calibration; check the "
             "path"
@@ -185,7 +180,9 @@ def _array_of_yaml(loader: Any, node: yaml.Node) -> Any:
 
 
 def _short_number(loader: Any, node: yaml.ScalarNode) -> Any:
-    if len(node.value) > _MOST_DIGITS:
+    # Maximum number of digits of a number: the time to parse YAML's base-60 numbers is
+    # quadratic in it.
+    if len(node.value) > 100:
         raise yaml.constructor.ConstructorError(
             problem="a number is too long", problem_mark=node.start_mark
         )

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from shapepose_fg.core.arrays import Array
@@ -22,8 +23,6 @@ from shapepose_fg.io.calibration.written import (
     rotation_of,
 )
 
-_FISHEYE = 1
-"""OpenCV's CALIB_MODEL_FISHEYE."""
 _MOST = 2**20
 """Maximum number of values of all cameras together."""
 _ASK = {
@@ -93,7 +92,7 @@ def _read_multiview(content: Content) -> WrittenRig | None:
     )
     sizes = nodes.needed("image_sizes", 2 * count).reshape(count, 2)
     models, ids = nodes.numbers("models", count), content.value.get("cam_ids")
-    fisheye = np.zeros(count, dtype=bool) if models is None else models == _FISHEYE
+    fisheye = np.zeros(count, dtype=bool) if models is None else models == cv2.CALIB_MODEL_FISHEYE
     numbers = nodes.needed("distortions", most=_MOST)
     # All coefficients are in one list: four per fisheye camera, and an equal number for each other
     # camera.

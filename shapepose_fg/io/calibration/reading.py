@@ -44,12 +44,12 @@ def read_rig(
 ) -> Rig:
     """Read the cameras of a calibration file or folder; the format is recognised by the content.
 
-    The formats are `FORMATS`; docs/conventions.md lists their units and up axes. `up` and `unit`
-    override the file. `image_size` (width, height) is for formats that do not state the size of the
-    pictures. `cameras` are names of the cameras to read, all by default; `without` are names of
-    cameras to leave out. InputError, one sentence that names the file, the key and the cure, if a
-    required value is given neither by the file nor by the caller. `notes` of the rig list what was
-    left out.
+    The formats are `FORMATS`; docs/calibration_files.md lists their units and up axes. `up` and
+    `unit` override the file. `image_size` (width, height) is for formats that do not state the
+    size of the pictures. `cameras` are names of the cameras to read, all by default; `without`
+    are names of cameras to leave out. InputError, one sentence that names the file, the key and
+    the cure, if a required value is given neither by the file nor by the caller. `notes` of the
+    rig list what was left out.
     """
     path = Path(path)
     for name, value, known in (("up", up, get_args(Axis)), ("unit", unit, METRES)):
@@ -59,7 +59,7 @@ def read_rig(
     if content.syntax == "pickle":
         raise InputError(
             f"{path}: this is a Python pickle (as OpenCap writes), which could run any program "
-            "when opened; if you trust it, convert it to a rig file as in docs/conventions.md"
+            "when opened; if you trust it, convert it to a rig file as in docs/calibration_files.md"
         )
     if (known := recognised(content)) is None:
         raise InputError(_unknown(content))
@@ -176,5 +176,5 @@ def _unknown(content: Content) -> str:
     known = ", ".join(form.name for form in FORMATS)
     return (
         f"{content.path}: recognised as {found}, but this is not a known calibration format; "
-        f"give one of {known} (docs/conventions.md)"
+        f"give one of {known} (docs/calibration_files.md)"
     )

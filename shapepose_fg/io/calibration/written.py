@@ -25,11 +25,6 @@ Unit = Literal["m", "cm", "mm"]
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 """Length of each unit, metres."""
 
-_EXACT = 1e-12
-"""Deviation from orthonormal below which a rotation is not changed, so that writing and reading a
-rig is lossless."""
-_MOST_COEFFICIENTS = 14
-
 
 @dataclass(frozen=True)
 class WrittenCamera:
@@ -154,7 +149,7 @@ class Node:
         size: Sequence[str | Sequence[str]],
         distortion: str | Sequence[str],
         lens: Lens = "perspective",
-        most: int = _MOST_COEFFICIENTS,
+        most: int = 14,
     ) -> WrittenCamera:
         """A camera with the pose `wTc`. Intrinsics are read by their names; `size` is the name of a
         list of two values, or two names.
@@ -225,7 +220,9 @@ def pose(
     if np.linalg.det(R) < 0:
         cure = "use a right-handed world and OpenCV's camera axes: x right, y down, z forward"
         raise InputError(f"{place}: the rotation of {key} is a reflection (determinant -1); {cure}")
-    if off >= _EXACT:
+    # Deviation from orthonormal below which a rotation is not changed, so that writing and
+    # reading a rig is lossless.
+    if off >= 1e-12:
         R = nearest_rotation(R)
     if world_from_camera:
         return rigid(R, t)

@@ -36,9 +36,6 @@ SUBPIXEL = 64.0
 _FULL = (1080, 1440, 2160)
 """Numbers of lines of full sensors in QTM's resolution names; no video camera has a smaller
 sensor."""
-_CROPPED = 8
-"""Largest difference between the number of lines of a picture and that in its resolution's name:
-1080p has 1088 lines."""
 _LINES = re.compile(r"(\d{3,4})[pi]", re.ASCII)
 _VIDEO = ("video", "hybrid", "none")
 """Words in the models of video cameras: Miqus Video (Plus), Miqus Hybrid; "none" means unknown."""
@@ -155,7 +152,9 @@ def scale_of(camera: ET.Element) -> float:
     ]
     sensor = max([lines for lines in (window, *whole) if lines is not None], default=0.0)
     full, lines = max(each for each in _FULL if each <= max(sensor, _FULL[0])), int(named[1])
-    cropped = full > _FULL[0] and window is not None and 0 <= window - lines <= _CROPPED
+    # Largest difference between the number of lines of a picture and that in its
+    # resolution's name: 1080p has 1088 lines.
+    cropped = full > _FULL[0] and window is not None and 0 <= window - lines <= 8
     return 1.0 if cropped else min(1.0, lines / full)
 
 

@@ -24,10 +24,6 @@ _FREEMOCAP, _SLEAP, _DEEPLABCUT = (
     "DeepLabCut's HDF5",
 )
 _RERUN = "write the detections again, in pixels"
-_MOST_VALUES = 2**29
-"""Maximum number of values in a file: as many as one hour of four cameras with MediaPipe's 553
-points at 30 Hz."""
-_MOST_CAMERAS = 1000
 _MOST_NAMES, _LONGEST_NAME = 1000, 1000
 _TABLE = "df_with_missing/table"
 """Path of the table in files of DeepLabCut and AniPose."""
@@ -89,7 +85,9 @@ def read_freemocap(path: Path, camera: int, cameras: int) -> CameraPeople:
                 f"{path}: has {shape[0]} cameras, but {cameras} are expected; give the "
                 "calibration of the same recording, with all cameras in the same order"
             )
-        if np.prod(shape, dtype=float) > _MOST_VALUES:
+        # Maximum number of values in a file: as many as one hour of four cameras with
+        # MediaPipe's 553 points at 30 Hz.
+        if np.prod(shape, dtype=float) > 2**29:
             raise InputError(f"{path}: its arrays {shape} are too large; split the recording")
         size = path.stat().st_size - offset
         if size < int(np.prod(shape)) * dtype.itemsize:
@@ -121,7 +119,7 @@ def cameras_of_freemocap(path: Path) -> list[str]:
     `read_freemocap` does.
     """
     with open_regular(path) as stream:
-        return [f"cam_{n}" for n in range(min(_header(path, stream)[0][0], _MOST_CAMERAS))]
+        return [f"cam_{n}" for n in range(min(_header(path, stream)[0][0], 1000))]
 
 
 def _header(path: Path, stream: Any) -> tuple[tuple[int, ...], np.dtype[Any], bool, int]:

@@ -1,7 +1,7 @@
 """The detection text of 4D Association: joint candidates of one camera, with part affinities.
 
 Zhang et al., "4D Association Graph for Realtime Multi-person Motion Capture", CVPR 2020. The file
-is a stream of numbers; docs/conventions.md gives their order.
+is a stream of numbers; docs/detection_files.md gives their order.
 """
 
 from collections.abc import Iterator

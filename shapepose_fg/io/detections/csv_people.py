@@ -19,7 +19,6 @@ from shapepose_fg.io.validation import is_number
 
 _DEEPLABCUT, _CALISCOPE = "DeepLabCut's CSV", "Caliscope's CSV"
 _RERUN = "write the detections again, in pixels"
-_MOST_COLUMNS = 10_000
 BLAZEPOSE = SKELETONS["BLAZEPOSE_33"].keypoint_count
 """Number of MediaPipe's points of the body; those of hands and face follow."""
 _LINES = 4096
@@ -203,7 +202,7 @@ def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
     reader = csv.reader(lines())
     try:
         for row in reader:
-            if len(row) > _MOST_COLUMNS:
+            if len(row) > 10_000:
                 raise InputError(f"{path}: line {reader.line_num} has {len(row)} columns; {_RERUN}")
             if any(row):
                 yield reader.line_num, row

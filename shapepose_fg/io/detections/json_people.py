@@ -59,8 +59,6 @@ _RERUN = {
 _LONGEST_GAP = 1000
 """Maximum ratio of missing to existing frames; a larger ratio means that the numbers are not frame
 numbers."""
-_LOOKED_AT = 100
-"""Maximum number of files without people that are read before the program is identified."""
 FRAME_FILE = r"(_keypoints|(\.\w{1,5})?\.predictions)?\.json"
 """Pattern of what follows the frame number in file names."""
 _ALL_FRAMES, _SEP_JSON = "alphapose-results.json", "sep-json"
@@ -68,9 +66,6 @@ _ALL_FRAMES, _SEP_JSON = "alphapose-results.json", "sep-json"
 cmu)."""
 _LISTS = ("annotations", "instance_info")
 """Keys of the list if the file is an object: COCO's data sets, and MMPose."""
-_AT_ONCE = 1024
-"""Number of items that are validated together: as Python objects they need several times the memory
-of arrays."""
 
 
 class _Person(BaseModel, strict=True, extra="allow"):
@@ -304,7 +299,8 @@ def _program_of_frames(files: list[Path]) -> tuple[str, str | tuple[str, ...] | 
     joint names in it.
     """
     program, joints = _POSE2SIM, None
-    for n, file in enumerate(files[:_LOOKED_AT]):
+    # Maximum number of files without people that are read before the program is identified.
+    for n, file in enumerate(files[:100]):
         content = read_json(file, most=MIDDLE)
         if isinstance(content, dict):
             if n == 0:
@@ -398,7 +394,9 @@ class _Collected:
     ) -> Iterator[tuple[int, list[Any]]]:
         """The validated items in batches, with the index of each batch's first item."""
         items, start = iter(items), 0
-        while len(some := list(islice(items, _AT_ONCE))) > 0:
+        # Number of items that are validated together: as Python objects they need
+        # several times the memory of arrays.
+        while len(some := list(islice(items, 1024))) > 0:
             yield start, validated_list(kind, some, self.path, _RERUN[self.program], start)
             start += len(some)
 

@@ -19,8 +19,6 @@ from shapepose_fg.io.camera_names import listing
 from shapepose_fg.io.detections.people import CameraPeople, DeclaredJoints, KeptPeople
 
 _CURE = "name the detector's layout with --skeleton"
-_MOST_PEOPLE = 200
-"""Maximum number of a camera's people that are compared with the proportions of a body."""
 _SPREAD, _SIGMAS = 0.5, 2.5
 """`_SPREAD`: assumed standard deviation of a person's fit, in addition to the observed one, nats
 per pair of joints; it is needed because a few similar people are weak evidence. `_SIGMAS`: standard
@@ -95,7 +93,9 @@ def _best_fit(people: Sequence[KeptPeople], layouts: Sequence[Skeleton]) -> tupl
     usual, fits = layouts[0], list[Array]()
     for each in people:
         if each.keypoint_count is not None:
-            fits.append(_fits(each.some(_MOST_PEOPLE), layouts))
+            # Maximum number of a camera's people that are compared with the
+            # proportions of a body.
+            fits.append(_fits(each.some(200), layouts))
             if (best := _sure(fits[-1])) is not None:
                 chosen.setdefault(layouts[best].name, each.camera)
     if len(chosen) > 1:

@@ -20,12 +20,6 @@ OVERSHOOT = 1.1
 _RARE = 0.01
 """Share of scores above the quantile by which all scores are divided; the maximum would depend on a
 single outlier."""
-_MOST_LOOKED_AT = 4_000_000
-"""Number of scores above which only every second, third ... of them is used to find their scale."""
-_BLOCKS_LOOKED_AT = 10
-"""Number of blocks of a camera's people that are compared with the proportions of a body."""
-_OCCLUDED = 0.5
-"""Score of a keypoint that is annotated as occluded (COCO's visibility 1)."""
 
 
 @dataclass(frozen=True)
@@ -163,7 +157,9 @@ class KeptPeople:
         not detected.
         """
         count = self.keypoint_count or 0
-        names = self._names[:: -(-len(self._names) // _BLOCKS_LOOKED_AT) if self._names else 1]
+        # Number of blocks of a camera's people that are compared with the proportions
+        # of a body.
+        names = self._names[:: -(-len(self._names) // 10) if self._names else 1]
         parts = [np.asarray(self._kept.array(name, "keypoints")) for name in names]
         every = np.concatenate(
             [np.zeros((0, count, 3)), *(part[:: -(-len(part) // most)] for part in parts)]
@@ -199,10 +195,13 @@ def score_rule(people: Sequence[KeptPeople]) -> tuple[Scores, str | None]:
     top = max(each.top_score for each in people)
     if top == 2 and all(each.visibilities for each in people):
         note = "scores are COCO visibilities: 2 (visible) is read as 1, and 1 (hidden) as 0.5"
-        return lambda score: np.where(score == 1, _OCCLUDED, score / 2), note
+        # Score of a keypoint that is annotated as occluded (COCO's visibility 1).
+        return lambda score: np.where(score == 1, 0.5, score / 2), note
     if top <= OVERSHOOT:
         return lambda score: np.minimum(score, 1.0), None
-    step = -(-sum(each.score_count for each in people) // _MOST_LOOKED_AT)
+    # Number of scores above which only every second, third ... of them is used to find
+    # their scale.
+    step = -(-sum(each.score_count for each in people) // 4_000_000)
     looked_at = np.concatenate([block.scores[::step] for each in people for block in each.blocks()])
     scale = max(1.0, float(np.quantile(looked_at, 1 - _RARE)))
     divided = f"divided by {scale:.3g}, their 99 % quantile, and " if scale > 1 else ""

@@ -43,13 +43,6 @@ from shapepose_fg.io.detections.yolo import label_files, read_yolo
 from shapepose_fg.io.footage.placement import FOOTAGE
 from shapepose_fg.io.skeleton_file import find_skeleton
 
-_MOST_FRAMES = 2_000_000
-"""Maximum number of frames of a recording: larger numbers are not frame numbers but ids of
-pictures."""
-_MOST_EMPTY = 200_000
-"""Maximum number of frames without people at the beginning. If there are more, frames are counted
-from the first one with people, with a note."""
-
 
 @dataclass(frozen=True)
 class Format:
@@ -101,13 +94,14 @@ def read_detections(
 ) -> DetectionTable:
     """Read the detections of every camera of `rig` from the folder `path`, undistorted.
 
-    The formats are `FORMATS`, recognised by the files (docs/conventions.md). Files of cameras that
-    are not in the rig are ignored. `skeleton` is a `Skeleton`, the name of one in `SKELETONS`, or a
-    TOML file that describes it; by default it is determined by joint names in the files, by a
-    project's declaration, or by the number of keypoints. `notes` of the table list how the files
-    were interpreted. The recording is stored in `kept`, by default in memory; with an empty
-    `InFolder` it may be larger than memory. With `own_frames`, cameras may have different numbers
-    of frames. Raises InputError, one sentence that names file, place and cure.
+    The formats are `FORMATS`, recognised by the files (docs/detection_files.md). Files of
+    cameras that are not in the rig are ignored. `skeleton` is a `Skeleton`, the name of one in
+    `SKELETONS`, or a TOML file that describes it; by default it is determined by joint names in
+    the files, by a project's declaration, or by the number of keypoints. `notes` of the table
+    list how the files were interpreted. The recording is stored in `kept`, by default in
+    memory; with an empty `InFolder` it may be larger than memory. With `own_frames`, cameras
+    may have different numbers of frames. Raises InputError, one sentence that names file, place
+    and cure.
     """
     kept = InMemory() if kept is None else kept
     form, places, notes = find_places(Path(path), rig)
@@ -315,7 +309,9 @@ def _streams_of(
     """
     cameras = [each.camera for each in people]
     first, last = _span(cameras)
-    empty = first if first <= _MOST_EMPTY and all(camera.lists_people for camera in cameras) else 0
+    # Maximum number of frames without people at the beginning. If there are more, frames
+    # are counted from the first one with people, with a note.
+    empty = first if first <= 200_000 and all(camera.lists_people for camera in cameras) else 0
     first -= empty
     rule, note = score_rule(people)
     for each, camera in zip(people, cameras, strict=True):
@@ -350,7 +346,9 @@ def _span(cameras: Sequence[CameraPeople]) -> tuple[int, int]:
         problem = f"recognised as {cameras[0].program}, but no camera has a frame"
         raise InputError(f"{cameras[0].source}: {problem}; give detections of people")
     first, last = min(each.first for each in listed), max(each.last for each in listed)
-    if last - first >= _MOST_FRAMES:
+    # Maximum number of frames of a recording: larger numbers are not frame numbers but ids
+    # of pictures.
+    if last - first >= 2_000_000:
         problem = (
             f"recognised as {listed[0].program}, but its frames would run from {first} to {last}"
         )

@@ -24,8 +24,6 @@ larger share means that the detections belong to other pictures."""
 _BENT = 0.5
 """Maximum share of a camera's joints at which its distortion cannot be inverted, as in the corners
 of wide lenses. A larger share means that the coefficients are wrong."""
-_LEAST_SCORE = 1e-6
-"""Score below which a joint counts as not detected; products of smaller scores underflow."""
 
 
 @dataclass(frozen=True)
@@ -266,7 +264,9 @@ class _Undistorted:
         outside = np.any((xy < -MARGIN * size) | (xy > (1 + MARGIN) * size), axis=1)
         why = f"far outside the {width} x {height} picture of the calibration"
         self.reasons[0].add(outside, partial(self._words, view, why))
-        certain = view.only(~outside & (view.seen.confidence >= _LEAST_SCORE))
+        # Score below which a joint counts as not detected; products of smaller scores
+        # underflow.
+        certain = view.only(~outside & (view.seen.confidence >= 1e-6))
         straight = camera.undistort(certain.seen.xy)
         undone = np.asarray(~np.isfinite(straight).all(axis=1))
         why = f"where the distortion of camera {camera.name} cannot be inverted"

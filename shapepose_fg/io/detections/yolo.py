@@ -14,8 +14,6 @@ from shapepose_fg.io.validation import is_number
 
 _YOLO = "YOLO's labels"
 _RERUN = "run yolo pose again with save_txt=True"
-_BOX = 5
-"""Number of values before the keypoints: class, and centre, width and height of the box."""
 
 
 def label_files(folder: Path) -> list[tuple[int, Path]]:
@@ -50,7 +48,8 @@ def _person(file: Path, line: int, words: list[str], image_size: tuple[int, int]
     """
     if not all(is_number(word) for word in words):
         raise InputError(f"{file}: line {line} must hold numbers; {_RERUN}")
-    numbers = np.array(words[_BOX:], dtype=np.float64)
+    # Number of values before the keypoints: class, and centre, width and height of the box.
+    numbers = np.array(words[5:], dtype=np.float64)
     count = len(numbers) // 3
     if count < 4:
         raise InputError(

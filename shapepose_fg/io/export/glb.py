@@ -20,8 +20,6 @@ _SET = 4
 sets."""
 _ARRAY, _ELEMENTS = 34962, 34963
 """glTF's buffer targets: vertex attributes, and triangle indices."""
-_COMPONENTS = {"uint8": 5121, "uint32": 5125, "float32": 5126}
-_TYPES = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
 
 
 def write_glb(job: Job) -> Written:
@@ -101,9 +99,9 @@ class _File:
             bufferView=self.add(
                 "bufferViews", **place, **({} if target is None else {"target": target})
             ),
-            componentType=_COMPONENTS[flat.dtype.name],
+            componentType={"uint8": 5121, "uint32": 5125, "float32": 5126}[flat.dtype.name],
             count=len(flat),
-            type=_TYPES[values.shape[1:]],
+            type={(): "SCALAR", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}[values.shape[1:]],
             **(limits if bounds else {}),
         )
 

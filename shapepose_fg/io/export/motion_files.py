@@ -19,12 +19,8 @@ from shapepose_fg.io.export.registry import Job, Written
 from shapepose_fg.io.export.skinned import BONES, Motion, RestBody, all_segments
 from shapepose_fg.io.export.take import y_up, z_up
 
-_SMPL_H = 156
-"""Number of values of a pose of SMPL-H: pelvis, 21 joints of the body, 15 of each hand."""
 _SHARED = 22
 """Number of joints, from the pelvis on, that SMPL and SMPL-H have in common."""
-_AMASS_BETAS = 16
-"""Number of shape components in AMASS."""
 OPEN_BODY = "shapepose-fg open body"
 """Name of the built-in body model in files."""
 
@@ -59,13 +55,15 @@ def amass_columns(segment: Motion, fps: float) -> dict[str, NDArray[Any]]:
     """
     frames, rest = len(segment.index), segment.rest
     vectors = Rotation.from_quat(segment.rotations.reshape(-1, 4)).as_rotvec().reshape(frames, -1)
-    poses = np.zeros((frames, _SMPL_H))
+    # Number of values of a pose of SMPL-H: pelvis, 21 joints of the body, 15 of each hand.
+    poses = np.zeros((frames, 156))
     poses[:, : 3 * _SHARED] = vectors[:, : 3 * _SHARED]
+    # Number of shape components in AMASS.
     return {
         "trans": segment.pelvis - rest.joints[0],
         "poses": poses,
         "poses_smpl": vectors,
-        "betas": np.pad(rest.betas, (0, _AMASS_BETAS - len(rest.betas))),
+        "betas": np.pad(rest.betas, (0, 16 - len(rest.betas))),
         "num_betas": np.array(len(rest.betas)),
         # Older and newer files of AMASS spell this key differently.
         "mocap_framerate": np.array(fps),

@@ -31,18 +31,10 @@ from shapepose_fg.io.footage.placement import CameraFootage, Placement
 
 _CAMERAS = "world/cameras"
 """Path of the cameras in the recording."""
-_REGION = float(np.sqrt(2 * gammaincinv(1.5, 0.95)))
-"""Radius, in standard deviations, of the 95 % ellipsoid of a 3D Gaussian."""
 _JOINT_M, _GUESSED_M, _BONE_M = 0.016, 0.010, 0.007
-_PALE = 0.6
-"""Share of white in the colour of a joint that no view detected."""
 Drawn = dict[int, dict[int, Array]]
 """By person whose body is shown, and bone: rotations (M, 3, 3) of the bones nearby, relative to
 this one, for which its part was shaped."""
-_BEND_RAD = 0.35
-"""Bend of a joint, radians, after which the shapes of the parts nearby are logged again."""
-_NEAR = 0.1
-"""Minimum weight of a bone that shapes a part."""
 _GATES = {
     Gate.TOO_FAR: (213, 43, 43),
     Gate.CONTRADICTS_BODY: (214, 39, 190),
@@ -52,8 +44,6 @@ _GATES = {
 """Colours of unused detections, by reason; used ones have the colour of their person."""
 _USED_DOT, _UNUSED_DOT = -2.0, -3.0
 """Radii of dots in screen units, independent of the zoom; rerun marks these by negative values."""
-_QUALITY = 75
-"""JPEG quality, 0 to 100; one second of four cameras in full HD has about 30 MB."""
 
 
 def person_path(who: int) -> str:
@@ -206,7 +196,8 @@ def _log_person(rr: ModuleType, stream: Any, take: Take, person: int) -> None:
         joints, known = people.joints[row], sigma[row][np.isfinite(sigma[row])]
         placed = np.flatnonzero(np.isfinite(joints).all(axis=1))
         seen = people.known[row][placed] == Known.SEEN
-        shades = np.where(seen[:, None], colour, colour + _PALE * (1 - colour))
+        # Share of white in the colour of a joint that no view detected.
+        shades = np.where(seen[:, None], colour, colour + 0.6 * (1 - colour))
         points = rr.Points3D(
             joints[placed],
             colors=_rgb8(shades),
@@ -232,9 +223,10 @@ def _ellipsoids(rr: ModuleType, centres: Array, covariance: Array, colour: Array
     """The 95 % ellipsoids of joints."""
     fine = np.isfinite(covariance).all(axis=(1, 2))
     variance, axes = principal_axes(covariance[fine])
+    # Radius, in standard deviations, of the 95 % ellipsoid of a 3D Gaussian.
     return rr.Ellipsoids3D(
         centers=centres[fine],
-        half_sizes=_REGION * np.sqrt(np.maximum(variance, 0)),
+        half_sizes=float(np.sqrt(2 * gammaincinv(1.5, 0.95))) * np.sqrt(np.maximum(variance, 0)),
         quaternions=Rotation.from_matrix(axes).as_quat() if fine.any() else np.zeros((0, 4)),
         colors=_rgb8(colour[None]),
         line_radii=0.0008,
@@ -267,11 +259,14 @@ def _log_bodies(
     turns, joints = motion.turns(), motion.joints()
     for bone, (kept, faces) in enumerate(skin_of.parts):
         path = _part_path(who, bone)
-        near = arrays.weights[kept].max(axis=0) > _NEAR
+        # Minimum weight of a bone that shapes a part.
+        near = arrays.weights[kept].max(axis=0) > 0.1
         bends = turns[:, bone, None].mT @ turns[:, near]
         for n, at in enumerate(index.tolist()):
             alike = (bends[n] * shapes.get(bone, 0.0)).sum(axis=(1, 2))  # 1 + 2 cos of the bend
-            if appears[n] or alike.min() < 1 + 2 * math.cos(_BEND_RAD):
+            # Bend of a joint, radians, after which the shapes of the parts nearby
+            # are logged again.
+            if appears[n] or alike.min() < 1 + 2 * math.cos(0.35):
                 shapes[bone] = bends[n]
                 turn, way = motion.rotations[n, None], motion.pelvis[n, None]
                 vertices = skin(arrays, motion.rest.betas[None], turn, way, kept)[0]
@@ -379,7 +374,9 @@ def log_pictures(
                 stream.log(path, rr.Clear(recursive=False))
             else:
                 straight = cv2.remap(picture, *maps, cv2.INTER_LINEAR, borderValue=(90, 90, 90))
-                _, jpeg = cv2.imencode(".jpg", straight, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+                # JPEG quality, 0 to 100; one second of four cameras in full HD
+                # has about 30 MB.
+                _, jpeg = cv2.imencode(".jpg", straight, [cv2.IMWRITE_JPEG_QUALITY, 75])
                 stream.log(path, rr.EncodedImage(contents=jpeg.tobytes(), media_type="image/jpeg"))
             done += 1
             if progress is not None:

@@ -18,8 +18,6 @@ from shapepose_fg.io.export.registry import Job, Written
 from shapepose_fg.io.export.take import Take
 
 BONES = len(SMPL_PARENTS)
-_VISIBLE_M = 1e-3
-"""Maximum difference between the shapes of one person, m, without a note."""
 
 
 @dataclass(frozen=True)
@@ -146,7 +144,8 @@ def everybody(
         if motion is None:
             written.notes.append(f"{kind}: person {who} has no body in any frame")
             continue
-        if motion.spread_m > _VISIBLE_M:
+        # Maximum difference between the shapes of one person, m, without a note.
+        if motion.spread_m > 1e-3:
             written.notes.append(
                 f"{kind}: person {who} has several body shapes; the file has their mean, which "
                 f"moves joints by up to {1e3 * motion.spread_m:.0f} mm"

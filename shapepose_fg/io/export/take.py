@@ -16,29 +16,11 @@ from shapepose_fg.core.reconstruction import BODY, Known, Reconstruction
 from shapepose_fg.core.result_files import check_memory
 from shapepose_fg.core.run_summary import covered_frames
 
-_TO_Y_UP: dict[Axis, list[list[int]]] = {
-    "y": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
-    "-y": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
-    "z": [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
-    "-z": [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
-    "x": [[0, -1, 0], [1, 0, 0], [0, 0, 1]],
-    "-x": [[0, 1, 0], [-1, 0, 0], [0, 0, 1]],
-}
-"""For each up axis, the smallest rotation that maps it to y."""
-_Z_FROM_Y = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-"""(x, y, z) to (x, -z, y): the rotation that Blender's importers apply to files with y up."""
-_FORWARD_X = np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]])
-"""Rotation about y that turns a world with z up into (y, z, x), as written by Pose2Sim."""
-_LONGEST = 1_000_000
-"""Maximum number of frames of a file with a constant rate: nine hours at 30 Hz. With more frames,
-the times have a wrong unit or a gap."""
 _BODY_BYTES = 2_000
 """Approximate memory for one person's body per frame during export, bytes."""
 _OF_JOINTS = ("joints", "covariance", "velocity", "velocity_covariance")
 """Columns that `seen_only` sets to NaN if no view detected the joint; those of `BODY`, if no view
 detected the person."""
-_FAR_M = 1000.0
-"""Largest coordinate, m, that single precision represents to a tenth of a millimetre."""
 
 
 @dataclass(frozen=True)
@@ -130,7 +112,9 @@ class Take:
         every = self.people.joints.reshape(-1, 3)
         every = np.concatenate([every[np.isfinite(every).all(axis=1)], self.people.transl])
         every = every[np.isfinite(every).all(axis=1)]
-        if len(every) == 0 or np.abs(every).max() <= _FAR_M:
+        # Largest coordinate, m, that single precision represents to a tenth of a
+        # millimetre.
+        if len(every) == 0 or np.abs(every).max() <= 1000.0:
             return self, np.zeros(3)
         origin = np.rint(np.median(every, axis=0))
         people = replace(
@@ -149,7 +133,9 @@ class Take:
         than a million frames.
         """
         step = (self.times_s - self.times_s[0]) * self.fps
-        if step[-1] >= _LONGEST:
+        # Maximum number of frames of a file with a constant rate: nine hours at 30 Hz.
+        # With more frames, the times have a wrong unit or a gap.
+        if step[-1] >= 1_000_000:
             raise InputError(
                 f"people.npz: the times cover {self.times_s[-1] - self.times_s[0]:.0f} s, which is"
                 f" {step[-1]:.0f} frames at {self.fps:g} Hz; give --fps, or a part with --frames"
@@ -235,16 +221,30 @@ def y_up(up: Axis) -> Array:
     Z up becomes (x, z, -y), which Blender's importers invert: in Blender the coordinates are again
     those of the world.
     """
-    return np.array(_TO_Y_UP[up], dtype=np.float64)
+    # For each up axis, the smallest rotation that maps it to y.
+    return np.array(
+        {
+            "y": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+            "-y": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
+            "z": [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
+            "-z": [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
+            "x": [[0, -1, 0], [1, 0, 0], [0, 0, 1]],
+            "-x": [[0, 1, 0], [-1, 0, 0], [0, 0, 1]],
+        }[up],
+        dtype=np.float64,
+    )
 
 
 def z_up(up: Axis) -> Array:
     """(3, 3) rotation to z up, for AMASS; the identity if z is already up."""
-    return _Z_FROM_Y @ y_up(up)
+    # (x, y, z) to (x, -z, y): the rotation that Blender's importers apply to files with y
+    # up.
+    return np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]) @ y_up(up)
 
 
 def opensim_axes(up: Axis) -> Array:
     """(3, 3) rotation to y up for TRC and C3D; the same as in Pose2Sim, so that the same cameras
     give equal coordinates.
     """
-    return _FORWARD_X @ y_up(up)
+    # Rotation about y that turns a world with z up into (y, z, x), as written by Pose2Sim.
+    return np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]]) @ y_up(up)

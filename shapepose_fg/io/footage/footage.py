@@ -30,10 +30,6 @@ _SAFE_READING = (
 )
 """Options for reading untrusted videos: only the file itself, and no playlists, which could name
 other files and addresses."""
-_MOST_BYTES = 2**29
-"""Maximum size of a picture's file, bytes."""
-_LARGEST = 16384
-"""Longest side of a picture, pixels: a file with a larger one is damaged, or malicious."""
 
 
 def open_footage(path: Path, progress: Progress | None = None) -> "Footage":
@@ -85,7 +81,9 @@ class Video:
         """
         capture = _capture(path)
         size, fps = glance(path, capture)
-        if not (min(size) > 0 and max(size) <= _LARGEST):
+        # Longest side of a picture, pixels: a file with a larger one is damaged, or
+        # malicious.
+        if not (min(size) > 0 and max(size) <= 16384):
             raise InputError(
                 f"{path}: its pictures would have {size[0]} x {size[1]} pixels; give an "
                 "undamaged video"
@@ -252,7 +250,8 @@ def _decoded(file: Path) -> Any:
     """The picture in a file; None if it cannot be read. InputError for a pipe, or a file that is
     too large.
     """
-    content = np.frombuffer(read_bytes(file, _MOST_BYTES), dtype=np.uint8)
+    # Maximum size of a picture's file, bytes.
+    content = np.frombuffer(read_bytes(file, 2**29), dtype=np.uint8)
     try:
         return cv2.imdecode(content, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error:

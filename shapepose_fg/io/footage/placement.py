@@ -23,10 +23,6 @@ from shapepose_fg.io.validation import validated
 FOOTAGE = "footage.json"
 """Name of the file beside the detections."""
 
-_BLOCK = 16
-"""Block size of video coders, pixels: coders pad or crop a few columns or rows to a multiple of
-it."""
-
 
 class PlacementKind(StrEnum):
     """How pictures of another size were made from pictures of the calibrated size."""
@@ -139,7 +135,9 @@ def place(
         raise InputError(f"{sizes}; give another --image-placement")
     if wanted is not None or picture_size == calibrated_size:
         kind = wanted or PlacementKind.SAME
-    elif max(abs(width - full_width), abs(height - full_height)) <= _BLOCK:
+    # Block size of video coders, pixels: coders pad or crop a few columns or rows to a
+    # multiple of it.
+    elif max(abs(width - full_width), abs(height - full_height)) <= 16:
         kind = PlacementKind.CROP
         note = (
             f"{sizes}: they are assumed to be cropped on the right or at the bottom "

@@ -20,11 +20,10 @@ from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Camera
 from shapepose_fg.core.decompositions import rigid
 from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.skeleton import smpl_joints
 
 _FRONT_LEFT_UP = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
 """Rotation to SMPL's axes (x left, y up, z front) from axes to the front, to the left and up."""
-_HEAD = (3, 6, 9, 12, 15)
-"""SMPL's joints from above the pelvis to the head."""
 _HINGE = (0, -1, 0)
 """Axis of elbows and knees."""
 _HEAD_NAMES, _HEAD_AXES = ("r_head", "y_head", "p_head"), ((1, 0, 0), (0, 0, 1), _HINGE)
@@ -41,8 +40,6 @@ _SKELETON_2D = (
 _LEAST_LIFT, _MIDDLE_YAW = 0.4, 0.4
 """Limits of the shoulder in the reference model, radians: largest lift to the back, and the middle
 of its turns about the vertical."""
-_RADIUS_M = 0.03
-"""Radius of the limbs that the URDF draws, m."""
 
 
 _Axes = tuple[tuple[float, float, float], ...]
@@ -54,7 +51,7 @@ class _Limb(NamedTuple):
     links: tuple[str, ...]
     """Upper and lower link, and the end."""
     joints: tuple[str, ...]
-    """Joints at the origins of these links, in the result."""
+    """Joints of the result at the origins of the links."""
     smpl: tuple[int, ...]
     """SMPL's joints from above the pelvis to the upper link."""
     side: float
@@ -142,7 +139,8 @@ class Human:
                 visual = SubElement(visuals[parent], "visual")
                 SubElement(visual, "origin", xyz=f"0 0 {z / 2:.4f}")
                 shape = SubElement(visual, "geometry")
-                SubElement(shape, "cylinder", radius=f"{_RADIUS_M}", length=f"{abs(z):.4f}")
+                # Radius of the limbs that the URDF draws, m.
+                SubElement(shape, "cylinder", radius="0.03", length=f"{abs(z):.4f}")
 
         add("waist", "body", "waist", (0, 1, 0))
         add("torso", "waist", "torso", z=length("torso", "waist"))
@@ -190,7 +188,10 @@ def humans(rows: Reconstruction) -> Iterator[Human]:
 
     neck = place(*_present(names, "Neck", "LShoulder", "RShoulder"))
     pitch = np.nan_to_num(np.arctan2(neck[:, 0], neck[:, 2]))
-    torso, head = exp_so3(pitch[:, None] * [0.0, 1.0, 0.0]), by_body(_HEAD)
+    torso, head = (
+        exp_so3(pitch[:, None] * [0.0, 1.0, 0.0]),
+        by_body(smpl_joints("spine1 spine2 spine3 neck head")),
+    )
     links = {
         "waist": rigid(torso, np.zeros((len(rows), 3))),
         "torso": rigid(torso, neck),

@@ -38,8 +38,6 @@ _CURE_POSES = "give MCAP with ROS 2 messages of /tf, odometry or poses"
 _LOOK_S = 0.1
 """Interval between searches for the poses of waiting pictures, s of log time; each search reads all
 poses."""
-_POSES_KEPT_S = 3.0
-"""Time for which poses are kept, s, for detections that are logged later than their poses."""
 View = tuple[str, Detections, float, Array | None, Array | None]
 """The arguments of `OnlineReconstructor.push_view`."""
 
@@ -153,7 +151,9 @@ def read_views(
                 yield from placed(logged_s)
                 looked_s, left = logged_s, len(waiting)
             if logged_s > tidied_s + 1.0:
-                frames.forget(logged_s - _POSES_KEPT_S)
+                # Time for which poses are kept, s, for detections that are
+                # logged later than their poses.
+                frames.forget(logged_s - 3.0)
                 tidied_s = logged_s
     yield from placed(math.inf)
     for (camera, frame), count in unplaced.items():

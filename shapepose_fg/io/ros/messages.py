@@ -36,8 +36,6 @@ COVARIANCES: dict[str, tuple[str, ...]] = {
     "all": ("covariance", "velocity_covariance"),
 }
 """Columns of a result with covariances, by level of detail."""
-_LENSES = {4: "equidistant", 5: "plumb_bob"}
-"""Names of lens models by the number of coefficients; those with more are `rational_polynomial`."""
 
 
 def nanoseconds(time_s: float) -> int:
@@ -151,11 +149,15 @@ def carrier_transforms(rig: Rig, time_s: float) -> list[Message]:
 def camera_info(camera: Camera, time_s: float) -> Message:
     """sensor_msgs/CameraInfo for pictures with lens distortion."""
     width, height = camera.image_size
+    # Names of lens models by the number of coefficients; those with more are
+    # `rational_polynomial`.
     return {
         "header": header(optical(camera), time_s),
         "height": height,
         "width": width,
-        "distortion_model": _LENSES.get(len(camera.distortion), "rational_polynomial"),
+        "distortion_model": {4: "equidistant", 5: "plumb_bob"}.get(
+            len(camera.distortion), "rational_polynomial"
+        ),
         "d": camera.distortion.tolist(),
         "k": camera.K.ravel().tolist(),
         "r": np.eye(3).ravel().tolist(),

@@ -24,8 +24,6 @@ Published = tuple[str, str, Message]
 LATCHED = ("/tf_static", "/camera_info", "/urdf")
 """Ends of topics that are published once: later subscribers must receive them, too."""
 _BODIES = "/humans/bodies"
-_LASTS_S = 0.2
-"""Lifetime of the markers of a person who is no longer seen, s."""
 
 
 class PeopleTopics:
@@ -72,7 +70,8 @@ class PeopleTopics:
         """
         here = f"/people/{kind}"
         yield here, "shapepose_msgs/People", people_message(rows, kind, time_s, self._covariances)
-        yield f"{here}/markers", "visualization_msgs/MarkerArray", markers(rows, time_s, _LASTS_S)
+        # Lifetime of the markers of a person who is no longer seen, s.
+        yield f"{here}/markers", "visualization_msgs/MarkerArray", markers(rows, time_s, 0.2)
         if has_bodies:
             yield from self._bodies(rows, time_s)
 

@@ -31,8 +31,6 @@ from shapepose_fg.estimation.floor import LOOK_S, Floor, find_floor
 from shapepose_fg.pipeline.bodies_over_time import BodiesOverTime, Person
 from shapepose_fg.pipeline.runs.parts import OBSERVED, Parts
 
-_FLOOR_ROWS = 4000
-"""Approximate number of rows, spread over all frames, for finding the floor."""
 _STANDS_M_S = 0.1
 """Maximum speed of a standing foot, m/s, and of its standard deviation per axis, for a visible heel
 or toe."""
@@ -200,7 +198,8 @@ class Assembly:
         if len(soles) == 0:
             return "the detector has no heels and toes"
         points, looks = [], []
-        every = 1 + (len(self) - 1) // _FLOOR_ROWS
+        # Approximate number of rows, spread over all frames, for finding the floor.
+        every = 1 + (len(self) - 1) // 4000
         for n in range(len(parts)):
             speed, spread = parts.column(n, "velocity"), parts.column(n, "velocity_covariance")
             with np.errstate(invalid="ignore"):

@@ -30,8 +30,6 @@ _GONE = ".parts-gone"
 unfinished run."""
 _MANIFEST = "manifest.json"
 _FORMAT = "shapepose-fg unfinished run 1"
-_LOOKED_AT = 200
-"""Number of frames, spread over the run, for estimating the number of people."""
 _WORDS = {"program": "version of this program", "cameras": "set of cameras", "skeleton": "skeleton"}
 """Words for differences, for keys that are not words themselves."""
 
@@ -114,8 +112,9 @@ def expected_bytes(detections: DetectionSequence, rig: Rig, frames: range) -> in
     joints = detections.skeleton.joints
     if len(frames) == 0:
         return 0
+    # Number of frames, spread over the run, for estimating the number of people.
     spread = np.unique(
-        np.linspace(frames.start, frames.stop - 1, min(len(frames), _LOOKED_AT)).astype(int)
+        np.linspace(frames.start, frames.stop - 1, min(len(frames), 200)).astype(int)
     )
     people = np.mean([len(detections[frame]) for frame in spread.tolist()]) / (
         len(rig) * len(joints)

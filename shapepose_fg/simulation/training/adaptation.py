@@ -33,10 +33,6 @@ from shapepose_fg.simulation.training.train import (
 )
 
 TRAINED, PLAIN = "trained", "plain optimiser"
-_RIDGE_M = 0.005
-"""Displacement of points by a shape component, m, below which it is ignored in the other body."""
-_SLOWER = 0.2
-"""Learning rate relative to training from scratch, since only small changes are needed."""
 _CALIBRATION_PEOPLE = 4096
 _SEEN = tuple(range(len(BODY_25)))
 
@@ -56,7 +52,8 @@ def adapted(
     the number of finished iterations and of all.
     """
     shipped, frame = FitterWeights.default(), PersonFrame.of(body, motions.poses, motions.weight)
-    rate = _SLOWER * config.learning_rate
+    # Learning rate relative to training from scratch, since only small changes are needed.
+    rate = 0.2 * config.learning_rate
     config = replace(config, network=shipped.network.config, learning_rate=rate)
     torch.manual_seed(config.seed)
     # The network is on a GPU if available, the bodies on the CPU.
@@ -112,6 +109,8 @@ def translated(weights: FitterWeights, trained_on: BodyModel, body: BodyModel) -
 
 def _solved(by: Array, wanted: Array) -> Tensor:
     """Least-squares X (10, 10) with `by` X close to `wanted`."""
+    # Displacement of points by a shape component, m, below which it is ignored in the other
+    # body.
     return torch.from_numpy(
-        np.linalg.solve(by.T @ by + _RIDGE_M**2 * np.eye(10), by.T @ wanted)
+        np.linalg.solve(by.T @ by + 0.005**2 * np.eye(10), by.T @ wanted)
     ).float()

@@ -63,9 +63,6 @@ but the legs."""
 _SWAPPED = torch.stack([_LEG, _SHIN, _ARM, _HAND, _LEG + _ARM])
 _MIRROR = torch.tensor(MIRROR)
 
-_PIPELINE_SIGMA_M = 0.013
-"""Standard deviation stated by the pipeline for a joint of confidence 1, m (see `observations`)."""
-
 
 @dataclass(frozen=True)
 class CorruptionConfig:
@@ -239,7 +236,9 @@ def _reports(
     sigma = (
         sigma * _table(statistics.joint_scale).mean(-1)[group] * torch.exp(tail * draw.normal(B, K))
     )
-    return missed, sigma.clamp_max(0.25), _PIPELINE_SIGMA_M / confidence
+    # Standard deviation stated by the pipeline for a joint of confidence 1, m (see
+    # `observations`).
+    return missed, sigma.clamp_max(0.25), 0.013 / confidence
 
 
 def _table(values: object) -> Tensor:

@@ -15,7 +15,7 @@ from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, MIRROR
 from shapepose_fg.core.arrays import Array, Mask, Whole
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.skeleton import SMPL_24
+from shapepose_fg.core.skeleton import SMPL_24, smpl_joints
 from shapepose_fg.core.storage.files import files_below
 from shapepose_fg.core.storage.npz import read_npz
 from shapepose_fg.core.storage.schema import Column, Table
@@ -39,26 +39,19 @@ MIRROR_JOINTS = tuple(place - BODY_POINTS.index(SMPL_24[0]) for place in MIRROR[
 """(24,) index of each SMPL joint's partner on the other side of the body; its own for joints in the
 middle."""
 
-SEGMENT_CAP = 300
-"""Maximum weight of one recording, frames (10 s)."""
 SUBJECT_CAP = 1500
 """Maximum weight of one subject, frames: 13,000 frames of one climber show one person's habits."""
 WALK_CAP = 0.25
 """Maximum share of walking in the weight of a split. With 0.25 instead of 0.15, likelihoods of
 unseen people's walks rise by 1.6 nats a frame, and those of all else fall by 0.1; without a cap by
 a further 0.6 and 0.1."""
-TARGET_FPS = 30.0
-"""Approximate frame rate to which AMASS recordings are decimated, Hz: every k-th frame, without
-interpolation."""
 
-_LEANING_RAD = 0.15
-"""Standard deviation of the lean of sampled people, rad."""
-_WRISTS, _HANDS, _TOES = (20, 21), (22, 23), (10, 11)
+_WRISTS, _HANDS, _TOES = (
+    smpl_joints(f"left_{name} right_{name}") for name in ("wrist", "hand", "foot")
+)
 _BODY_COLUMNS = 66
 """Number of columns of root and 21 body joints, which SMPL, SMPL+H and SMPL-X files have in
 common."""
-_Y_UP = Rotation.from_rotvec([-np.pi / 2, 0.0, 0.0])
-"""Rotation from AMASS, z up, to SMPL's own frame, y up."""
 _NOT_MOTIONS = ("shape.npz", "_stagei.npz")
 """Suffixes of other files than motions in AMASS."""
 
@@ -117,7 +110,8 @@ def drawn_motions(count: int, seed: int) -> Motions:
     recordings.
     """
     rng = np.random.default_rng(seed)
-    root = rng.normal(0, _LEANING_RAD, (count, 1, 3))
+    # Standard deviation of the lean of sampled people, rad.
+    root = rng.normal(0, 0.15, (count, 1, 3))
     root[:, 0, 1] = rng.uniform(-np.pi, np.pi, count)
     poses = np.concatenate((root, PosePrior.default().sample(rng, count)), axis=1).astype(
         np.float32
@@ -164,7 +158,8 @@ def frame_weights(length: Whole, subject: NDArray[np.str_], walking: Mask) -> Ar
     """Weight (S,) of a frame in each of S recordings: recordings, subjects and walking are capped,
     per split.
     """
-    total = np.minimum(length.astype(np.float64), SEGMENT_CAP)
+    # Maximum weight of one recording, frames (10 s).
+    total = np.minimum(length.astype(np.float64), 300)
     for name in np.unique(subject):
         rows = subject == name
         total[rows] *= min(1.0, SUBJECT_CAP / total[rows].sum())
@@ -188,10 +183,15 @@ def _of_clip(clip: Clip) -> _Recording:
 def _read_amass(path: Path) -> _Recording:
     """One AMASS file, decimated to about 30 Hz and rotated to y up, without hands."""
     poses, fps = _amass_arrays(path)
-    step = max(1, round(fps / TARGET_FPS))
+    # Approximate frame rate to which AMASS recordings are decimated, Hz: every k-th frame,
+    # without interpolation.
+    step = max(1, round(fps / 30.0))
     kept = np.zeros((len(poses[::step]), 24, 3))
     kept[:, :22] = poses[::step, :_BODY_COLUMNS].reshape(-1, 22, 3)
-    kept[:, 0] = (_Y_UP * Rotation.from_rotvec(kept[:, 0])).as_rotvec()
+    # Rotation from AMASS, z up, to SMPL's own frame, y up.
+    kept[:, 0] = (
+        Rotation.from_rotvec([-np.pi / 2, 0.0, 0.0]) * Rotation.from_rotvec(kept[:, 0])
+    ).as_rotvec()
     return path.parent.name, "walk" in path.stem.lower(), kept.astype(np.float32)
 
 

@@ -37,8 +37,6 @@ INSIDE = 0.9
 is calibrated."""
 _SKELETONS = ("SMPL_24", "HALPE_26", "BODY_25")
 """Skeletons for calibration; for a shared point the last one counts."""
-_ENOUGH = 50
-"""Minimum number of joints for a calibration."""
 
 _ALL = tuple(range(len(BODY_POINTS)))
 
@@ -279,7 +277,8 @@ def calibrated(weights: FitterWeights, source: PeopleSource, count: int = 4096) 
             both = np.concatenate(
                 [squared.get(place, np.zeros(0)), squared.get(MIRROR[place], np.zeros(0))]
             )
-            if len(both) >= _ENOUGH:
+            # Minimum number of joints for a calibration.
+            if len(both) >= 50:
                 spread[place] = np.quantile(both, INSIDE) / chi2.ppf(INSIDE, 3)
     return replace(weights, spread=spread)
 

@@ -28,8 +28,6 @@ GATED: Colour = (40, 40, 255)
 """Colour of detections that were not used."""
 _WHITE: Colour = (255, 255, 255)
 _DARK: Colour = (30, 30, 30)
-_BEND = 8
-"""Number of straight segments in which a bone is drawn, because lens distortion curves it."""
 _OPACITY = 0.45
 """Opacity of bodies, so that the picture behind them stays visible."""
 _FINE = 8
@@ -147,7 +145,9 @@ class Skeletons:
 def draw_skeletons(picture: Picture, view: PictureView, people: Skeletons) -> None:
     """Draw bones, joints (rings if they are inferred) and labels on `picture`."""
     stroke = stroke_of(view.size)
-    part = np.linspace(0.0, 1.0, _BEND + 1)[:, None]
+    # Number of straight segments in which a bone is drawn, because lens distortion curves
+    # it.
+    part = np.linspace(0.0, 1.0, 8 + 1)[:, None]
     tops = []
     for joints, seen, colour in zip(people.joints, people.seen, people.colours, strict=True):
         ends = joints[people.bones]

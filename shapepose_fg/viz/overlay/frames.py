@@ -23,7 +23,6 @@ from shapepose_fg.viz.overlay import drawing
 if TYPE_CHECKING:
     from shapepose_fg.body.model.body_model import BodyModel
 
-_INK: drawing.Colour = (45, 45, 45)
 _GRID = "grid"
 """Name of the file with all cameras."""
 
@@ -70,7 +69,7 @@ class Overlay:
             if self.skeletons:
                 drawing.draw_skeletons(picture, view, drawing.Skeletons.of(people))
             drawing.draw_label(
-                picture, f"camera {used.name}, frame {frame}", (0, 0), _INK, centred=False
+                picture, f"camera {used.name}, frame {frame}", (0, 0), (45, 45, 45), centred=False
             )
             drawn.append(picture)
         return drawn

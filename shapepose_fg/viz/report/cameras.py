@@ -19,8 +19,6 @@ from shapepose_fg.viz.report.figures import Residual
 from shapepose_fg.viz.report.page import filled
 from shapepose_fg.viz.report.scene import Scene, camera_of, scene_of
 
-_SCENE_BYTES = 4_000_000
-
 
 @dataclass(frozen=True, kw_only=True)
 class CameraPage:
@@ -41,7 +39,7 @@ class CameraPage:
     heads: Sequence[str]
     """Column headings of the table of cameras."""
     rows: Sequence[tuple[str, Sequence[str]]]
-    """Name of each camera, and its values for these columns."""
+    """Name of each camera, and its values, a column each."""
     missed_px: Mapping[str, Array]
     """(N, V) distances of joints from their positions by the other cameras, pixels, by name of the
     series; NaN if unknown."""
@@ -92,7 +90,7 @@ class CameraPage:
             transl=np.full((P, 3), np.nan),
         )
         up = self.rig.up
-        scene = scene_of(Take.of(people, up, rig=self.rig), None, _SCENE_BYTES)
+        scene = scene_of(Take.of(people, up, rig=self.rig), None, 4_000_000)
         if self.before is None:
             return scene
         before = [camera_of(each, z_up(up)) for each in self.before.cameras]

@@ -18,8 +18,6 @@ from shapepose_fg.core.reconstruction import Known, Reconstruction, sigma_m
 from shapepose_fg.core.run_summary import covered_frames
 from shapepose_fg.viz.report.facts import lists, number, objects
 
-_BINS = 60
-"""Number of points of a time series: as many as can be distinguished in a table cell."""
 KINDS = (Known.SEEN, Known.WEAK, Known.BODY, Known.MOTION, Known.UNKNOWN)
 """How joints are known, from the most to the least certain."""
 
@@ -85,7 +83,7 @@ class CameraFigures:
     given: int
     """Number of detections that were assigned to people."""
     gates: dict[Gate, int]
-    """Number of these detections by gate: used, or the reason why not."""
+    """Number of assigned detections by gate: used, or the reason why not."""
     all: Residual
     """Residuals of all detections that were assigned to people."""
     used: Residual
@@ -216,5 +214,6 @@ def _segments(table: ObservationTable) -> Index:
     if len(table) == 0:
         return np.zeros(0, dtype=np.intp)
     first, last = int(table.frame.min()), int(table.frame.max())
-    bins = min(_BINS, last - first + 1)
+    # Number of points of a time series: as many as can be distinguished in a table cell.
+    bins = min(60, last - first + 1)
     return np.asarray((table.frame - first) * bins // (last - first + 1), dtype=np.intp)

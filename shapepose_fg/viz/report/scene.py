@@ -24,17 +24,9 @@ _FINEST_MM = 1.0
 _OCTAVE, _LEVELS = 8, 63
 """Quantisation of standard deviations: 63 levels in six bits, eight per doubling (steps of 9 %),
 from 1 mm on."""
-_FLOOR_M = 0.3
-"""Maximum height of feet above 0, m, for which the floor is drawn at 0."""
 CELL_M = 0.05
 """Size of the grid cells in which one vertex of a body is kept, m. The open body then has 860 of
 its 12,488 vertices, which a page can draw in every frame."""
-_ROW_BYTES = 8 * BONES + 6
-"""Size of a body in a frame, bytes: quaternions and pelvis position."""
-_MOST_BONES = 4
-"""Maximum number of bones per vertex; those with the largest weights are kept."""
-_TURN = 32767
-"""Scale of quaternion entries, which are stored as integers."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +51,8 @@ def scene_of(take: Take, arrays: SmplArrays | None, most_bytes: int) -> Scene:
     model `arrays` is given.
     """
     J = len(take.people.joint_names)
-    row_bytes = 4 / 3 * (6 * J + J + 2 + (_ROW_BYTES if arrays is not None else 0))
+    # Size of a body in a frame, bytes: quaternions and pelvis position.
+    row_bytes = 4 / 3 * (6 * J + J + 2 + ((8 * BONES + 6) if arrays is not None else 0))
     every = max(1, int(np.ceil(len(take.people) * row_bytes / most_bytes)))
     index = np.arange(0, len(take.frames), every)
     axes = z_up(take.up)
@@ -151,7 +144,8 @@ def _floor(joints: Array) -> float:
         return 0.0
     lowest = np.min(np.where(placed, height, np.inf), axis=1)
     ground = float(np.quantile(lowest[np.isfinite(lowest)], 0.2))
-    return 0.0 if abs(ground) < _FLOOR_M else ground
+    # Maximum height of feet above 0, m, for which the floor is drawn at 0.
+    return 0.0 if abs(ground) < 0.3 else ground
 
 
 def _view(joints: Array, centres: Array) -> dict[str, Any]:
@@ -194,7 +188,8 @@ def _bodies(
     its position. Rows without a body are left out.
     """
     kept, faces, _ = thinned(arrays.template, arrays.faces, CELL_M)
-    order = np.argsort(-arrays.weights[kept], axis=1, kind="stable")[:, :_MOST_BONES]
+    # Maximum number of bones per vertex; those with the largest weights are kept.
+    order = np.argsort(-arrays.weights[kept], axis=1, kind="stable")[:, :4]
     weights = np.take_along_axis(arrays.weights[kept], order, axis=1)
     weights = np.rint(255 * weights / weights.sum(axis=1, keepdims=True))
     P, N = len(take.persons), len(frame)
@@ -213,6 +208,7 @@ def _bodies(
             motion.pelvis[place[frame[mine]]],
         )
     millimetres = _Packing(np.zeros(3), 1e-3)
+    # Scale of quaternion entries, which are stored as integers.
     return {
         "mesh": {
             "faces": _base64(faces, "<i2"),
@@ -222,7 +218,7 @@ def _bodies(
         },
         "rest": _base64(millimetres(rest), "<i2"),
         "rest_joints": _base64(millimetres(joints), "<i2"),
-        "turns": _base64(np.rint(_TURN * np.nan_to_num(turns)), "<i2"),
+        "turns": _base64(np.rint(32767 * np.nan_to_num(turns)), "<i2"),
         "pelvis": _base64(pack(pelvis), "<i2"),
     }
 

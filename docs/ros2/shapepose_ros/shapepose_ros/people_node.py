@@ -176,7 +176,7 @@ class PeopleNode(Node):
 
     def _log_cameras(self) -> None:
         """Log cameras that fail, or work again."""
-        said = self.people.said()
+        said = self.people.camera_changes()
         new = list(takewhile(lambda each: each is not self.told, reversed(said)))
         for each in reversed(new):
             self.get_logger().warning(
@@ -188,7 +188,11 @@ class PeopleNode(Node):
 def main() -> None:
     """Run the node until it is stopped."""
     rclpy.init()
-    node = PeopleNode()
+    try:
+        node = PeopleNode()
+    except InputError as error:  # the calibration, mostly
+        rclpy.try_shutdown()
+        raise SystemExit(str(error)) from None
     try:
         with node.people:
             rclpy.spin(node)
