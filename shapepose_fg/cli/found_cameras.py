@@ -89,7 +89,6 @@ def show_clocks(found: "Synchronised", rig: "Rig") -> None:
         rows.append((name, f"{offset:+.4f}", known, f"{sure:.1f}"))
     caption = (
         "start: time of the camera's frame 0 on the first camera's clock; distinct: how clearly "
-        "the best"
+        "the best offset differs from all others"
     )
-    " offset differs from all others"
     show(table(("camera", "start, s", "± ms", "distinct"), rows, caption=caption))
