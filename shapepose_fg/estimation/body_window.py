@@ -23,7 +23,7 @@ from shapepose_fg.body.fitting.priors import MotionPrior, PosePrior
 from shapepose_fg.body.kernels.solving import eliminated, put_back
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.body.model.rotation import exp_so3, log_so3
-from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.asynchronous_views import carried_to_frames, leads, velocities_of
@@ -345,6 +345,23 @@ class BodyWindow:
 
     def _bodies(self, state: BodyState) -> Array:
         return self.energy.model.keypoints(self.energy.complete(state.free))
+
+    def said_by(self, state: BodyState, joints: Mask) -> Array:
+        """(T, M, P) normal equations of what some `joints` (J,) say of each frame's body, without
+        priors, around the last solution.
+        """
+        weighed = self.last.gain / self.variance[..., None, None] * joints[:, None, None]
+        targets, T = EnergyTargets(self.last.target, weighed), len(self)
+        whole = self.energy.linearise(state.free, targets, 1e9, self._held, nothing(T)).system
+        alone = EnergyTargets(self.last.target, np.zeros_like(weighed))
+        prior = self.energy.linearise(state.free, alone, 1e9, self._held, nothing(T)).system
+        return np.asarray(whole - prior)
+
+    def deviation(self, bodies: Array) -> Array:
+        """(T, J, 3) X - J that is best for bodies (T, J, 3) that have moved from the last solution,
+        metres around the origin.
+        """
+        return self._deviation(self.last, bodies)
 
     def _deviation(self, here: _Around, bodies: Array) -> Array:
         """X - J that is best for bodies that have moved."""
