@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import lapack
 
 from factors import DEFAULT_WIDTH_SIGMA, Motion
 from shapepose_fg.body.fitting.chains import Links
@@ -375,14 +374,12 @@ class BodyWindow:
         """
         acceleration, velocity = MotionPrior.default().part(self.energy.angles)
         T, n = len(self), self._law.order
-        step = np.full(max(n, T) - 1, np.inf)
-        step[: T - 1] = np.diff(self.times_s)
-        times = np.ones((max(n, T) - n, len(acceleration)))
-        if n < T:
-            faster = self._faster(bodies)
-            for k in range(n):  # the fastest step among those that it links
-                times[: T - n] = np.maximum(times[: T - n], faster[k : k + T - n])
-        return Links(self._law, acceleration * times, velocity, step)
+        step, times = np.full(max(n, T) - 1, np.inf), np.ones((max(n, T) - 1, len(velocity)))
+        step[: T - 1], times[: T - 1] = np.diff(self.times_s), self._faster(bodies)
+        fastest = times[: len(times) - n + 1].copy()  # of the steps that an acceleration links
+        for k in range(1, n):
+            fastest = np.maximum(fastest, times[k : k + len(fastest)])
+        return Links(self._law, acceleration * fastest, velocity * times, step)
 
     def _faster(self, bodies: Array) -> Array:
         """(T - 1, N) how many times the usual density of acceleration each unknown has, at least
@@ -435,6 +432,8 @@ class BodyWindow:
 
     def covariances(self, state: BodyState) -> "Marginals":
         """Marginal covariances of every frame's variables, around the last solution."""
+        from scipy.linalg import lapack
+
         here = self.last
         kept, front = self._eliminated(state.root, here, 0.0)
         T, N = here.pull.shape

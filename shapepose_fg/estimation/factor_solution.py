@@ -84,9 +84,7 @@ def _solved(
     return [FactorSolution(each, *_covariances(each, every)) for each in people]
 
 
-def _covariances(
-    person: BodyGraph, every: dict[tuple[int, int], Array]
-) -> tuple[Array, Marginals]:
+def _covariances(person: BodyGraph, every: dict[tuple[int, int], Array]) -> tuple[Array, Marginals]:
     """Covariances of the joints of a solved person, and the marginals of the model."""
     marginals = person.marginals(every)
     found = person.widen * marginals.joints()
