@@ -9,7 +9,7 @@ movements have equal angles.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, get_args
 
 import numpy as np
@@ -141,28 +141,6 @@ class JointAngles:
             columns |= {f"{name}_deg": degrees, f"{name}_sigma_deg": sigma}
         return columns
 
-    def relative_to(self, neutral: "JointAngles") -> "JointAngles":
-        """The angles minus each person's median angles in a neutral posture, such as standing.
-
-        What joints do not show of a posture, such as the tilt of the pelvis, is much the same in
-        both, and cancels. How much is not known, so the covariances are those of independent
-        errors: the sum of both. ValueError if a person has no angles in `neutral`, or if it has
-        other angles.
-        """
-        if neutral.names != self.names:
-            raise ValueError("both must have the same angles; give both the same definitions")
-        rest, covariance = np.full(self.degrees.shape, np.nan), self.covariance.copy()
-        for person in np.unique(self.people.person).tolist():
-            own = (neutral.people.person == person) & np.isfinite(neutral.degrees).all(axis=1)
-            found = neutral.degrees[own]
-            if len(found) == 0:
-                raise ValueError(f"person {person} has no body in the neutral posture")
-            around = _wrapped(found - found[0])  # angles near +-180 degrees have no median
-            mine = self.people.person == person
-            rest[mine] = found[0] + np.median(around, axis=0)
-            covariance[mine] += neutral.covariance[own].mean(axis=0)
-        return replace(self, degrees=_wrapped(self.degrees - rest), covariance=covariance)
-
     def to_frame(self, library: str = "pandas") -> Any:
         """`columns` as a DataFrame of pandas or Polars."""
         return optional(library, "frames").DataFrame(self.columns())
@@ -221,11 +199,6 @@ def segment_axes(model: BodyModel, betas: Array) -> dict[str, Array]:
                 x = np.cross(y, z)
             axes[f"{side}{proximal}"] = np.stack([x, y, z], axis=-1)
     return axes
-
-
-def _wrapped(degrees: Array) -> Array:
-    """Angles as -180 to 180 degrees."""
-    return (degrees + 180.0) % 360.0 - 180.0
 
 
 def _unit(vectors: Array) -> Array:

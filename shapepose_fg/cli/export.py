@@ -2,14 +2,7 @@
 
 from pathlib import Path
 
-from shapepose_fg.cli.options import (
-    RESULT,
-    TakeOptions,
-    argument,
-    grouped,
-    option,
-    result_frames,
-)
+from shapepose_fg.cli.options import RESULT, TakeOptions, argument, grouped, option
 from shapepose_fg.cli.terminal import note
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.result_files import results_folder
@@ -31,9 +24,6 @@ def export(
     fill_gaps: float = option(
         RESULT, "Longest gap that is filled in amass and bvh, seconds.", 0.2, metavar="SECONDS"
     ),
-    neutral: str | None = option(
-        RESULT, "Frames of a neutral posture, to which angles.csv is relative.", metavar="A:B"
-    ),
 ) -> None:
     """Write a result in formats of other programs: shapepose-fg export RESULTS amass trc c3d bvh
     glb angles opensim csv parquet mcap rrd.
@@ -49,7 +39,6 @@ def export(
     wanted = list(FORMATS.values()) if "all" in formats else chosen(formats)
     output = inside(results_folder(take.results), "export") if output is None else output
     more = {"markers": MarkerSet(markers), "fill_gaps_s": fill_gaps, "body": take.body}
-    more["neutral"] = result_frames(neutral, "--neutral")
     done = export_result(take.results, wanted, output, **how, **more)
     for file in (file for written in done.values() for file in written.files):
         print(file)

@@ -46,10 +46,13 @@ def live(
     of people.
 
     Input: OpenPose's JSON of a frame in one line, with "camera" and "time_s" beside "people".
-    Output: "now" after each frame, and "settled" when its people have been refined. The command
-    ends with the input; invalid lines are skipped with a note. A socket accepts connections from
-    this machine only, unless an address is given (tcp://0.0.0.0:PORT). An .mcap file has ROS 2
-    messages. `rerun` starts the viewer; rerun+http://HOST:9876/proxy connects to a running one.
+
+    Output: "now" after each frame, and "settled" when its people have been refined.
+
+    The command ends with the input; invalid lines are skipped with a note. A socket accepts
+    connections from this machine only, unless an address is given (tcp://0.0.0.0:PORT). An .mcap
+    file has ROS 2 messages. `rerun` starts the viewer; rerun+http://HOST:9876/proxy connects to a
+    running one.
     """
     from shapepose_fg.core.skeleton import BODY_25
     from shapepose_fg.io.skeleton_file import find_skeleton

@@ -19,6 +19,7 @@ from shapepose_fg.cli.live import live
 from shapepose_fg.cli.options import (
     RESULT,
     Preset,
+    flowing,
     grouped,
     option,
     preset_option,
@@ -65,7 +66,7 @@ for _panel, _commands in {
 }.items():
     for _command in _commands:
         app.command(rich_help_panel=_panel)(_command)
-app.command("compile", rich_help_panel=_TRY)(compile_kernels)
+app.command("compile", rich_help_panel=_TRY)(flowing(compile_kernels))
 app.add_typer(tracks, name="tracks", rich_help_panel=_RESULT)
 
 _UsageProblem = cast("type[Exception]", typer.BadParameter.__mro__[2])

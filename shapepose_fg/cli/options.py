@@ -106,7 +106,13 @@ def grouped(command: Callable[..., Any]) -> Callable[..., Any]:
     del called.__wrapped__
     cast(Any, called).__signature__ = inspect.Signature(parameters)
     called.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-    return called
+    return flowing(called)
+
+
+def flowing(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Join the lines of each paragraph of the docstring: the help would break them twice."""
+    command.__doc__ = re.sub(r"(?<=\S)\n(?=[^\s-])", " ", inspect.getdoc(command) or "")
+    return command
 
 
 def frames_option() -> Any:
@@ -429,16 +435,14 @@ def check_workers(workers: int | None) -> None:
         )
 
 
-def result_frames(text: str | None, name: str = "--frames") -> range | None:
-    """Frames selected by `A:B` from a saved result with an unknown last frame; None for all. `name`
-    is the option.
-    """
+def result_frames(text: str | None) -> range | None:
+    """Frames selected by `A:B` from a saved result with an unknown last frame; None for all."""
     if text is None:
         return None
-    start, stop = ends(text, name)
+    start, stop = ends(text)
     found = range(start, 10**18 if stop is None else stop)
     if len(found) == 0:
-        raise InputError(f"{name} {text}: must be A:B with A below B, such as 0:100")
+        raise InputError(f"--frames {text}: must be A:B with A below B, such as 0:100")
     return found
 
 
@@ -456,9 +460,9 @@ def frame_range(text: str | None, count: int, first: int = 0) -> range:
     return found
 
 
-def ends(text: str, name: str = "--frames") -> tuple[int, int | None]:
+def ends(text: str) -> tuple[int, int | None]:
     """Both ends of `A:B`; the second is None if it is left out."""
     match = re.fullmatch(r"(\d{0,18}):(\d{0,18})", text.strip())
     if match is None:
-        raise InputError(f"{name} {text}: must be A:B with two frame numbers, such as 0:100")
+        raise InputError(f"--frames {text}: must be A:B with two frame numbers, such as 0:100")
     return int(match[1] or 0), int(match[2]) if match[2] else None

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from shapepose_fg.cli.options import flowing
 from shapepose_fg.cli.terminal import note, show, table
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.result_files import results_folder, set_aside
@@ -29,6 +30,7 @@ From = Annotated[int, typer.Argument(metavar="FRAME", help="First frame that cha
 
 
 @tracks.callback()
+@flowing
 def people_over_time(
     context: typer.Context,
     results: Annotated[Path, typer.Argument(metavar="RESULTS", help="Folder of a reconstruction.")],

@@ -3,11 +3,12 @@
 import gc
 import logging
 import os
+import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from importlib import import_module
-from threading import Timer
+from threading import Thread, Timer
 from typing import Any
 
 from loky import ProcessPoolExecutor
@@ -68,7 +69,7 @@ def _share_out(kernels: Sequence[Any], count: int) -> None:
         p for m in modules.values() for p in ([m] if _work(m) < bound else [[each] for each in m])
     ]
     groups.sort(key=_work, reverse=True)
-    pool = ProcessPoolExecutor(count, initializer=_begin)
+    pool = ProcessPoolExecutor(count, initializer=_begin, initargs=(os.getpid(),))
     try:
         waiting = [pool.submit(_load, [each.name for each in group]) for group in groups]
         for each in waiting:
@@ -79,10 +80,22 @@ def _share_out(kernels: Sequence[Any], count: int) -> None:
         pool.shutdown(kill_workers=True)
 
 
-def _begin() -> None:
+def end_with(parent: int) -> None:
+    """End this process, even if busy, when its parent has ended or was killed."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(0.5)
+        os._exit(1)
+
+    Thread(target=watch, daemon=True).start()
+
+
+def _begin(parent: int) -> None:
     """Prepare a process of `compile_beside`: it compiles what it is told, and prints nothing."""
     global _tried
     _tried = True
+    end_with(parent)
     gc.disable()
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)

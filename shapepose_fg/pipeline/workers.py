@@ -9,8 +9,6 @@ All use `concurrent.futures.Executor`: this process (`Here`), processes of this 
 import os
 import signal
 import sys
-import threading
-import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, Future
@@ -23,7 +21,7 @@ from typing import Any, Generic, TypeVar
 import cloudpickle
 from loky import ProcessPoolExecutor
 
-from shapepose_fg.core.compiling import cores
+from shapepose_fg.core.compiling import cores, end_with
 from shapepose_fg.core.errors import WorkLost
 
 Shared = TypeVar("Shared")
@@ -178,17 +176,8 @@ _shared: Any = None
 def _begin(parent: int, initializer: Callable[..., object], *arguments: Any) -> None:
     """Initialise a worker process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+    end_with(parent)
     initializer(*arguments)
-
-
-def _end_with(parent: int) -> None:
-    """End this process, even if busy, when its parent has ended or was killed."""
-    while os.getppid() == parent:
-        # Interval at which a worker checks whether the process that started it is
-        # alive, s.
-        time.sleep(0.5)
-    os._exit(1)
 
 
 def _keep(content: bytes) -> None:

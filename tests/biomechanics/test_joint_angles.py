@@ -16,7 +16,6 @@ from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import Known
 from shapepose_fg.core.skeleton import SMPL_24
-from shapepose_fg.io.export.registry import FORMATS, export_result
 from shapepose_fg.simulation import built_in_scene
 from shapepose_fg.simulation.files import truth_of
 
@@ -179,45 +178,6 @@ def test_rows_without_a_body_are_unknown(people):
     assert np.isnan(joint_angles(exact, "z").sigma).all()  # no measurement without a covariance
     with pytest.raises(InputError, match="up="):
         joint_angles(people)
-
-
-def test_a_neutral_posture_cancels_what_joints_do_not_show(people):
-    """The same error of each person's pelvis in all frames; angles near 180 degrees, too."""
-    found = joint_angles(people, "z")
-    wrong = np.where(people.person % 2 == 0, 12.0, -170.0)[:, None] * (np.arange(36) % 3 == 0)
-    shifted = replace(found, degrees=(found.degrees + wrong + 180) % 360 - 180)
-    still = np.flatnonzero(people.frame < 12)
-    rest = replace(shifted, people=people.rows(still), degrees=shifted.degrees[still],
-                   covariance=found.covariance[still])  # fmt: skip
-    ideal = replace(rest, degrees=found.degrees[still])
-    relative, expected = shifted.relative_to(rest), found.relative_to(ideal)
-    off = (relative.degrees - expected.degrees + 180) % 360 - 180
-    assert np.abs(off).max() < 1e-9 and np.abs(relative.degrees).max() <= 180
-    ratio = relative.sigma / found.sigma  # as if the errors of both were independent
-    assert (ratio > 1).all() and np.median(ratio) == pytest.approx(2**0.5, abs=0.1)
-    one = rest.people.person == 0
-    alone = replace(rest, people=rest.people.rows(np.flatnonzero(one)), degrees=rest.degrees[one],
-                    covariance=rest.covariance[one])  # fmt: skip
-    with pytest.raises(ValueError, match="person 1 has no body in the neutral posture"):
-        found.relative_to(alone)
-
-
-def test_angles_relative_to_frames_of_a_result(people, tmp_path):
-    people.with_run(frames=[0, 60]).save(tmp_path / "result", built_in_scene().rig)
-    wanted = [FORMATS["angles"]]
-    export_result(tmp_path / "result", wanted, tmp_path / "absolute")
-    export_result(tmp_path / "result", wanted, tmp_path / "relative", neutral=range(0, 12))
-    table, relative = (
-        np.genfromtxt(tmp_path / name / "angles.csv", delimiter=",", names=True)
-        for name in ("absolute", "relative")
-    )
-    knee = "right_knee_flexion_deg"
-    for person in range(4):
-        mine = table["person"] == person
-        rest = np.median(table[knee][mine & (table["frame"] < 12)])
-        np.testing.assert_allclose(relative[knee][mine], table[knee][mine] - rest, atol=2e-3)
-    with pytest.raises(InputError, match="--neutral: person 0 has no body"):
-        export_result(tmp_path / "result", wanted, tmp_path / "none", neutral=range(100, 10**18))
 
 
 def test_frames_of_pandas(people):

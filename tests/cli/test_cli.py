@@ -13,10 +13,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import typer
 
 import shapepose_fg.cli.reconstruct.run
 from shapepose_fg.body.shapes import SubjectShapes
-from shapepose_fg.cli.main import main
+from shapepose_fg.cli.main import app, main
 from shapepose_fg.core.errors import WorkLost
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.notes import Notes
@@ -466,6 +467,13 @@ def test_config_prints_every_table_with_units(capsys):
     printed = capsys.readouterr().out
     assert "[people]" in printed
     assert "gate_m = " in printed
+
+
+def test_paragraphs_of_the_help_have_no_line_ends_of_their_own():
+    """A terminal of 80 columns would break their lines twice."""
+    commands = getattr(typer.main.get_command(app), "commands", {})
+    broken = [name for name, each in commands.items() if re.search(r"\S\n[^\s-]", each.help)]
+    assert len(commands) > 10 and broken == []
 
 
 def test_help_groups_the_options(capsys):

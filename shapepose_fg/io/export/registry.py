@@ -49,8 +49,6 @@ class Job:
     """Markers of TRC and C3D."""
     fill_gaps_s: float = 0.2
     """Longest gap in a body's motion, s, that is interpolated for formats without gaps."""
-    neutral: range | None = None
-    """Frames of a neutral posture, to which joint angles are relative; None: absolute angles."""
 
     @property
     def body(self) -> Path | None:
@@ -185,7 +183,6 @@ def export_result(
     markers: MarkerSet = MarkerSet.OPENSIM,
     fill_gaps_s: float = 0.2,
     body: Path | None = None,
-    neutral: range | None = None,
     **options: Any,
 ) -> dict[str, Written]:
     """Export a result to several formats into `folder`; returns the output by format. InputError if
@@ -198,8 +195,7 @@ def export_result(
     if not all(each.rows for each in formats):
         kinds = ("identities", "observations")
         needs: Any = {name: any(getattr(each, name) for each in formats) for name in kinds}
-        take = read_take(results, **options, **needs)
-        job = Job(take, folder, body, markers, fill_gaps_s, neutral)
+        job = Job(read_take(results, **options, **needs), folder, body, markers, fill_gaps_s)
     done: dict[str, Written] = {}
     for each in formats:
         if each.rows:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from shapepose_fg.biomechanics.joint_angles import joint_angles
 from shapepose_fg.core.arrays import Index
-from shapepose_fg.core.errors import naming, optional
+from shapepose_fg.core.errors import optional
 from shapepose_fg.core.reconstruction import OpenedReconstruction
 from shapepose_fg.core.storage.files import write_atomically
 from shapepose_fg.io.export.registry import Job, Written
@@ -46,11 +46,6 @@ def write_angles(job: Job) -> Written:
     """Write `angles.csv`: a line for each person and frame with a body."""
     take, written = job.take, Written()
     angles = joint_angles(take.people, take.up, job.model)
-    if job.neutral is not None:
-        frame, first, end = take.people.frame, job.neutral.start, job.neutral.stop
-        still = take.people.rows(np.flatnonzero((frame >= first) & (frame < end)))
-        with naming("--neutral", "give frames in which everybody is seen"):
-            angles = angles.relative_to(joint_angles(still, take.up, job.model))
     times = take.times_s[np.searchsorted(take.frames, take.people.frame)]
     columns = angles.columns() | {"time_s": times}
     order = np.lexsort((take.people.person, take.people.frame))
