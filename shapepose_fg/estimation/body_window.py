@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import lapack
 
 from factors import DEFAULT_WIDTH_SIGMA, Motion
 from shapepose_fg.body.fitting.chains import Links
@@ -23,7 +22,7 @@ from shapepose_fg.body.fitting.priors import MotionPrior, PosePrior
 from shapepose_fg.body.kernels.solving import eliminated, put_back
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.body.model.rotation import exp_so3, log_so3
-from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.asynchronous_views import carried_to_frames, leads, velocities_of
@@ -346,6 +345,23 @@ class BodyWindow:
     def _bodies(self, state: BodyState) -> Array:
         return self.energy.model.keypoints(self.energy.complete(state.free))
 
+    def said_by(self, state: BodyState, joints: Mask) -> Array:
+        """(T, M, P) normal equations of what some `joints` (J,) say of each frame's body, without
+        priors, around the last solution.
+        """
+        weighed = self.last.gain / self.variance[..., None, None] * joints[:, None, None]
+        targets, T = EnergyTargets(self.last.target, weighed), len(self)
+        whole = self.energy.linearise(state.free, targets, 1e9, self._held, nothing(T)).system
+        alone = EnergyTargets(self.last.target, np.zeros_like(weighed))
+        prior = self.energy.linearise(state.free, alone, 1e9, self._held, nothing(T)).system
+        return np.asarray(whole - prior)
+
+    def deviation(self, bodies: Array) -> Array:
+        """(T, J, 3) X - J that is best for bodies (T, J, 3) that have moved from the last solution,
+        metres around the origin.
+        """
+        return self._deviation(self.last, bodies)
+
     def _deviation(self, here: _Around, bodies: Array) -> Array:
         """X - J that is best for bodies that have moved."""
         seen = np.asarray(here.gain.any(axis=(-1, -2)))
@@ -358,14 +374,12 @@ class BodyWindow:
         """
         acceleration, velocity = MotionPrior.default().part(self.energy.angles)
         T, n = len(self), self._law.order
-        step = np.full(max(n, T) - 1, np.inf)
-        step[: T - 1] = np.diff(self.times_s)
-        times = np.ones((max(n, T) - n, len(acceleration)))
-        if n < T:
-            faster = self._faster(bodies)
-            for k in range(n):  # the fastest step among those that it links
-                times[: T - n] = np.maximum(times[: T - n], faster[k : k + T - n])
-        return Links(self._law, acceleration * times, velocity, step)
+        step, times = np.full(max(n, T) - 1, np.inf), np.ones((max(n, T) - 1, len(velocity)))
+        step[: T - 1], times[: T - 1] = np.diff(self.times_s), self._faster(bodies)
+        fastest = times[: len(times) - n + 1].copy()  # of the steps that an acceleration links
+        for k in range(1, n):
+            fastest = np.maximum(fastest, times[k : k + len(fastest)])
+        return Links(self._law, acceleration * fastest, velocity * times, step)
 
     def _faster(self, bodies: Array) -> Array:
         """(T - 1, N) how many times the usual density of acceleration each unknown has, at least
@@ -418,6 +432,8 @@ class BodyWindow:
 
     def covariances(self, state: BodyState) -> "Marginals":
         """Marginal covariances of every frame's variables, around the last solution."""
+        from scipy.linalg import lapack
+
         here = self.last
         kept, front = self._eliminated(state.root, here, 0.0)
         T, N = here.pull.shape

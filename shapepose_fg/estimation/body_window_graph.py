@@ -25,6 +25,7 @@ from shapepose_fg.body.model.rotation import exp_so3, log_so3, right_jacobian_in
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.decompositions import symmetric_root
 from shapepose_fg.estimation.body_window import BodyState, BodyWindow, Marginals
+from shapepose_fg.estimation.condensed_graph import frame_systems
 from shapepose_fg.estimation.graph_covariances import graph_covariances
 from shapepose_fg.estimation.in_time import moments
 from shapepose_fg.estimation.user_factors import PersonWindow
@@ -69,34 +70,71 @@ class BodyGraph(PersonWindow):
         return self.window.observations.seen
 
     def build(self) -> "BodyGraph":
-        """Make the factors of the person alone, linear ones around the state, and the values."""
+        """Make all factors of the person, linear ones around the state, and the values; with active
+        user factors, those of all people whom they couple.
+        """
+        everyone = [each for each in self.ties.people if isinstance(each, BodyGraph)]
+        everyone = everyone if len(self.ties.active) > 0 else [self]
+        for each in everyone:
+            each.part(np.ones(len(each.touched), dtype=bool))
+        if len(self.ties.active) > 0:
+            graph, values = self.ties.joined()
+            for each in everyone:
+                each.set_graph(graph, values)
+        return self
+
+    def part(self, joints: Mask) -> None:
+        """Make the graph of the person alone with only some `joints` (J,) as variables. From each
+        frame the others are eliminated: what they say of body and shape is one factor.
+        """
         window, state = self.window, self.state
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         self.set_graph(graph, values)
-        scale, J, T = np.sqrt(self.widen), self.keys.shape[1], len(window)
-        turns = self.turns()
+        scale, chosen = np.sqrt(self.widen), np.flatnonzero(joints)
+        (T, J), turns = self.keys[:, chosen].shape, self.turns()
         slopes, betas = Marginals(window, state, *(np.empty(0),) * 4).slopes, state.betas.ravel()
         slopes[..., 10:13] = slopes[..., 10:13] @ turns[:, None]
-        bodies, joints = self._bodies(), window.joints(state)
-        for key, x in zip(self.keys.ravel().tolist(), joints.reshape(-1, 3), strict=True):
+        slopes = slopes[:, chosen]
+        bodies, X = self._bodies(), window.joints(state)[:, chosen]
+        for key, x in zip(self.keys[:, chosen].ravel().tolist(), X.reshape(-1, 3), strict=True):
             values.insert(key, x)
         for key, body in zip(self.body_keys.tolist(), bodies, strict=True):
             values.insert(key, body)
         values.insert(self.shape_key, betas)
         factors: list[gtsam.NonlinearFactor] = [*self._seen(scale, joints)]
-        at_zero = joints - state.deviation - (slopes[..., 10:] @ bodies[:, None, :, None])[..., 0]
-        at_zero -= slopes[..., :10] @ betas
-        flat = slopes.reshape(T * J, 3, -1)
-        sigma = np.broadcast_to(scale * np.sqrt(window.variance), (T, J))
+        at_zero = X - state.deviation[:, chosen] - slopes[..., :10] @ betas
+        at_zero -= (slopes[..., 10:] @ bodies[:, None, :, None])[..., 0]
+        flat = slopes.reshape(T * J, 3, slopes.shape[-1])
+        sigma = scale * np.sqrt(window.variance[:, chosen])
         factors += shape_factors(
-            self.keys.ravel(), self.body_keys.repeat(J), self.shape_key, at_zero.reshape(-1, 3),
-            flat[..., 10:], flat[..., :10], sigma.ravel(),
+            self.keys[:, chosen].ravel(), self.body_keys.repeat(J), self.shape_key,
+            at_zero.reshape(-1, 3), flat[..., 10:], flat[..., :10], sigma.ravel(),
         )  # fmt: skip
         factors += pose_factors([self.shape_key], [np.eye(10)[None] / scale], np.zeros((1, 10)), 10)
         factors += self._poses(scale, bodies, turns)
-        factors += [*self._velocities(), *self._standing(scale)]
+        factors += [*self._velocities(), *self._standing(scale, joints)]
+        if not joints.all():
+            factors += self._others(joints, turns)
         deque(map(graph.push_back, factors), maxlen=0)
-        return self
+
+    def _others(self, joints: Mask, turns: Array) -> list[gtsam.NonlinearFactor]:
+        """What all but these `joints` say of each body and the shape."""
+        H, pull = frame_systems(self.window, self.state, ~joints)
+        H[:, 10:13] = turns.mT @ H[:, 10:13]
+        H[..., 10:13] = H[..., 10:13] @ turns
+        pull[:, 10:13] = (turns.mT @ pull[:, 10:13, None])[..., 0]
+        H, pull = H / self.widen, pull / self.widen
+        keys, found = self.body_keys.tolist(), list[gtsam.NonlinearFactor]()
+        for t, key in enumerate(keys):
+            factor = gtsam.HessianFactor(
+                key, self.shape_key, H[t, 10:, 10:], H[t, 10:, :10], pull[t, 10:],
+                H[t, :10, :10], pull[t, :10], 0.0,
+            )  # fmt: skip
+            around = gtsam.Values()
+            around.insert(key, self._values.atVector(key))
+            around.insert(self.shape_key, self._values.atVector(self.shape_key))
+            found.append(gtsam.LinearContainerFactor(factor, around))
+        return found
 
     def of_body(self, t: int, joint: int) -> Array:
         """(3, 3) information on a joint in row `t` from its body in the same frame: from the other
@@ -112,21 +150,27 @@ class BodyGraph(PersonWindow):
         found = graph_covariances(part, self.values, gtsam.Ordering(order))[key, key]
         return np.asarray(np.linalg.inv(found), dtype=np.float64)
 
+    def refresh(self) -> None:
+        """Gate and linearise again around the state, after the deviations of joints changed."""
+        of_body = self.window.joints(self.state) - self.state.deviation - self.window.origin
+        self.window.last = self.window.around(self.state, of_body)
+
     def take(self, values: gtsam.Values) -> float:
         """Take the person's variables from a solution of a graph around the state before, and gate
         the detections there. Returns the mean motion of the joints, metres.
         """
         bodies = np.array([values.atVector(key) for key in self.body_keys.tolist()])
-        joints = np.array([values.atPoint3(key) for key in self.keys.ravel().tolist()])
         others = bodies[:, 3:].copy()
         others[:, -3:] -= self.window.origin
         zero = np.zeros((*self.keys.shape, 3))
         root = exp_so3(bodies[:, :3]) @ self._upright
         betas = values.atVector(self.shape_key).reshape(self.state.betas.shape)
-        state = BodyState(betas, root, others, zero)
-        joints, before = joints.reshape(zero.shape), self.window.joints(self.state)
-        self.state = replace(state, deviation=joints - self.window.joints(state))
+        state, before = BodyState(betas, root, others, zero), self.window.joints(self.state)
         of_body = self.window.joints(state) - self.window.origin
+        joints = of_body + self.window.deviation(of_body) + self.window.origin
+        for joint in self._variables(values):
+            joints[:, joint] = [values.atPoint3(key) for key in self.keys[:, joint].tolist()]
+        self.state = replace(state, deviation=joints - of_body - self.window.origin)
         self.window.last = self.window.around(self.state, of_body)
         return float(np.linalg.norm(joints - before, axis=-1).mean())
 
@@ -146,6 +190,10 @@ class BodyGraph(PersonWindow):
             part[..., :3] = part[..., :3] @ turns.mT
         shape = every[self.shape_key, self.shape_key] / self.widen
         return Marginals(self.window, self.state, poses, steps, shape, across)
+
+    def _variables(self, values: gtsam.Values) -> list[int]:
+        """The joints among `values`."""
+        return [n for n, key in enumerate(self.keys[0].tolist()) if values.exists(key)]
 
     def _bodies(self) -> Array:
         """(T, N) values of the bodies."""
@@ -189,19 +237,21 @@ class BodyGraph(PersonWindow):
                     found.append(linear_factor(names, parts, sigma=_DEFINED_M_S))
         return found
 
-    def _standing(self, scale: float) -> list[gtsam.NonlinearFactor]:
-        """What other frames of a stance say of joints of feet."""
+    def _standing(self, scale: float, joints: Mask) -> list[gtsam.NonlinearFactor]:
+        """What other frames of a stance say of `joints` (J,) of feet."""
         held = self.window.standing
-        frame, joint = np.nonzero(held.information.any(axis=(-1, -2)))
+        frame, joint = np.nonzero(held.information.any(axis=(-1, -2)) & joints)
         roots = symmetric_root(held.information[frame, joint]) / scale
         right = (roots @ held.xyz[frame, joint][..., None])[..., 0]
         names = self.keys[frame, joint].tolist()
         return [linear_factor([key], [A], b) for key, A, b in zip(names, roots, right, strict=True)]
 
-    def _seen(self, scale: float, joints: Array) -> list[gtsam.NoiseModelFactor]:
+    def _seen(self, scale: float, joints: Mask) -> list[gtsam.NoiseModelFactor]:
+        """The projections of `joints` (J,)."""
         window, evidence = self.window, self.window.last.evidence
-        xy = window.carried(joints).xy
-        frame, joint, view = chosen = np.nonzero(evidence.inlier & (window.sigmas_px > 0))
+        xy = window.carried(window.joints(self.state)).xy
+        used = evidence.inlier & (window.sigmas_px > 0) & joints[:, None]
+        frame, joint, view = chosen = np.nonzero(used)
         kernel, views = window.config.robust_kernel, window.views
         width = None if kernel is None else DEFAULT_WIDTH_SIGMA[kernel] / scale
         return projection_factors(

@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 
 from factors import body_keys, jacobian_factor, shape_key
-from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.estimation.body_window import HELD, BodyState, BodyWindow
 
 
@@ -20,13 +20,7 @@ def gtsam_step(window: BodyWindow, state: BodyState) -> tuple[Array, Array]:
     T, N = window.last.pull.shape
     keys, shape = body_keys(0, np.arange(T)), shape_key(0)
     graph = gtsam.GaussianFactorGraph()
-    system, turn = window.last.system, state.root
-    lower = np.tril(system[:, : N + 10])
-    H = lower + np.tril(lower, -1).mT
-    pull = -system[:, N + 10]
-    H[:, 10:13] = turn @ H[:, 10:13]
-    H[..., 10:13] = H[..., 10:13] @ turn.mT
-    pull[:, 10:13] = (turn @ pull[:, 10:13, None])[..., 0]
+    H, pull = frame_systems(window, state)
     H[:, 10:, 10:] += HELD * np.eye(N)
     frames = map(
         gtsam.HessianFactor, keys.tolist(), repeat(shape), H[:, 10:, 10:], H[:, 10:, :10],
@@ -46,3 +40,21 @@ def gtsam_step(window: BodyWindow, state: BodyState) -> tuple[Array, Array]:
     except RuntimeError as error:  # gtsam.IndeterminantLinearSystemException
         raise np.linalg.LinAlgError(str(error)) from None
     return found.at(shape), np.array([found.at(key) for key in keys.tolist()])
+
+
+def frame_systems(
+    window: BodyWindow, state: BodyState, joints: Mask | None = None
+) -> tuple[Array, Array]:
+    """What each frame says of betas and pose around a state: Hessians (T, P, P) and negative
+    gradients (T, P), the root's in tangents of the world, with the priors of poses. With `joints`
+    (J,) only what these say, without priors.
+    """
+    system, turn, P = window.last.system, state.root, window.energy.num_free
+    if joints is not None:
+        system = window.said_by(state, joints)
+    lower = np.tril(system[:, :P])
+    H, pull = lower + np.tril(lower, -1).mT, -system[:, P]
+    H[:, 10:13] = turn @ H[:, 10:13]
+    H[..., 10:13] = H[..., 10:13] @ turn.mT
+    pull[:, 10:13] = (turn @ pull[:, 10:13, None])[..., 0]
+    return H, pull

@@ -55,6 +55,8 @@ def _solved(
 ) -> list[FactorSolution]:
     few = replace(config, max_iterations=min(config.max_iterations, _STEPS))
     before = [(each.state, each.window.last) for each in people]
+    for each in people:
+        each.refresh()
     try:
         for _ in range(_ROUNDS):
             graph, values = _joined(people, ties)
@@ -77,26 +79,29 @@ def _solved(
         for each, (state, last) in zip(people, before, strict=True):
             each.state, each.window.last = state, last
             each.failure = str(error) if isinstance(error, NotFinite) else singular
-            each.build()
+            each.set_graph(None)
         return []
-    for each in people:
-        each.set_graph(graph, values)
-    return [
-        FactorSolution(
-            each,
-            np.array([[every[key, key] for key in row] for row in each.keys.tolist()]),
-            each.marginals(every),
-        )
-        for each in people
-    ]
+    return [FactorSolution(each, *_covariances(each, every)) for each in people]
+
+
+def _covariances(person: BodyGraph, every: dict[tuple[int, int], Array]) -> tuple[Array, Marginals]:
+    """Covariances of the joints of a solved person, and the marginals of the model."""
+    marginals = person.marginals(every)
+    found = person.widen * marginals.joints()
+    for joint in np.flatnonzero(person.touched):
+        found[:, joint] = [every[key, key] for key in person.keys[:, joint].tolist()]
+    person.set_graph(None)
+    return found, marginals
 
 
 def _joined(
     people: list[BodyGraph], ties: CoupledGraph
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-    """The graph around the present state of the people, and its values."""
+    """The graph around the present state of the people, and its values: with the joints that user
+    factors are on.
+    """
     for each in people:
-        each.build()
+        each.part(each.touched)
     return ties.joined()
 
 

@@ -151,9 +151,11 @@ class PersonWindow:
             self.build()
         return self._values
 
-    def set_graph(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
-        """Set the factors and the solution."""
-        self._graph, self._values = graph, values
+    def set_graph(
+        self, graph: gtsam.NonlinearFactorGraph | None, values: gtsam.Values | None = None
+    ) -> None:
+        """Set the factors and the solution; without them, they are made when they are asked for."""
+        self._graph, self._values = graph, gtsam.Values() if values is None else values
 
     def build(self) -> "PersonWindow":
         """Make `graph` and `values` of the person alone."""

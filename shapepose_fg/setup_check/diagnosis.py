@@ -173,7 +173,7 @@ _FITTING, _STEADY, _UNLIKELY, _NEARLY = 0.5, 0.3, 0.1, 0.5
 pieces of the recording above the second, a probability of small mistakes above the third, or an
 offset in time with more than this share of what makes it significant."""
 _SHORT = 5
-"""Frames in such a piece."""
+"""Minimum frames in such a piece, of which there are up to four."""
 _MOST_FINDINGS, _MOST_BIASED = 4, 3
 """Maximum number of findings, and of biased people, that are distinguished."""
 _UNFIT = 0.15
@@ -253,12 +253,13 @@ def _sound(look: Look, detections: DetectionSequence, rig: Rig) -> Diagnosis | N
     """The diagnosis of cameras and detections without any sign of a mistake; None if there is one,
     or if too little is seen.
     """
+    piece = max(_SHORT, len(look.evidence.anchors) // 4)
     if (
         len(look.sightings) < MIN_SIGHTINGS
         or len(look.groups()) < MIN_SIGHTINGS
         or min(look.scores) < (_FITTING if look.cameras_used > 2 else GOOD_PAIR)
         or [*duplicates(rig, look.evidence), *_blind(look), *_stopped(look), *_unfit(look, set())]
-        or any(restlessness(in_pieces(look, v, _SHORT)[2]) > _STEADY for v in range(len(rig)))
+        or any(restlessness(in_pieces(look, v, piece)[2]) > _STEADY for v in range(len(rig)))
     ):
         return None
     problem = Problem.of(look)
