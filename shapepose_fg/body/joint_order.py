@@ -65,13 +65,14 @@ def _distances(dimensions: int) -> _Distances:
         )
         points = np.einsum("npx,nyx->npy", points, np.stack([right, up], axis=1))
     points = points + _NOISE_M * rng.normal(size=points.shape)
-    apart = np.linalg.norm(points[:, :, None] - points[:, None], axis=-1)
     first, second = np.triu_indices(len(BODY_POINTS), 1)
+    apart = np.linalg.norm(points[:, first] - points[:, second], axis=-1)
     logs = np.log(np.maximum(apart, 1e-9))
-    logs -= logs[:, first, second].mean(axis=1)[:, None, None]
-    sigma = logs.std(axis=0)
-    np.fill_diagonal(sigma, 1.0)
-    return _Distances(logs.mean(axis=0), sigma)
+    logs -= logs.mean(axis=1, keepdims=True)
+    mean, sigma = np.zeros((len(BODY_POINTS),) * 2), np.eye(len(BODY_POINTS))
+    for matrix, values in ((mean, logs.mean(axis=0)), (sigma, logs.std(axis=0))):
+        matrix[first, second] = matrix[second, first] = values
+    return _Distances(mean, sigma)
 
 
 def fit_of_order(people: Array, points: Sequence[str]) -> Array:

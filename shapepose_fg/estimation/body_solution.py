@@ -80,7 +80,7 @@ def solve_bodies(
     # Bodies and joints together. Rows without a body keep what their views determine.
     agreed = np.asarray(evidence.inlier.sum(axis=-1) >= 2)
     found = _Found.of_views(evidence, config.refine.max_sigma_m, start.status)
-    people, spread = list[BodyGraph](), list[Marginals]()
+    people, spread = list[BodyGraph](), list[Array]()
     feet = feet_of(config.joints if config.motion.contact else ())
     for rows in window_rows(observations):
         if not start.ok[rows].any():
@@ -102,7 +102,7 @@ def solve_bodies(
         # errors: solution and gates do not change.
         widen = noisy * marginals.lasting()
         people.append(BodyGraph(window, state, track, frames, widen, rows))
-        spread.append(marginals)
+        spread.append(marginals.of_bodies)
         found.put(people[-1], marginals)
 
     # Uncertainty: unseen joints deviate from their bodies by more, above all those that cameras
@@ -111,12 +111,12 @@ def solve_bodies(
     strong = found.evidence.inlier & sure
     limbs = limbs_that_hide(config.joints)
     elsewhere = elsewhere_variance(found.joints, observations.frame, strong, views, limbs)
-    for person, marginals in zip(people, spread, strict=True):
+    for person, of_bodies in zip(people, spread, strict=True):
         seen = np.asarray(strong[person.rows].any(axis=-1))
         moved = np.square(SPEED_M_S * waited_s(seen, person.times_s))
         moved = np.minimum(elsewhere[person.rows], moved)
-        person.window.widen_unseen(person.widen * marginals.of_bodies, moved)
-        found.covariance[person.rows] = person.widen * marginals.joints()
+        person.window.widen_unseen(person.widen * of_bodies, moved)
+        found.covariance[person.rows] = person.widen * person.window.of_joints(of_bodies)
 
     # User factors: people who have some are solved once more.
     if len(functions) > 0:

@@ -64,8 +64,8 @@ def test_limbs_that_swing_are_where_they_are_frame_by_frame(five_cameras, fps, f
         reconstruct(recording, rig, config, times=clock) for config in (PipelineConfig(), ALONE)
     )
     error, without = errors(over_time, people), errors(alone, people)
-    limbs = [*ARM, *LEG]
-    assert error[:, limbs].mean() < 1.15 * without[:, limbs].mean()
+    for limb in (ARM, LEG):
+        assert error[:, limb].mean() < 1.05 * without[:, limb].mean()
     assert error.mean() < 1.05 * without.mean()
     assert error.max() < 0.15
     off = over_time.joints - people
@@ -76,7 +76,7 @@ def test_limbs_that_swing_are_where_they_are_frame_by_frame(five_cameras, fps, f
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "most_mm"), [("time", 18.0), ("fast", 22.0)])
+@pytest.mark.parametrize(("name", "most_mm"), [("time", 17.0), ("fast", 22.0)])
 def test_a_recorded_jump_kick(shared_data, name, most_mm):
     """Five cameras, 30 frames a second; frame by frame the mean error is 16.8 mm."""
     folder = shared_data.parent / "cases" / "jumpkick"
