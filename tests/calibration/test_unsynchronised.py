@@ -122,6 +122,7 @@ def test_the_command_finds_the_start_of_a_camera_with_a_log(
     write_trajectory(log, Path("log.tum"))
     base = ["calibrate", "--calibration", "lenses.json", "--detections", "detection", "--fps", "25"]
     base += ["--times", "times.csv", "--most", "8", "--trajectory", "cam2=log.tum"]
+    base += ["--tolerance", "5,300"]
 
     def run(*more: str) -> tuple[int, str]:
         with pytest.raises(SystemExit) as ended:
