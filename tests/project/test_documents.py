@@ -239,7 +239,7 @@ def test_the_code_of_every_page_is_run():
 def test_the_python_of_a_page_runs(page, recording):
     if page == "export":
         pytest.importorskip("pyarrow", reason="needs the extra archive")
-    (there,) = (each for each in PAGES if each.stem == page)
+    there = min((each for each in PAGES if each.stem == page), key=lambda each: len(each.parts))
     run(there, names=PREPARED[page](recording))
 
 
