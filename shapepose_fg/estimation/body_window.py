@@ -15,10 +15,10 @@ from functools import cached_property
 import numpy as np
 
 from factors import DEFAULT_WIDTH_SIGMA, Motion
-from shapepose_fg.body.fitting.chains import Links
+from shapepose_fg.body.fitting.chains import Links, linked
 from shapepose_fg.body.fitting.energy import BodyEnergy, EnergyTargets, Held, nothing
 from shapepose_fg.body.fitting.fitter import JointTargets
-from shapepose_fg.body.fitting.priors import MotionPrior, PosePrior
+from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.kernels.solving import eliminated, put_back
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.body.model.rotation import exp_so3, log_so3
@@ -31,7 +31,7 @@ from shapepose_fg.estimation.contact import (
     held_in_place,
     standing_density,
 )
-from shapepose_fg.estimation.in_time import moments, motion_of, velocities
+from shapepose_fg.estimation.in_time import moments, velocities
 from shapepose_fg.estimation.linearisation import (
     ObservationConfig,
     ViewEvidence,
@@ -45,9 +45,6 @@ DEVIATION_M = 0.007
 POSE_LASTS_S = 1.0
 """A pose is as good as independent of the one before after so long, seconds: the pose prior counts
 once in it."""
-_LEVER_M = 0.05
-"""A rotation that moves a keypoint by less per radian, metres, does not decide how fast that
-keypoint is."""
 _PLACED_M = 0.05
 """Standard deviation by the views, m, up to which a foot is held in place where it stands."""
 _STRAYS_M = 0.07
@@ -180,7 +177,7 @@ class BodyWindow:
         )
         bodies = self._bodies(state)
         if len(self) > 1:
-            self.links = self._linked(bodies)
+            self.links = linked(self._law, self.energy, self.times_s, self._faster(bodies))
         self.last = self.around(state, bodies)
         return self._descended(state)
 
@@ -368,31 +365,13 @@ class BodyWindow:
         away = np.where(seen[..., None], here.target - bodies, 0.0)
         return (here.gain @ away[..., None])[..., 0]
 
-    def _linked(self, bodies: Array) -> Links:
-        """The motion prior, where joints are faster than people on average as much wider as they
-        are.
-        """
-        acceleration, velocity = MotionPrior.default().part(self.energy.angles)
-        T, n = len(self), self._law.order
-        step, times = np.full(max(n, T) - 1, np.inf), np.ones((max(n, T) - 1, len(velocity)))
-        step[: T - 1], times[: T - 1] = np.diff(self.times_s), self._faster(bodies)
-        fastest = times[: len(times) - n + 1].copy()  # of the steps that an acceleration links
-        for k in range(1, n):
-            fastest = np.maximum(fastest, times[k : k + len(fastest)])
-        return Links(self._law, acceleration * fastest, velocity * times, step)
-
     def _faster(self, bodies: Array) -> Array:
-        """(T - 1, N) how many times the usual density of acceleration each unknown has, at least
-        1.
-        """
+        """(T - 1, J) how many times the mean density of acceleration each joint has, at least 1."""
         X = bodies + self.origin
         evidence = linearise(self.observations, self.sigmas_px, X, self.views, self.config)
         points = np.where(np.isfinite(evidence.target).all(-1, keepdims=True), evidence.target, X)
         variance = np.minimum(evidence.sigma_m, 1e3) ** 2
-        speed, turning = motion_of(points, variance, self.times_s)
-        density = np.maximum(self._motion.acceleration(speed), turning)
-        ratio = np.maximum(density / self._motion.psd_lost, 1.0)
-        return ratio[:, nearest_keypoint(self.energy)]
+        return self._motion.faster(points, variance, self.times_s)
 
     def _moved(self, state: BodyState) -> tuple[float, Array]:
         assert self.links is not None
@@ -558,23 +537,6 @@ class Marginals:
         moved = np.concatenate((np.zeros((1, J)), walk.cumsum(axis=0)))
         density = (moved[last] - moved[first]) / lasts[:, None] ** 2
         return found @ inverses(np.eye(3) + found / density[..., None, None])
-
-
-def nearest_keypoint(energy: BodyEnergy) -> Index:
-    """(N,) for every unknown of a pose the keypoint that it moves with the shortest lever, but for
-    tiny ones.
-    """
-    still = BodyParameters(
-        np.zeros((1, 10)), np.zeros((1, 3)), np.zeros((1, 23, 3)), np.zeros((1, 3))
-    )
-    _, slopes = energy.model.keypoints_with_jacobian(still)
-    turns = slopes[0, :, :, 10:82].reshape(slopes.shape[1], 3, 24, 3)
-    lever = np.sqrt((turns**2).sum(axis=(1, 3)) / 2)
-    lever = np.where(lever > _LEVER_M, lever, np.inf)
-    nearest = np.where(np.isfinite(lever).any(axis=0), lever.argmin(axis=0), lever[:, 0].argmin())
-    return np.concatenate(
-        [nearest[:1].repeat(3), (nearest[1:].repeat(3))[energy.angles], nearest[:1].repeat(3)]
-    )
 
 
 def _symmetric(lower: Array) -> Array:

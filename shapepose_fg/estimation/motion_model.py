@@ -12,6 +12,7 @@ from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.bounds import Factor, Settings
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import read_json
+from shapepose_fg.estimation.in_time import motion_of
 
 FORMAT = "shapepose-fg motion model 1"
 LOST_M = 0.1
@@ -72,6 +73,13 @@ class MotionModel:
         m²/s³.
         """
         return self.psd_still + self.psd_speed * np.asarray(speed_m_s) ** 2
+
+    def faster(self, points: Array, variance: Array, times_s: Array) -> Array:
+        """(T - 1, J) how many times the mean density over all speeds the accelerations of points
+        (T, J, 3), metres, have in each step, at least 1; arguments as `in_time.motion_of`.
+        """
+        speed, turning = motion_of(points, variance, times_s)
+        return np.maximum(np.maximum(self.acceleration(speed), turning) / self.psd_lost, 1.0)
 
     @classmethod
     def load(

@@ -5,10 +5,11 @@ away.
 import numpy as np
 import pytest
 
+from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections, Recording
 from shapepose_fg.core.frame_times import FrameTimes
-from shapepose_fg.core.reconstruction import Reconstruction, Status
+from shapepose_fg.core.reconstruction import BODY, Reconstruction, Status
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
@@ -68,6 +69,12 @@ def test_limbs_that_swing_are_where_they_are_frame_by_frame(five_cameras, fps, f
         assert error[:, limb].mean() < 1.05 * without[:, limb].mean()
     assert error.mean() < 1.05 * without.mean()
     assert error.max() < 0.15
+    # The bodies over time follow the limbs: their keypoints lie near the joints.
+    bodies = BodyModel.default().keypoints(
+        BodyParameters(*(getattr(over_time, name) for name in BODY))
+    )
+    apart = np.linalg.norm(bodies - over_time.joints, axis=-1)
+    assert apart[:, [*ARM, *LEG]].mean() < 0.03
     off = over_time.joints - people
     squared = np.einsum(
         "tji,tji->tj", off, np.linalg.solve(over_time.covariance, off[..., None])[..., 0]

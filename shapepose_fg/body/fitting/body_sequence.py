@@ -49,6 +49,7 @@ class SequenceFitter:
         shapes: Shapes | None = None,
         *,
         fixed_shapes: bool = False,
+        faster: Array | None = None,
     ) -> SequenceFit:
         """See `BodyFitter.fit_sequence`."""
         groups, time_s = check_groups(groups, len(targets)), np.asarray(time_s, dtype=np.float64)
@@ -65,9 +66,12 @@ class SequenceFitter:
             raise ValueError(f"shapes must have one row for each of the {count}")
         if fixed_shapes and shapes is None:
             raise ValueError("fixed_shapes needs shapes: give them")
+        faster = np.ones(targets.xyz.shape[:2]) if faster is None else faster
+        if faster.shape != targets.xyz.shape[:2] or not (faster >= 1).all():
+            raise ValueError(f"faster must be {targets.xyz.shape[:2]}, at least 1")
         evidence = weigh(targets, self.config.model_sigma_m)
         fit = BodyFit.failed(evidence.status, joints)
-        free, origin, rows, found = self._start(evidence, group, time_s)
+        free, origin, rows, found = self._start(evidence, group, time_s, faster)
         # Rows without a fit of their own get a body if their segment is solved; `_fill` then sets
         # their status.
         fit.status[fit.ok & ~found] = FitStatus.NOT_CONVERGED
@@ -91,7 +95,7 @@ class SequenceFitter:
         return SequenceFit(fit, numbers, known)
 
     def _start(
-        self, evidence: Evidence, group: Index, time_s: Array
+        self, evidence: Evidence, group: Index, time_s: Array, faster: Array
     ) -> tuple[Array, Array, ChainRows, Mask]:
         """Initial bodies of B rows from single-row fits; rows without one take that of the nearest
         row of the group in time.
@@ -120,7 +124,9 @@ class SequenceFitter:
                 free[mine, -3:] = np.stack(place, axis=1)
                 angles[mine] = held[np.searchsorted(ok, nearest)]
         targets = EnergyTargets(evidence.xyz - origin[:, None], evidence.information)
-        rows = ChainRows(self.energy, self.config.kernel_scale, targets, angles, time_s, self.law)
+        rows = ChainRows(
+            self.energy, self.config.kernel_scale, targets, angles, time_s, self.law, faster
+        )
         return free, origin, rows, found
 
     def _solved(

@@ -8,6 +8,7 @@ from factors import Motion
 from shapepose_fg.body.fitting.energy import BodyEnergy, EnergyTargets, Held, nothing
 from shapepose_fg.body.fitting.priors import MotionPrior
 from shapepose_fg.body.kernels.solving import eliminated, put_back
+from shapepose_fg.body.model.body_model import BodyParameters
 from shapepose_fg.body.model.rotation import exp_so3, log_so3, right_jacobian_inverse
 from shapepose_fg.core.arrays import Array, Index, Mask
 
@@ -15,6 +16,9 @@ MAX_ITERATIONS = 8
 """Maximum number of Levenberg-Marquardt steps, rejected ones included."""
 TOLERANCE = 0.05
 """Convergence: decrease of the energy per row in a step, in squared standard deviations."""
+_LEVER_M = 0.05
+"""A rotation that moves a keypoint by less per radian, metres, does not decide how fast that
+keypoint is."""
 _DAMPING_START, _DAMPING_MIN, _DAMPING_MAX = 1e-4, 1e-8, 1e4
 
 
@@ -174,6 +178,37 @@ class Links:
         return found
 
 
+def linked(law: Motion, energy: BodyEnergy, times_s: Array, faster: Array) -> Links:
+    """The motion prior along T rows at `times_s` (T,). Where joints accelerate more than people on
+    average, `faster` (T - 1, J) times, it is as much wider for the unknowns that move them.
+    """
+    acceleration, velocity = MotionPrior.default().part(energy.angles)
+    T, n = len(times_s), law.order
+    step, times = np.full(max(n, T) - 1, np.inf), np.ones((max(n, T) - 1, len(velocity)))
+    step[: T - 1], times[: T - 1] = np.diff(times_s), faster[:, nearest_keypoint(energy)]
+    fastest = times[: len(times) - n + 1].copy()  # of the steps that an acceleration links
+    for k in range(1, n):
+        fastest = np.maximum(fastest, times[k : k + len(fastest)])
+    return Links(law, acceleration * fastest, velocity * times, step)
+
+
+def nearest_keypoint(energy: BodyEnergy) -> Index:
+    """(N,) for every unknown of a pose the keypoint that it moves with the shortest lever, but for
+    tiny ones.
+    """
+    still = BodyParameters(
+        np.zeros((1, 10)), np.zeros((1, 3)), np.zeros((1, 23, 3)), np.zeros((1, 3))
+    )
+    _, slopes = energy.model.keypoints_with_jacobian(still)
+    turns = slopes[0, :, :, 10:82].reshape(slopes.shape[1], 3, 24, 3)
+    lever = np.sqrt((turns**2).sum(axis=(1, 3)) / 2)
+    lever = np.where(lever > _LEVER_M, lever, np.inf)
+    nearest = np.where(np.isfinite(lever).any(axis=0), lever.argmin(axis=0), lever[:, 0].argmin())
+    return np.concatenate(
+        [nearest[:1].repeat(3), (nearest[1:].repeat(3))[energy.angles], nearest[:1].repeat(3)]
+    )
+
+
 @dataclass(frozen=True)
 class ChainRows:
     """R rows with their energies, linked by the motion prior; all rows of a chain share
@@ -192,6 +227,8 @@ class ChainRows:
     """(R,) times, s."""
     law: Motion
     """Motion model between rows."""
+    faster: Array
+    """(R, J) how many times the usual density of acceleration each joint has, at least 1."""
 
     def solved(
         self, free: Array, segments: list[Segment], mean: Array, information: Array, *, fixed: bool
@@ -261,9 +298,8 @@ class _Chain:
         count, index = len(segment.rows), segment.rows
         self._targets, angles = rows.targets.rows(index), rows.angles[index]
         self._held = Held(np.zeros((count, 10)), np.zeros(count), angles)
-        step = np.full(max(rows.law.order, count) - 1, np.inf)
-        step[: count - 1] = np.diff(rows.time_s[index])
-        self._links = Links(rows.law, *MotionPrior.default().part(rows.energy.angles), step)
+        faster = np.maximum(rows.faster[index[1:]], rows.faster[index[:-1]])
+        self._links = linked(rows.law, rows.energy, rows.time_s[index], faster)
 
     def solved(self, start: Array) -> tuple[_State, Array]:
         """The state solved from `start` (T, P), and the information of the rows about the betas

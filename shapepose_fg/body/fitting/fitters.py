@@ -154,26 +154,35 @@ class SmplFitter(BodyFitter):
         shapes: Shapes | None = None,
         *,
         fixed_shapes: bool = False,
+        faster: Array | None = None,
     ) -> SequenceFit:
         """See `BodyFitter`; people far from adults' size are fitted at that size first
         (`sizes`).
         """
         sequence = SequenceFitter(self.energy, self._starts, self.law, self.config)
-        found = sequence.fit(targets, groups, time_s, shapes, fixed_shapes=fixed_shapes)
+        found = sequence.fit(
+            targets, groups, time_s, shapes, fixed_shapes=fixed_shapes, faster=faster
+        )
         sizes = Sizes.of(self.model)
         far = sizes.far(found.shapes.mean)
         if shapes is not None or not far.any():
             return found
         rows = np.flatnonzero(np.isin(groups, found.groups[far]))
         own, groups, time_s = targets.rows(rows), groups[rows], time_s[rows]
+        faster = None if faster is None else faster[rows]
         whose = np.unique(groups, return_inverse=True)[1]
         mean, information = found.shapes.mean.copy(), found.shapes.information
         for _ in range(_ROUNDS):
             size = sizes.ratio(mean[far])
-            adult = sequence.fit(own.larger(1 / size[whose]), groups, time_s)
+            adult = sequence.fit(own.larger(1 / size[whose]), groups, time_s, faster=faster)
             mean[far] = sizes.resized(self.model, adult.shapes.mean, size)
         again = sequence.fit(
-            own, groups, time_s, Shapes(mean[far], information[far]), fixed_shapes=True
+            own,
+            groups,
+            time_s,
+            Shapes(mean[far], information[far]),
+            fixed_shapes=True,
+            faster=faster,
         )
         return SequenceFit(
             found.fit.with_rows(rows, again.fit), found.groups, Shapes(mean, information)
