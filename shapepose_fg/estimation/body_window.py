@@ -411,8 +411,6 @@ class BodyWindow:
 
     def covariances(self, state: BodyState) -> "Marginals":
         """Marginal covariances of every frame's variables, around the last solution."""
-        from scipy.linalg import lapack
-
         here = self.last
         kept, front = self._eliminated(state.root, here, 0.0)
         T, N = here.pull.shape
@@ -424,8 +422,7 @@ class BodyWindow:
         after, arrows = np.zeros((n * N, n * N)), np.zeros((n * N, 10))
         for t in range(T - 1, -1, -1):
             L, ahead = kept[t, :N, :N], kept[t, N : N + n * N, :N]
-            inverse, _ = lapack.dtrtri(L, lower=1)
-            inverse = np.tril(inverse)
+            inverse = np.linalg.inv(np.tril(L))
             W = ahead @ inverse
             across = -after @ W  # of those after it with this one
             own = inverse.T @ inverse - W.T @ across
@@ -496,7 +493,7 @@ class Marginals:
         """
         window, last = self.window, self.window.last
         some = slice(None, None, max(len(window) // _LOOKS, 1))
-        seen = np.asarray(last.evidence.inlier.any(axis=-1)[some])
+        seen = np.asarray(last.evidence.inlier.any(axis=-1))[some]
         if not seen.any():
             return LASTS
         slope, gain = self.slopes[some, ..., 10:], last.gain[some]
