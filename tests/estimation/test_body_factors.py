@@ -95,6 +95,27 @@ def test_a_factor_on_a_pose_turns_the_body() -> None:
     np.testing.assert_allclose(turned, turn, atol=0.02)
 
 
+def test_the_whole_graph_agrees_with_the_solution() -> None:
+    """GTSAM solves with the joints of user factors only. The graph with all joints, made when it is
+    asked for, has the same minimum and the same marginals.
+    """
+    one = person(0)
+    ends = int(one.keys[5, WRIST]), int(one.keys[5, NECK])
+    apart = float(np.linalg.norm(one.first[5, WRIST] - one.first[5, NECK]))
+    one.add(gtsam.RangeFactor3(*ends, apart + 0.03, isotropic(1, 0.01)), "apart")
+    (found,) = solve_with_factors([one], CONFIG)
+    step = one.graph.linearize(one.values).optimize()
+    moves = [np.linalg.norm(step.at(key)) for key in one.keys.ravel().tolist()]
+    assert len(moves) == one.keys.size and np.median(moves) < 5e-4 and max(moves) < 5e-3
+    marginals = gtsam.Marginals(one.graph, one.values)
+    for joint in (WRIST, ELBOW, BODY_25.index("LAnkle")):
+        covariance = found.covariance[5, joint]
+        np.testing.assert_allclose(
+            marginals.marginalCovariance(int(one.keys[5, joint])), covariance,
+            atol=0.02 * np.trace(covariance),
+        )  # fmt: skip
+
+
 def test_people_whom_a_factor_ties_are_one_graph_and_both_give_way() -> None:
     one, other, third = person(0, 0), person(3, 1), person(4, 2)
     for each in (one, other, third):
