@@ -26,9 +26,9 @@ def read_number_table(
 
     Words are separated by commas or spaces, and `#` begins a comment. `heads` receives the number
     and the words of the first line, and returns the names of the columns, and whether that line is
-    a header. `may_lack` returns whether a column may contain `MISSING`, or end a
-    line empty. InputError that names file and line; `units` is the advice for words that are no
-    numbers.
+    a header. `may_lack` returns whether a column may contain `MISSING`, or be empty after the last
+    comma of a line. InputError that names file and line; `units` is the advice for words that are
+    no numbers.
     """
     names, rows, lines = list[str](), list[list[float]](), list[int]()
     for line, text in enumerate(read_text(path, most=BIG).splitlines(), start=1):
@@ -39,7 +39,8 @@ def read_number_table(
             names, is_header = heads(line, words)
             if is_header:
                 continue
-        words += [MISSING for name in names[len(words) :] if may_lack(name)]
+        if text.rstrip().endswith(","):
+            words += [MISSING for name in names[len(words) :] if may_lack(name)]
         if len(words) != len(names):
             cure = "correct the line, or name the columns in the first line"
             raise InputError(

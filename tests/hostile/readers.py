@@ -381,7 +381,7 @@ def _actors(folder: Path, seed: int) -> Read:
     for n in range(2):
         actors[0, n] = np.empty((2, 1), dtype=object)
         for frame in range(2):
-            actors[0, n][frame, 0] = rng.normal(0, 1, (14, 3))
+            actors[0, n][frame, 0] = rng.normal(0, 0.4, (14, 3))
     savemat(folder / "actorsGT.mat", {"actor3D": actors}, do_compression=seed % 2 == 0)
     return lambda: read_people(folder / "actorsGT.mat")
 
@@ -389,14 +389,14 @@ def _actors(folder: Path, seed: int) -> Read:
 def _panoptic(folder: Path, seed: int) -> Read:
     rng = np.random.default_rng(seed)
     for frame in range(2):
-        bodies = [{"id": n, "joints19": rng.normal(0, 100, 76).tolist()} for n in range(2)]
+        bodies = [{"id": n, "joints19": rng.normal(0, 40, 76).tolist()} for n in range(2)]
         text = json.dumps({"version": 0.7, "bodies": bodies})
         (folder / f"body3DScene_{frame:08d}.json").write_text(text)
     return lambda: read_people(folder)
 
 
 def _joints(folder: Path, seed: int) -> Read:
-    joints = np.random.default_rng(seed).normal(0, 1, (3, 2, 17, 3))
+    joints = np.random.default_rng(seed).normal(0, 0.4, (3, 2, 17, 3))
     np.savez(folder / "truth.npz", joints=joints, layout="H36M_17", frames=np.arange(3))
     return lambda: read_people(folder / "truth.npz")
 

@@ -282,8 +282,7 @@ class BodyFitter(ABC):
         time_s: (B,) times, seconds. Rows of a group more than `gap_s` apart are not linked.
         shapes: prior shapes of the groups, in the order of `np.unique(groups)`; None: adults.
         fixed_shapes: keep the means of `shapes`.
-        faster: (B, J) how many times the usual density of acceleration each joint has, at least 1:
-            the motion prior is as much wider. None: 1.
+        faster: (B, J) ratio, at least 1, by which the motion prior of joints is widened; None: 1.
 
         Rows with too few joints are interpolated by the motion prior. Raises ValueError if a group
         has two rows at one time.

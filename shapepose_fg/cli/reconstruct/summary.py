@@ -115,12 +115,13 @@ def summary_table(
         table.add_row("", words, style="yellow")
     if len(people) > 0:
         table.add_row("joints", _joints(counts["joints"], people))
-    # Loading the body takes a third of a second once, and is not part of the time per frame.
-    stages = {name: spent for name, spent in run.get("seconds", {}).items() if name != "load"}
+    # Loading the body and the set-up check are done once, and not part of the time per frame.
+    once, spent = ("load", "set-up check"), run.get("seconds", {})
+    stages = {name: each for name, each in spent.items() if name not in once}
     table.add_row(
         "time", f"{1e3 * sum(stages.values()) / len(span):.1f} ms a frame, {seconds:.1f} s in all"
     )
-    words = (f"{name} {1e3 * spent / len(span):.1f}" for name, spent in stages.items())
+    words = (f"{name} {1e3 * each / len(span):.1f}" for name, each in stages.items())
     table.add_row("", "  ".join(words), style="dim")
     return table
 
