@@ -4,6 +4,7 @@ error.
 
 import os
 import pickle
+import signal
 import sys
 from collections.abc import Generator
 from dataclasses import dataclass
@@ -24,6 +25,11 @@ from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25, Skeleton
 from shapepose_fg.pipeline.pipeline import reconstruct
 from shapepose_fg.simulation import Scene, built_in_scene, simulate
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    # A shell that starts the tests in the background has programs ignore Ctrl-C, which tests send.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
 
 # Some tests import others from this folder, where `factors` is the folder of the library's tests:
 # the project goes first, for processes that are begun by a test, too.
