@@ -71,13 +71,15 @@ class BodyGraph(PersonWindow):
 
     def build(self) -> "BodyGraph":
         """Make all factors of the person, linear ones around the state, and the values; with active
-        user factors, those of all people whom they couple.
+        user factors, those of all people whom they couple. Where their solution failed, the graph
+        is without them.
         """
+        coupled = len(self.ties.active) > 0 and not self.failure
         everyone = [each for each in self.ties.people if isinstance(each, BodyGraph)]
-        everyone = everyone if len(self.ties.active) > 0 else [self]
+        everyone = everyone if coupled else [self]
         for each in everyone:
             each.part(np.ones(len(each.touched), dtype=bool))
-        if len(self.ties.active) > 0:
+        if coupled:
             graph, values = self.ties.joined()
             for each in everyone:
                 each.set_graph(graph, values)

@@ -79,8 +79,10 @@ def _solved(
         for each, (state, last) in zip(people, before, strict=True):
             each.state, each.window.last = state, last
             each.failure = str(error) if isinstance(error, NotFinite) else singular
-            each.set_graph(None)
         return []
+    finally:  # whoever asks for a graph gets the one with all joints
+        for each in people:
+            each.set_graph(None)
     return [FactorSolution(each, *_covariances(each, every)) for each in people]
 
 
@@ -90,7 +92,6 @@ def _covariances(person: BodyGraph, every: dict[tuple[int, int], Array]) -> tupl
     found = person.widen * marginals.joints()
     for joint in np.flatnonzero(person.touched):
         found[:, joint] = [every[key, key] for key in person.keys[:, joint].tolist()]
-    person.set_graph(None)
     return found, marginals
 
 

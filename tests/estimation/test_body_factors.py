@@ -148,7 +148,23 @@ def test_a_velocity_is_that_of_the_positions() -> None:
 def test_factors_that_cannot_be_met_leave_people_as_they_were() -> None:
     one = person(0)
     far = gtsam.PriorFactorPoint3(int(one.keys[5, WRIST]), np.full(3, 1e3), isotropic(3, 1e-3))
+    factors, before = one.graph.size(), one.window.joints(one.state)
     one.add(far, "far")
-    before = one.window.joints(one.state)
     assert solve_with_factors([one], CONFIG) == [] and "diverged" in one.failure
     np.testing.assert_array_equal(one.window.joints(one.state), before)
+    assert one.graph.size() == factors, "all joints, and not the factor"
+
+
+def test_an_inactive_factor_leaves_the_whole_graph() -> None:
+    """A factor on a variable without a position is not solved, and the graph has all joints."""
+    one = person(0)
+    factors, board = one.graph.size(), gtsam.symbol("b", 0)
+    start = gtsam.Values()
+    start.insert(board, np.zeros(3))
+    one.add(start)
+    one.add(
+        gtsam.BetweenFactorPoint3(int(one.keys[5, WRIST]), board, np.zeros(3), isotropic(3, 0.01))
+    )
+    one.ties.start = gtsam.Values()
+    assert solve_with_factors([one], CONFIG) == []
+    assert one.graph.size() == factors
