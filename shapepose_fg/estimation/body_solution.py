@@ -16,6 +16,7 @@ from shapepose_fg.core.notes import Problem
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Known
 from shapepose_fg.estimation.association_uncertainty import mirrored_spread
+from shapepose_fg.estimation.body_frames import BodyFrames, doubts
 from shapepose_fg.estimation.body_step import joint_targets
 from shapepose_fg.estimation.body_window import BodyWindow, Marginals
 from shapepose_fg.estimation.body_window_graph import BodyGraph
@@ -82,28 +83,33 @@ def solve_bodies(
     found = _Found.of_views(evidence, config.refine.max_sigma_m, start.status)
     people, spread = list[BodyGraph](), list[Array]()
     feet = feet_of(config.joints if config.motion.contact else ())
-    for rows in window_rows(observations):
+    over_time = len(np.unique(observations.track)) < len(observations)
+    Model = BodyWindow if over_time else BodyFrames
+    for rows in window_rows(observations) if over_time else [np.flatnonzero(start.ok)]:
         if not start.ok[rows].any():
             continue
         given = observations.rows(rows), sigmas[rows], views.rows(rows)
-        window = BodyWindow(*given, fitter.model, gates, motion, config.law)
+        window = Model(*given, fitter.model, gates, motion, config.law)
         free = window.energy.parameters(start.rows(rows), np.zeros((len(rows), 3)))
+        free = _filled(free, start.ok[rows], window.times_s) if over_time else free
         try:
-            state = window.solve(_filled(free, start.ok[rows], window.times_s))
-            if len(rows) > 2 and len(feet) > 0:
+            state = window.solve(free)
+            if over_time and len(rows) > 2 and len(feet) > 0:
                 window.hold(state, feet)
             state = window.take(state, *gtsam_step(window, state))
             marginals = window.covariances(state)
         except np.linalg.LinAlgError:
             continue
-        frames = observations.frame[rows].astype(np.int64)
-        track = int(observations.track[rows[0]])
-        # All covariances grow with the noise of the recording's detector, and by its lasting
-        # errors: solution and gates do not change.
-        widen = noisy * marginals.lasting()
-        people.append(BodyGraph(window, state, track, frames, widen, rows))
-        spread.append(marginals.of_bodies)
-        found.put(people[-1], marginals)
+        # All covariances of a graph grow by one factor, by which neither solution nor gates change:
+        # over time with the noise of the recording's detector and its lasting errors.
+        widen = [noisy * marginals.lasting()] if over_time else doubts(marginals)
+        for (place, each), factor in zip(window.apart(marginals), widen, strict=True):
+            own = rows[place]
+            frames = observations.frame[own].astype(np.int64)
+            track = int(observations.track[own[0]])
+            people.append(BodyGraph(each.window, each.state, track, frames, factor, own))
+            spread.append(each.of_bodies)
+            found.put(people[-1], each)
 
     # Uncertainty: unseen joints deviate from their bodies by more, above all those that cameras
     # should see; cameras' poses and sides may be wrong.
@@ -115,7 +121,7 @@ def solve_bodies(
         seen = np.asarray(strong[person.rows].any(axis=-1))
         moved = np.square(SPEED_M_S * waited_s(seen, person.times_s))
         moved = np.minimum(elsewhere[person.rows], moved)
-        person.window.widen_unseen(person.widen * of_bodies, moved)
+        person.window.widen_unseen(of_bodies, moved)
         found.covariance[person.rows] = person.widen * person.window.of_joints(of_bodies)
 
     # User factors: people who have some are solved once more.
@@ -160,7 +166,8 @@ class _Found:
         rows, window, state, fit = person.rows, person.window, person.state, self.fit
         self.joints[rows] = joints = window.joints(state)
         self.velocity[rows] = velocities(joints, window.times_s)
-        self.velocity_covariance[rows] = marginals.velocities()
+        if window.over_time:
+            self.velocity_covariance[rows] = marginals.velocities()
         self.evidence.put(rows, window.last.evidence)
         fit.put_bodies(rows, window.parameters(state), np.zeros((len(rows), 3)))
         fit.joints[rows] = joints - state.deviation

@@ -25,6 +25,7 @@ from shapepose_fg.body.model.rotation import exp_so3, log_so3
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.rows import Rows
 from shapepose_fg.estimation.asynchronous_views import carried_to_frames, leads, velocities_of
 from shapepose_fg.estimation.contact import (
     FREE_M2_S,
@@ -55,22 +56,22 @@ LASTS = 1.1
 Measured as that with which the 95 % regions hold in most recordings (docs/evaluation.md)."""
 _LOOKS = 8
 """Number of frames, evenly over the window, from which it is taken how much it averages."""
-_STEPS, _SETTLED_M = 8, 2e-3
+STEPS, SETTLED_M = 8, 2e-3
 """Most steps of the solver; it ends when joints move by less on average, metres. GTSAM's last step
 then moves them by a tenth of that."""
 _ANYWHERE = 1e-3
 """Information on the place and direction of a body in a frame by itself, 1/m² and 1/rad²."""
 HELD = 1e-6
 """Information on every unknown, so that what nothing determines stays where it is."""
-_DAMPING = 1e-3
+DAMPING = 1e-3
 
 
 @dataclass(frozen=True)
-class BodyState:
-    """The variables of a window."""
+class BodyState(Rows):
+    """The variables of a window, or of single frames."""
 
     betas: Array
-    """(10,) shape."""
+    """(10,) shape; of single frames (T, 10)."""
     root: Array
     """(T, 3, 3) rotation of the root."""
     others: Array
@@ -95,11 +96,11 @@ class BodyState:
 
 
 @dataclass(frozen=True)
-class _Around:
+class Around(Rows):
     """What the model says around a state."""
 
-    cost: float
-    """E, in squared standard deviations."""
+    cost: float | Array
+    """E, in squared standard deviations; of single frames (T,)."""
     system: Array
     """(T, M, P) normal equations of each row, joints eliminated (`body/kernels/solving.py`)."""
     pull: Array
@@ -117,7 +118,11 @@ class _Around:
 
 
 class BodyWindow:
-    """The model of one person in T frames; T = 1 is a frame by itself, without motion."""
+    """The model of one person in T frames."""
+
+    over_time = True
+    """Whether rows are a person's in one frame after the other."""
+    deviation_m = DEVIATION_M
 
     def __init__(
         self,
@@ -128,8 +133,6 @@ class BodyWindow:
         config: ObservationConfig,
         motion: MotionModel,
         law: Motion,
-        *,
-        deviation_m: float = DEVIATION_M,
     ):
         """Make the model of T rows of one person, times rising; `sigmas_px` (T, J, V) as
         `observation_sigmas`.
@@ -141,10 +144,10 @@ class BodyWindow:
             config,
         )
         self.times_s = observations.time_s.mean(axis=1)
-        steps = np.diff(self.times_s)
+        steps = np.diff(self.times_s) if self.over_time else np.empty(0)
         share = min(1.0, float(np.median(steps)) / POSE_LASTS_S) if len(steps) > 0 else 1.0
         self.energy = BodyEnergy(model, PosePrior.default().widened(share**-0.5))
-        self.variance = np.full(self.sigmas_px.shape[:2], deviation_m**2)
+        self.variance = np.full(self.sigmas_px.shape[:2], self.deviation_m**2)
         self.origin = np.zeros(3)
         self._motion, self._law, self._kernel = motion, law, config.robust_kernel
         self._held = self.energy.held_by_priors(len(self.times_s))
@@ -183,8 +186,8 @@ class BodyWindow:
 
     def _descended(self, state: BodyState) -> BodyState:
         """The state of least cost, from one with `last` around it."""
-        here, damping, done = self.last, _DAMPING, False
-        for _ in range(_STEPS):
+        here, damping, done = self.last, DAMPING, False
+        for _ in range(STEPS):
             if done:
                 break
             there, new = self._after(state, here, *self._step(state, here, damping))
@@ -199,7 +202,7 @@ class BodyWindow:
                 there,
                 new,
                 max(damping / 5, 1e-6),
-                bool(moved < _SETTLED_M),
+                bool(moved < SETTLED_M),
             )
         self.last = here
         return state
@@ -244,8 +247,8 @@ class BodyWindow:
         return there
 
     def _after(
-        self, state: BodyState, here: _Around, shape: Array, pose: Array
-    ) -> tuple[BodyState, _Around]:
+        self, state: BodyState, here: Around, shape: Array, pose: Array
+    ) -> tuple[BodyState, Around]:
         """State after a step, with the best deviations, and the model around it."""
         there = state.moved(shape, pose)
         bodies = self._bodies(there)
@@ -259,7 +262,7 @@ class BodyWindow:
     def parameters(self, state: BodyState) -> BodyParameters:
         """The bodies in the world."""
         body = self.energy.complete(state.free)
-        return replace(body, transl=body.transl + self.origin)
+        return replace(body, transl=body.transl + self.origin.reshape(-1, 3))
 
     def widen_unseen(self, of_bodies: Array, elsewhere: Array) -> None:
         """Widen the deviation of joints without a used detection. No solution changes, and no other
@@ -288,7 +291,7 @@ class BodyWindow:
             observed = carried_to_frames(observed, X, velocities_of(observed, X), self.views)
         return observed
 
-    def around(self, state: BodyState, bodies: Array) -> _Around:
+    def around(self, state: BodyState, bodies: Array) -> Around:
         """Cost and normal equations, joints eliminated, around a state with these `bodies` (T, J,
         3).
         """
@@ -314,12 +317,18 @@ class BodyWindow:
         cost += np.einsum(
             "ti,ij,tj->t", angles, self.energy.priors.precision, angles, optimize=True
         )
-        cost = float(cost.sum() + np.square(state.betas).sum())
-        pull = np.zeros((len(self), self.energy.num_free - 10))
-        if self.links is not None:
-            moved, pull = self._moved(state)
-            cost += moved
-        return _Around(cost, linear.system, pull, bodies, evidence, variance * weighed, target)
+        total, pull = self._total(state, cost)
+        return Around(total, linear.system, pull, bodies, evidence, variance * weighed, target)
+
+    def _total(self, state: BodyState, cost: Array) -> tuple[float | Array, Array]:
+        """The cost with that of shape and motion, for the `cost` of each frame (T,); and half the
+        gradient of motion.
+        """
+        total = float(cost.sum() + np.square(state.betas).sum())
+        if self.links is None:
+            return total, np.zeros((len(self), self.energy.num_free - 10))
+        moved, pull = self._moved(state)
+        return total + moved, pull
 
     def _seen_cost(self, evidence: ViewEvidence) -> Array:
         """(T,) robust cost of the detections; a rejected one costs as much as at its gate."""
@@ -359,7 +368,7 @@ class BodyWindow:
         """
         return self._deviation(self.last, bodies)
 
-    def _deviation(self, here: _Around, bodies: Array) -> Array:
+    def _deviation(self, here: Around, bodies: Array) -> Array:
         """X - J that is best for bodies that have moved."""
         seen = np.asarray(here.gain.any(axis=(-1, -2)))
         away = np.where(seen[..., None], here.target - bodies, 0.0)
@@ -383,7 +392,7 @@ class BodyWindow:
         energy, pull = self.links.at(root, others)
         return energy, pull[:T]
 
-    def _eliminated(self, root: Array, here: _Around, damping: float) -> tuple[Array, Array]:
+    def _eliminated(self, root: Array, here: Around, damping: float) -> tuple[Array, Array]:
         """The factor of the poses and what is left of the betas
         (`body/kernels/solving.eliminated`).
         """
@@ -399,7 +408,7 @@ class BodyWindow:
         eliminated(here.system, root, diagonal + HELD, beyond, here.pull, damping, kept, front)
         return kept, front
 
-    def _step(self, state: BodyState, here: _Around, damping: float) -> tuple[Array, Array]:
+    def _step(self, state: BodyState, here: Around, damping: float) -> tuple[Array, Array]:
         """Steps of betas (10,) and poses (T, N)."""
         kept, front = self._eliminated(state.root, here, damping)
         whole = _symmetric(front[-10:, -10:]) + np.eye(10)
@@ -408,6 +417,10 @@ class BodyWindow:
         pose = np.empty(here.pull.shape)
         put_back(kept, coefficients, pose)
         return coefficients[1:], pose
+
+    def apart(self, marginals: "Marginals") -> "list[tuple[Index, Marginals]]":
+        """The rows of each person, and their marginals."""
+        return [(np.arange(len(self)), marginals)]
 
     def covariances(self, state: BodyState) -> "Marginals":
         """Marginal covariances of every frame's variables, around the last solution."""
@@ -444,7 +457,7 @@ class BodyWindow:
 
 @dataclass(frozen=True)
 class Marginals:
-    """Marginal covariances of a solved window."""
+    """Marginal covariances of a solved window, or of single frames."""
 
     window: BodyWindow
     state: BodyState
@@ -454,7 +467,7 @@ class Marginals:
     """(T, N, N) covariances of the next frame's pose, rows, with this one's, columns; zero in
     the last."""
     shape: Array
-    """(10, 10) covariance of the betas."""
+    """(10, 10) covariance of the betas; of single frames (T, 10, 10)."""
     across: Array
     """(T, N, 10) covariances of poses with the betas."""
 

@@ -1,5 +1,6 @@
-"""A person's window as a GTSAM graph of bodies and shape only, from which each joint and its
-projection factors are eliminated: a container factor a frame. GTSAM solves each window with it.
+"""A person's window, or people in single frames, as a GTSAM graph of bodies and shapes only, from
+which each joint and its projection factors are eliminated: a container factor a frame. GTSAM solves
+each of them with it.
 """
 
 from collections import deque
@@ -14,32 +15,36 @@ from shapepose_fg.estimation.body_window import HELD, BodyState, BodyWindow
 
 
 def gtsam_step(window: BodyWindow, state: BodyState) -> tuple[Array, Array]:
-    """Gauss-Newton step by GTSAM around a solved window: of the betas (10,), and of the poses (T,
-    N), the root's in tangents of the world. LinAlgError if the system is singular.
+    """Gauss-Newton step by GTSAM around a solved window: of the betas, (10,) or of single frames
+    (T, 10), and of the poses (T, N), the root's in tangents of the world. LinAlgError if the system
+    is singular.
     """
     T, N = window.last.pull.shape
-    keys, shape = body_keys(0, np.arange(T)), shape_key(0)
+    keys, betas = body_keys(0, np.arange(T)), np.atleast_2d(state.betas)
+    shapes = [shape_key(n) for n in range(len(betas))]
     graph = gtsam.GaussianFactorGraph()
     H, pull = frame_systems(window, state)
     H[:, 10:, 10:] += HELD * np.eye(N)
     frames = map(
-        gtsam.HessianFactor, keys.tolist(), repeat(shape), H[:, 10:, 10:], H[:, 10:, :10],
+        gtsam.HessianFactor, keys.tolist(), shapes * (T // len(shapes)), H[:, 10:, 10:],
+        H[:, 10:, :10],
         pull[:, 10:], H[:, :10, :10], pull[:, :10], repeat(0.0),
     )  # fmt: skip
     unit = gtsam.noiseModel.Unit.Create
-    prior = gtsam.JacobianFactor(shape, np.eye(10), -state.betas, unit(10))
+    priors = map(gtsam.JacobianFactor, shapes, repeat(np.eye(10)), -betas, repeat(unit(10)))
     motion = list[gtsam.JacobianFactor]()
     if window.links is not None:
         for matrices, residual in window.links.linear(state.root, state.others):
             for t, right in enumerate(-residual):
                 terms = [(int(keys[t + k]), each[t]) for k, each in enumerate(matrices)]
                 motion.append(jacobian_factor(terms, right, unit(N)))
-    deque(map(graph.push_back, chain(frames, [prior], motion)), maxlen=0)
+    deque(map(graph.push_back, chain(frames, priors, motion)), maxlen=0)
     try:
-        found = graph.optimize(gtsam.Ordering([*keys.tolist(), shape]))
+        found = graph.optimize(gtsam.Ordering([*keys.tolist(), *shapes]))
     except RuntimeError as error:  # gtsam.IndeterminantLinearSystemException
         raise np.linalg.LinAlgError(str(error)) from None
-    return found.at(shape), np.array([found.at(key) for key in keys.tolist()])
+    of_shape, of_pose = (np.array([found.at(key) for key in each]) for each in (shapes, keys.tolist()))
+    return of_shape.reshape(state.betas.shape), of_pose
 
 
 def frame_systems(

@@ -107,7 +107,7 @@ def solve_window(
 
     over_time = len(np.unique(observations.track)) < len(observations)
     functions = functions_of(extra_factors)
-    if config.refine.with_body and over_time and fitter.model is not None:
+    if config.refine.with_body and fitter.model is not None:
         solution = solve_bodies(observations, views, fitter, config, motion, functions)
         solution.seconds.update(
             {"associate again": assigned - began, "solve": time.perf_counter() - assigned}

@@ -1,0 +1,131 @@
+"""People in single frames: the model of `body_window.py` without motion, all rows solved at once."""
+
+from copy import copy
+import numpy as np
+
+from shapepose_fg.body.kernels.solving import solved
+from shapepose_fg.body.model.rotation import exp_so3
+from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.estimation.body_window import (
+    DAMPING,
+    HELD,
+    SETTLED_M,
+    STEPS,
+    Around,
+    BodyState,
+    BodyWindow,
+    Marginals,
+)
+from shapepose_fg.estimation.condensed_graph import frame_systems
+
+
+DEVIATION_M = 0.012
+"""As `body_window.DEVIATION_M`, for a body whose shape a single frame determines: of 7, 12 and 20
+mm that with which neither simulated nor recorded people are much worse than with the best."""
+DOUBT = (0.6, 1.0, 1.5)
+"""Scale and exponents in `doubts`, measured by `scripts/fit_covariances.py`."""
+USUAL_M = 0.01
+"""Standard deviation of people whom all views see, metres."""
+REJECTED = 0.1
+"""Share of rejected evidence that means as much as a doubled variance."""
+
+
+class BodyFrames(BodyWindow):
+    """The model of T people in a single frame each, with a shape each."""
+
+    over_time = False
+    deviation_m = DEVIATION_M
+
+    def rows(self, index: Index) -> "BodyFrames":
+        """The model of some rows."""
+        part = copy(self)
+        part.observations, part.views = self.observations.rows(index), self.views.rows(index)
+        part.standing = self.standing.rows(index)
+        part._held = self._held.rows(index)
+        for name in ("sigmas_px", "times_s", "variance", "origin"):
+            setattr(part, name, getattr(self, name)[index])
+        if hasattr(self, "last"):
+            part.last = self.last.rows(index)
+        return part
+
+    def solve(self, start: Array) -> BodyState:
+        """The states of least cost, from bodies (T, P) in the world on."""
+        self.origin = start[:, None, -3:]
+        free = start.copy()
+        free[:, -3:] = 0.0
+        zero = np.zeros((*self.sigmas_px.shape[:2], 3))
+        state = BodyState(free[:, :10], exp_so3(free[:, 10:13]), free[:, 13:], zero)
+        self.last = self.around(state, self._bodies(state))
+        damping, left = np.full(len(free), DAMPING), np.arange(len(free))
+        for _ in range(STEPS):
+            if len(left) == 0:
+                break
+            part, at = self.rows(left), state.rows(left)
+            system = part.last.system.copy()
+            system[:, range(10), range(10)] += 1.0  # the prior of the shape
+            system[:, self.energy.num_free, :10] += at.betas
+            step = np.empty((len(left), self.energy.num_free))
+            solved(system, damping[left], step, np.empty(len(left)))
+            step[:, 10:13] = (at.root @ step[:, 10:13, None])[..., 0]
+            there, new = part._after(at, part.last, step[:, :10], step[:, 10:])
+            better = _better(new, part.last)
+            moved = new.bodies + there.deviation - part.last.bodies - at.deviation
+            small = np.linalg.norm(moved, axis=-1).mean(axis=-1) < SETTLED_M
+            state.put(left[better], there.rows(better))
+            self.last.put(left[better], new.rows(better))
+            worse = np.maximum(10 * damping[left], 1e-2)
+            damping[left] = np.where(better, np.maximum(damping[left] / 5, 1e-6), worse)
+            left = left[~(better & small) & (damping[left] <= 1e3)]
+        return state
+
+    def apart(self, marginals: Marginals) -> list[tuple[Index, Marginals]]:
+        """Each row, and its marginals."""
+        found = list[tuple[Index, Marginals]]()
+        for n in range(len(self)):
+            at, one = np.array([n]), slice(n, n + 1)
+            names = ("poses", "steps", "shape", "across")
+            parts = (getattr(marginals, name)[one] for name in names)
+            found.append((at, Marginals(self.rows(one), marginals.state.rows(one), *parts)))
+        return found
+
+    def take(self, state: BodyState, shape: Array, pose: Array) -> BodyState:
+        """The states after another step, where it doesn't make them worse."""
+        there, new = self._after(state, self.last, shape, pose)
+        worse = ~_better(new, self.last)
+        new.put(worse, self.last.rows(worse))
+        there.put(worse, state.rows(worse))
+        self.last = new
+        return there
+
+    def covariances(self, state: BodyState) -> Marginals:
+        """Marginal covariances of every row's variables, around the last solution."""
+        H, _ = frame_systems(self, state)
+        H[:, range(H.shape[1]), range(H.shape[1])] += np.repeat(
+            [1.0, HELD], [10, H.shape[1] - 10]
+        )
+        whole = np.linalg.inv(H)
+        poses, across = whole[:, 10:, 10:], whole[:, 10:, :10]
+        return Marginals(self, state, poses, np.zeros_like(poses), whole[:, :10, :10], across)
+
+    def _total(self, state: BodyState, cost: Array) -> tuple[Array, Array]:
+        """As for a window, for each row."""
+        nothing = np.zeros((len(cost), self.energy.num_free - 10))
+        return cost + np.square(state.betas).sum(axis=1), nothing
+
+
+def _better(new: Around, last: Around) -> Array:
+    return np.asarray(new.cost <= last.cost + 1e-3 * np.abs(last.cost))
+
+
+def doubts(marginals: Marginals) -> Array:
+    """(T,) how many times larger covariances of people in single frames are, because some of their
+    detections are another person's: the more, the more of the evidence (weights of Eq. 1) gates
+    reject, and the less certain all joints are.
+    """
+    window = marginals.window
+    sigma_m = np.sqrt(np.trace(marginals.joints(), axis1=-2, axis2=-1) / 3).mean(axis=1)
+    told = window.config.weight(window.observations.confidence) * window.observations.seen
+    used = (told * window.last.evidence.inlier).sum(axis=(1, 2))
+    rejected = 1 - used / np.maximum(told.sum(axis=(1, 2)), 1e-9)
+    scale, of_sigma, of_rejected = DOUBT
+    return scale * (sigma_m / USUAL_M) ** of_sigma * (1 + rejected / REJECTED) ** of_rejected
