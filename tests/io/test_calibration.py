@@ -134,7 +134,7 @@ BAD_ASSOCIATION = [
     ),
     (("b", "RT"), "remove", 'camera "b": RT is missing; write the 3x4'),
     (("a", "K"), "remove", 'camera "a": K is missing; write the 3x3'),
-    (("a", "K"), K[:8], 'camera "a": K must have rows of equal length; write the 3x3'),
+    (("a", "K"), K[:8], 'camera "a": K must hold 9 numbers, got 8; write the 3x3'),
     (("a", "K"), "1000", "camera \"a\": K must hold 9 numbers, got text '1000'"),
     (("a", "K", 4), "1000", "camera \"a\": K[4] must be a number, got text '1000'"),
     (("a", "K", 4), None, 'camera "a": K[4] must be a number, got null'),
