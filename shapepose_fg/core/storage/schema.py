@@ -101,7 +101,7 @@ class Column:
         if self.finite and not np.isfinite(array).all():
             raise ValueError(f"{name} must be finite")
         least = 0 if array.dtype.kind == "i" and np.isfinite(self.most) else self.least
-        low, high = np.fmin.reduce(array, axis=None), np.fmax.reduce(array, axis=None)
+        low, high = (float(each.reduce(array, axis=None)) for each in (np.fmin, np.fmax))
         if low < least:
             words = "not be negative" if least == 0 else f"be at least {least:g}"
             raise ValueError(f"{name} must {words}, got {low:g}")
