@@ -83,3 +83,16 @@ def rows_in(before: Observations, now: Observations) -> Index:
     was, key = (each.frame * most + each.track for each in (before, now))
     order = np.argsort(was, kind="stable")
     return order[np.searchsorted(was[order], key)]
+
+
+def window_rows(observations: Observations) -> list[Index]:
+    """Rows of each window, i.e. track, with ascending frames. Raises ValueError if a track has two
+    rows in a frame.
+    """
+    order = np.lexsort((observations.frame, observations.track))
+    track, frame = observations.track[order], observations.frame[order]
+    if np.any((np.diff(track) == 0) & (np.diff(frame) == 0)):
+        raise ValueError(
+            "a track may have only one row per frame: give each person another track number"
+        )
+    return np.split(order, np.flatnonzero(np.diff(track)) + 1) if len(order) else []

@@ -1,11 +1,16 @@
-"""People in single frames: the model of `body_window.py` without motion, all rows solved at once."""
+"""People in single frames: the model of `body_window.py` without motion, for all rows at once."""
 
 from copy import copy
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import as_file, files
+
 import numpy as np
 
 from shapepose_fg.body.kernels.solving import solved
 from shapepose_fg.body.model.rotation import exp_so3
-from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.core.arrays import Array, Index, Mask
+from shapepose_fg.core.storage.files import read_json
 from shapepose_fg.estimation.body_window import (
     DAMPING,
     HELD,
@@ -18,12 +23,9 @@ from shapepose_fg.estimation.body_window import (
 )
 from shapepose_fg.estimation.condensed_graph import frame_systems
 
-
 DEVIATION_M = 0.012
 """As `body_window.DEVIATION_M`, for a body whose shape a single frame determines: of 7, 12 and 20
 mm that with which neither simulated nor recorded people are much worse than with the best."""
-DOUBT = (0.6, 1.0, 1.5)
-"""Scale and exponents in `doubts`, measured by `scripts/fit_covariances.py`."""
 USUAL_M = 0.01
 """Standard deviation of people whom all views see, metres."""
 REJECTED = 0.1
@@ -81,11 +83,10 @@ class BodyFrames(BodyWindow):
     def apart(self, marginals: Marginals) -> list[tuple[Index, Marginals]]:
         """Each row, and its marginals."""
         found = list[tuple[Index, Marginals]]()
-        for n in range(len(self)):
-            at, one = np.array([n]), slice(n, n + 1)
+        for at in np.arange(len(self))[:, None]:
             names = ("poses", "steps", "shape", "across")
-            parts = (getattr(marginals, name)[one] for name in names)
-            found.append((at, Marginals(self.rows(one), marginals.state.rows(one), *parts)))
+            parts = (getattr(marginals, name)[at] for name in names)
+            found.append((at, Marginals(self.rows(at), marginals.state.rows(at), *parts)))
         return found
 
     def take(self, state: BodyState, shape: Array, pose: Array) -> BodyState:
@@ -100,10 +101,8 @@ class BodyFrames(BodyWindow):
     def covariances(self, state: BodyState) -> Marginals:
         """Marginal covariances of every row's variables, around the last solution."""
         H, _ = frame_systems(self, state)
-        H[:, range(H.shape[1]), range(H.shape[1])] += np.repeat(
-            [1.0, HELD], [10, H.shape[1] - 10]
-        )
-        whole = np.linalg.inv(H)
+        H[:, range(H.shape[1]), range(H.shape[1])] += np.repeat([1.0, HELD], [10, H.shape[1] - 10])
+        whole = np.asarray(np.linalg.inv(H), dtype=np.float64)
         poses, across = whole[:, 10:, 10:], whole[:, 10:, :10]
         return Marginals(self, state, poses, np.zeros_like(poses), whole[:, :10, :10], across)
 
@@ -113,19 +112,47 @@ class BodyFrames(BodyWindow):
         return cost + np.square(state.betas).sum(axis=1), nothing
 
 
-def _better(new: Around, last: Around) -> Array:
+def _better(new: Around, last: Around) -> Mask:
     return np.asarray(new.cost <= last.cost + 1e-3 * np.abs(last.cost))
 
 
+@dataclass(frozen=True)
+class Doubt:
+    """How much less certain people in single frames are than their graphs, because some of their
+    detections are another person's.
+    """
+
+    scale: float
+    """Factor on all variances."""
+    sigma: float
+    """Exponent of the mean standard deviation of the person's joints, over `USUAL_M`."""
+    rejected: float
+    """Exponent of one plus the share of evidence that gates reject, over `REJECTED`."""
+
+    @classmethod
+    @cache
+    def measured(cls) -> "Doubt":
+        """The numbers that ship, measured by `scripts/fit_covariances.py`."""
+        with as_file(files("shapepose_fg.estimation") / "data" / "covariances.json") as path:
+            return cls(**read_json(path)["doubt"])
+
+    def factors(self, sigma_m: Array, rejected: Array) -> Array:
+        """(T,) factors on variances."""
+        usual = (sigma_m / USUAL_M) ** self.sigma
+        return self.scale * usual * (1 + rejected / REJECTED) ** self.rejected
+
+
 def doubts(marginals: Marginals) -> Array:
-    """(T,) how many times larger covariances of people in single frames are, because some of their
-    detections are another person's: the more, the more of the evidence (weights of Eq. 1) gates
-    reject, and the less certain all joints are.
+    """(T,) `Doubt.factors` of people in single frames."""
+    return Doubt.measured().factors(*signs_of_doubt(marginals))
+
+
+def signs_of_doubt(marginals: Marginals) -> tuple[Array, Array]:
+    """(T,) mean standard deviation of each person's joints, metres, and (T,) share of the evidence,
+    the weights w_ij of Eq. 1, that gates reject.
     """
     window = marginals.window
     sigma_m = np.sqrt(np.trace(marginals.joints(), axis1=-2, axis2=-1) / 3).mean(axis=1)
     told = window.config.weight(window.observations.confidence) * window.observations.seen
     used = (told * window.last.evidence.inlier).sum(axis=(1, 2))
-    rejected = 1 - used / np.maximum(told.sum(axis=(1, 2)), 1e-9)
-    scale, of_sigma, of_rejected = DOUBT
-    return scale * (sigma_m / USUAL_M) ** of_sigma * (1 + rejected / REJECTED) ** of_rejected
+    return sigma_m, 1 - used / np.maximum(told.sum(axis=(1, 2)), 1e-9)

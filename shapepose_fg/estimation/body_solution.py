@@ -13,17 +13,15 @@ from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, FitStatus, Joi
 from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.notes import Problem
-from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.observations import Observations, window_rows
 from shapepose_fg.core.reconstruction import Known
-from shapepose_fg.estimation.association_uncertainty import mirrored_spread
 from shapepose_fg.estimation.body_frames import BodyFrames, doubts
-from shapepose_fg.estimation.body_step import joint_targets
 from shapepose_fg.estimation.body_window import BodyWindow, Marginals
 from shapepose_fg.estimation.body_window_graph import BodyGraph
 from shapepose_fg.estimation.camera_pose_uncertainty import carried_covariance
 from shapepose_fg.estimation.condensed_graph import gtsam_step
 from shapepose_fg.estimation.contact import feet_of
-from shapepose_fg.estimation.draft import first_places
+from shapepose_fg.estimation.draft import first_places, joint_targets
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.factor_solution import solve_with_factors
 from shapepose_fg.estimation.in_time import near_in_time, velocities, waited_s
@@ -34,16 +32,21 @@ from shapepose_fg.estimation.linearisation import (
     mean_confidence,
     observation_sigmas,
 )
+from shapepose_fg.estimation.mirrored_sides import mirrored_spread
 from shapepose_fg.estimation.missed_detections import (
     SPEED_M_S,
     elsewhere_variance,
     limbs_that_hide,
 )
 from shapepose_fg.estimation.motion_model import MotionModel
-from shapepose_fg.estimation.reported_covariance import WEAK_PROBABILITY, WEAK_SCORE, statuses
-from shapepose_fg.estimation.state import window_rows
 from shapepose_fg.estimation.user_factors import FactorFunction, add_factors, factors_of
-from shapepose_fg.estimation.window_solution import PersonGraph, WindowSolution, tied
+from shapepose_fg.estimation.window_solution import (
+    PersonGraph,
+    WindowSolution,
+    statuses,
+    strong_detections,
+    tied,
+)
 
 GATE_M = 0.1
 """rho_2D of Eq. 2 in windows, as a length at the joint's depth, at the initial estimate and in
@@ -113,8 +116,7 @@ def solve_bodies(
 
     # Uncertainty: unseen joints deviate from their bodies by more, above all those that cameras
     # should see; cameras' poses and sides may be wrong.
-    sure = (observations.confidence >= WEAK_SCORE) & (observations.probability > WEAK_PROBABILITY)
-    strong = found.evidence.inlier & sure
+    strong = strong_detections(observations, found.evidence.inlier)
     limbs = limbs_that_hide(config.joints)
     elsewhere = elsewhere_variance(found.joints, observations.frame, strong, views, limbs)
     for person, of_bodies in zip(people, spread, strict=True):

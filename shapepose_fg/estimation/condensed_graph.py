@@ -43,7 +43,9 @@ def gtsam_step(window: BodyWindow, state: BodyState) -> tuple[Array, Array]:
         found = graph.optimize(gtsam.Ordering([*keys.tolist(), *shapes]))
     except RuntimeError as error:  # gtsam.IndeterminantLinearSystemException
         raise np.linalg.LinAlgError(str(error)) from None
-    of_shape, of_pose = (np.array([found.at(key) for key in each]) for each in (shapes, keys.tolist()))
+    of_shape, of_pose = (
+        np.array([found.at(key) for key in each]) for each in (shapes, keys.tolist())
+    )
     return of_shape.reshape(state.betas.shape), of_pose
 
 

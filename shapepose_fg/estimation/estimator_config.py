@@ -3,7 +3,6 @@
 from dataclasses import dataclass, field
 from typing import Annotated
 
-import numpy as np
 from annotated_types import Interval
 
 from factors import CONSTANT_VELOCITY, Motion
@@ -53,21 +52,12 @@ class RefineConfig(Settings):
     rounds. 0: never."""
     max_sigma_m: Metres = 0.5
     """Maximum standard deviation of a joint determined by its views, in the worst direction, m."""
-    disagreement: Annotated[float, Interval(ge=0, le=1e6)] = 6.0
-    """Disagreement of a joint's views with the body, in standard deviations, above which the joint
-    is gated again at the body's position, and the body fitted again. With 4 more correct than wrong
-    joints were rejected in simulated crowds. 0: none is rejected, as in the paper."""
     complete_start: bool = True
     """Whether, in single frames, joints seen by two views but missing from stage I are triangulated
     for X_0. In the paper they are missing until the body gives them a position."""
-    body_from_views: bool = True
-    """Whether the body is fitted to estimates of joints from the views only, and its constraint on
-    a joint is from a fit without that joint's own views. In Algorithm 1 it is fitted to X_n, and
-    its joints are the prior."""
-
     with_body: bool = True
-    """Whether joints and bodies of a window of several frames are one problem
-    (`body_window.BodyWindow`)."""
+    """Whether joints and bodies are one problem (`body_window.BodyWindow`), not two in turn as in
+    the paper."""
 
     @classmethod
     def paper(cls) -> "RefineConfig":
@@ -75,18 +65,9 @@ class RefineConfig(Settings):
         return cls(
             alternations=10,
             settled_m=0.0,
-            disagreement=0.0,
             complete_start=False,
-            body_from_views=False,
             with_body=False,
         )
-
-    @property
-    def contradiction(self) -> float:
-        """Disagreement of views and body that is a contradiction, in standard deviations; infinite
-        if disabled.
-        """
-        return self.disagreement if self.disagreement > 0 else np.inf
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,8 @@ from shapepose_fg.estimation.estimator_config import WindowGraphConfig
 from shapepose_fg.estimation.graph_covariances import graph_covariances
 from shapepose_fg.estimation.minimise import NotFinite, descend
 from shapepose_fg.estimation.user_factors import CoupledGraph
+from shapepose_fg.estimation.window_solution import RUNAWAY_M
 
-RUNAWAY_M = 1.0
-"""Distance of a joint with a user factor from its solution without at which it has diverged, m."""
 _ROUNDS, _STEPS = 8, 4
 """Maximum number of linearisations of the bodies, and of GTSAM's steps around each; detections are
 gated anew in each."""

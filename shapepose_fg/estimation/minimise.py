@@ -1,6 +1,4 @@
-"""Minimises a factor graph by GTSAM: one Gauss-Newton step if that suffices, else
-Levenberg-Marquardt.
-"""
+"""Minimises a factor graph by GTSAM."""
 
 import re
 
@@ -11,27 +9,6 @@ from shapepose_fg.estimation.estimator_config import WindowGraphConfig
 
 class NotFinite(RuntimeError):
     """The solution is not finite."""
-
-
-def confirmed(
-    graph: gtsam.NonlinearFactorGraph,
-    values: gtsam.Values,
-    ordering: gtsam.Ordering,
-    config: WindowGraphConfig,
-) -> gtsam.Values | None:
-    """The values after a Gauss-Newton step if the error decreases by at most the tolerance; else
-    None.
-    """
-    linear = graph.linearize(values)
-    try:
-        solved = linear.eliminateSequential(ordering)
-        step = solved.optimize()
-    except RuntimeError:  # an undetermined joint; damping solves the others
-        return None
-    nowhere = gtsam.VectorValues.Zero(step)
-    # After elimination the error is zero at the step, so that the error without it is the decrease.
-    settled = solved.error(nowhere) <= config.tolerance * linear.error(nowhere)
-    return values.retract(step) if settled else None
 
 
 def descend(

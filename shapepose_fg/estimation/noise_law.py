@@ -3,7 +3,7 @@
 The law is learnt from the recording itself, without ground truth. Each keypoint of a person in one
 view is compared with the position triangulated from confident detections of the other views.
 Keypoints that the solver rejected are compared too, since gates have removed the large errors of
-the others. The prior is the law shipped with the package (`calibration.json`), so a short recording
+the others. The prior is the law shipped with the package (`covariances.json`), so a short recording
 changes it little.
 """
 
@@ -74,10 +74,8 @@ class NoiseLaw:
     @classmethod
     @cache
     def shipped(cls) -> "NoiseLaw":
-        """The law for which the covariances of joints are calibrated
-        (`scripts/fit_covariances.py`).
-        """
-        with as_file(files("shapepose_fg.estimation") / "data" / "calibration.json") as path:
+        """The mean law of simulated recordings (`scripts/fit_covariances.py`)."""
+        with as_file(files("shapepose_fg.estimation") / "data" / "covariances.json") as path:
             return cls.from_dict(read_json(path)["noise"])
 
     @classmethod

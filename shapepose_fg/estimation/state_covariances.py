@@ -6,8 +6,10 @@ import gtsam
 import numpy as np
 
 from shapepose_fg.core.arrays import Array
-from shapepose_fg.estimation.joint_step import UNDETERMINED_M
 from shapepose_fg.estimation.window_graph import WindowGraph
+
+UNDETERMINED_M = 10.0
+"""Standard deviation, metres, above which a joint is undetermined, in its worst direction."""
 
 
 def state_covariances(graphs: Sequence[WindowGraph]) -> list[Array]:

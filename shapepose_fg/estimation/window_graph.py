@@ -25,7 +25,7 @@ from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
-from shapepose_fg.estimation.minimise import NotFinite, confirmed, descend, undetermined_key
+from shapepose_fg.estimation.minimise import NotFinite, descend, undetermined_key
 from shapepose_fg.estimation.user_factors import PersonWindow
 
 
@@ -66,15 +66,6 @@ class WindowGraph(PersonWindow):
         """(1, J, 3) positions of the last solution, metres; NaN if not in it."""
 
     @property
-    def coupled(self) -> list[frozenset[int]]:
-        """Disjoint sets of two or more joints of the person coupled by user factors."""
-        mine = [
-            frozenset(joint for track, joint in part if track == self.track)
-            for part in self.ties.parts
-        ]
-        return [each for each in mine if len(each) > 1]
-
-    @property
     def seen(self) -> Mask:
         """(1, J, V) whether there is a detection of the joint."""
         return self._observations.seen
@@ -97,14 +88,18 @@ class WindowGraph(PersonWindow):
         self.build()
         deque(map(self.values.insert, self._present_keys(), initial[self.present]), maxlen=0)
         self._add(self._seen(inlier & (self._sigmas_px > 0) & self.present[..., None]))
-        self._add(self._pulled(body.where(self.present, self.config.weight_shape)))
+        self.body = body.where(self.present, self.config.weight_shape)
+        self._add(self._pulled(self.body))
+
+    def of_body(self, t: int, joint: int) -> Array:
+        """(3, 3) information on a joint from its body, 1/m²."""
+        return self.body.information[t, joint]
 
     def optimise(self) -> None:
         """Minimise over the joints of this person and all coupled people, who must be prepared,
         too.
 
-        GTSAM takes a single step if that suffices, else Levenberg-Marquardt steps. `graph` and
-        `values` of all of them are then those of the whole problem.
+        `graph` and `values` of all of them are then those of the whole problem.
         """
         people = self.ties.people
         graph, values = self.ties.joined()
@@ -132,9 +127,6 @@ class WindowGraph(PersonWindow):
         if len(self.ties.factors) > 0:
             return descend(graph, values, None, self.config, over_time=False)
         ordering = gtsam.Ordering(self._present_keys())
-        found = confirmed(graph, values, ordering, self.config)
-        if found is not None:
-            return found
         return descend(graph, values, ordering, self.config, over_time=False)
 
     def _present_keys(self) -> list[int]:

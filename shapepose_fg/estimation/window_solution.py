@@ -2,31 +2,33 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import gaussian, reported_keys
-from shapepose_fg.body.fitting.fitter import BodyFit, JointTargets
+from shapepose_fg.body.fitting.fitter import BodyFit
 from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.core.camera import Rig, Views
-from shapepose_fg.core.decompositions import raise_eigenvalues
 from shapepose_fg.core.errors import NotDetermined
 from shapepose_fg.core.notes import Problem
 from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.observations import Observations
-from shapepose_fg.core.reconstruction import BODY, Reconstruction
+from shapepose_fg.core.reconstruction import BODY, Reconstruction, Status
 from shapepose_fg.core.rows import Rows
 from shapepose_fg.estimation.asynchronous_views import carried_to_frames
 from shapepose_fg.estimation.minimise import undetermined_key
+from shapepose_fg.estimation.mirrored_sides import DOUBTED
 from shapepose_fg.estimation.user_factors import PersonWindow
-from shapepose_fg.estimation.window_graph import WindowGraph
 
-LEAST_M = 1e-4
-"""Minimum additional standard deviation of the reported joint relative to the solver's graph,
-metres, where the report is not less certain."""
+RUNAWAY_M = 1.0
+"""Distance of a joint with a user factor from its solution without, or from X_0, at which it has
+diverged, m."""
+WEAK_SCORE = 0.3
+"""Score below which a detection is weak: in simulated crowds one in 18 is not the person's, of
+others one in 60."""
+WEAK_PROBABILITY = 0.5
+"""Probability below which a detection is weak."""
 
 
 @dataclass(frozen=True)
@@ -204,7 +206,7 @@ class PersonGraph:
         """
         key = undetermined_key(error)
         body = np.broadcast_to(self.window.body_keys[:, None, None], (*self.keys.shape, 1))
-        keys = np.concatenate([self._variables, body], axis=-1)
+        keys = np.concatenate([self.window.state_keys, body], axis=-1)
         found = np.argwhere(keys == key)
         if key is None or key < 0 or len(found) == 0:
             return None
@@ -217,108 +219,9 @@ class PersonGraph:
         saw = {0: "no camera saw it", 1: "only one camera saw it"}.get(
             views, f"{views} cameras saw it"
         )
-        says = "constrains" if self._body_says(t, joint) else "does not constrain"
+        says = "constrains" if self.window.of_body(t, joint).any() else "does not constrain"
         said = f"{saw}, and the body {says} it"
         return NotDetermined(self.person, str(joint_names[joint]), frame, time_s, said)
-
-    @property
-    def _variables(self) -> NDArray[np.int64]:
-        """(T, J, n) keys of a joint's variables."""
-        return self.window.state_keys
-
-    def _body_says(self, t: int, joint: int) -> bool:
-        """Whether the body constrains a joint."""
-        del t, joint
-        return True
-
-
-@dataclass(frozen=True, kw_only=True)
-class CorrectedGraph(PersonGraph):
-    """Solved graph of one person in a frame, whose body is no variable.
-
-    Besides each position of the solver's graph there is a reported one in `graph`, which differs by
-    corrections after solving: its marginal covariances, for `keys`, are the reported ones, and its
-    values the reported joints.
-    """
-
-    window: WindowGraph
-    """The solver's problem."""
-    solved: Array
-    """(1, J, 3) joints of the solver, metres."""
-    solved_covariance: Array
-    """(1, J, 3, 3) covariance of `solved`: marginals of the solver's graph, m²."""
-    body: JointTargets
-    """(1, J) constraints from the body without each joint's own views; none where it is
-    not used."""
-
-    @property
-    def keys(self) -> NDArray[np.int64]:
-        """(1, J) keys of the reported positions, `Point3`, metres; unknown joints (NaN) are not in
-        the graph.
-        """
-        return reported_keys(self.person, np.arange(self.joints.shape[1]), self.frames[:, None])
-
-    @cached_property
-    def graph(self) -> gtsam.NonlinearFactorGraph:
-        """All factors: projections, bodies, user factors, and the corrections. Coupled people
-        (`together`) are one graph, with the keys of all of them.
-        """
-        graph = gtsam.NonlinearFactorGraph(self.window.graph)
-        for person in self._members:
-            known = person._known
-            more = np.where(
-                known[..., None, None], person.covariance - person.solved_covariance, np.eye(3)
-            )
-            parts = zip(
-                person.window.keys[known].tolist(), person.keys[known].tolist(),
-                (person.joints - person.solved)[known],
-                raise_eigenvalues(more, LEAST_M**2)[known], strict=True,
-            )  # fmt: skip
-            for solved, reported, away, covariance in parts:
-                noise = gaussian(covariance)
-                graph.push_back(gtsam.BetweenFactorPoint3(solved, reported, away, noise))
-        return graph
-
-    @cached_property
-    def values(self) -> gtsam.Values:
-        """The solution: the solver's variables, and the reported positions."""
-        values = gtsam.Values(self.window.values)
-        for person in self._members:
-            known = person._known
-            for key, place in zip(person.keys[known].tolist(), person.joints[known], strict=True):
-                values.insert(key, place)
-        return values
-
-    def coupled(self, one: tuple[int, int, int], other: tuple[int, int, int]) -> bool:
-        """Whether to take the correlation of two joints (person, joint, frame) from the graph."""
-        return any({one[:2], other[:2]} <= part for part in self.window.ties.parts)
-
-    def sources(self, t: int, joint: int) -> Sources | None:
-        """What a joint in row `t` is known from; None if it is unknown."""
-        if not np.isfinite(self.solved_covariance[t, joint]).all():
-            return None
-        whole = np.asarray(np.linalg.inv(self.solved_covariance[t, joint]), dtype=np.float64)
-        of_body = self.window.config.weight_shape * self.body.information[t, joint]
-        return Sources(self.solved[t, joint], whole, of_body, 1.0)
-
-    @property
-    def _variables(self) -> NDArray[np.int64]:
-        return np.concatenate([self.window.state_keys, self.keys[..., None]], axis=-1)
-
-    def _body_says(self, t: int, joint: int) -> bool:
-        return bool(self.body.known[t, joint])
-
-    @property
-    def _members(self) -> "list[CorrectedGraph]":
-        return [each for each in self.together or [self] if isinstance(each, CorrectedGraph)]
-
-    @property
-    def _known(self) -> Mask:
-        """(1, J) joints that are reported with covariance."""
-        finite = np.isfinite(self.covariance).all(axis=(2, 3)) & np.isfinite(
-            self.solved_covariance
-        ).all(axis=(2, 3))
-        return np.asarray(finite & np.isfinite(self.joints).all(axis=2) & self.window.present)
 
 
 def tied(people: Sequence[PersonGraph]) -> tuple[PersonGraph, ...]:
@@ -330,3 +233,23 @@ def tied(people: Sequence[PersonGraph]) -> tuple[PersonGraph, ...]:
         found.append(person if alone else replace(person, together=group))
         group.append(found[-1])
     return tuple(found)
+
+
+def statuses(
+    rows: Observations, ok: Mask, enough: Mask, problems: Sequence[Problem]
+) -> NDArray[np.str_]:
+    """(N,) status of each row: whether it has a body, `ok` (N,), whether its views determine one,
+    `enough` (N,), whether sides may be exchanged, and whether it could not be solved.
+    """
+    doubted = np.median(rows.mirrored.max(axis=2, initial=0.0), axis=1) > DOUBTED
+    sided = np.where(doubted, Status.CONTRADICTED, Status.OK)
+    failed = np.where(enough, Status.BODY_UNDETERMINED, Status.TOO_FEW_VIEWS)
+    status = np.where(ok, sided, failed)
+    status[[problem.row for problem in problems]] = Status.NOT_SOLVED
+    return status
+
+
+def strong_detections(rows: Observations, inlier: Mask) -> Mask:
+    """(N, J, V) the used detections, `inlier`, that are not weak."""
+    sure = (rows.confidence >= WEAK_SCORE) & (rows.probability > WEAK_PROBABILITY)
+    return inlier & sure

@@ -14,8 +14,8 @@ from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import BODY, Known, Reconstruction, Status
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.estimation.body_step import MODEL_SIGMA_M
 from shapepose_fg.estimation.camera_pose_uncertainty import carried_covariance
+from shapepose_fg.estimation.draft import MODEL_SIGMA_M
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.linearisation import linearise, observation_sigmas
 from shapepose_fg.estimation.motion_model import MotionModel

@@ -13,9 +13,8 @@ import numpy as np
 from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Input
-from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.observations import Observations, window_rows
 from shapepose_fg.core.reconstruction import Reconstruction
-from shapepose_fg.estimation.state import window_rows
 from shapepose_fg.estimation.window_solution import WindowSolution
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.config import WindowConfig as WindowConfig

@@ -19,8 +19,8 @@ from shapepose_fg.body.fitting.fitter import BodyFitter, JointTargets
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.detections import Input
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.estimation.association_uncertainty import DOUBTED
-from shapepose_fg.estimation.body_step import MODEL_SIGMA_M
+from shapepose_fg.estimation.draft import MODEL_SIGMA_M
+from shapepose_fg.estimation.mirrored_sides import DOUBTED
 from shapepose_fg.proposal.people_2d import group_people
 from shapepose_fg.tracking.motion_filter import LOST_M, JointStates
 from shapepose_fg.tracking.tracker import Tracker, Tracks

@@ -1,17 +1,20 @@
 """Drafts: where a body has the joints when some views' detections are another person's."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from shapepose_fg.body.fitting.fitter import BodyFitter
+from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter
 from shapepose_fg.body.fitting.fitters import BodyConfig, make_fitter
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation import draft
+from shapepose_fg.estimation.draft import drafted
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
+from shapepose_fg.estimation.linearisation import ViewEvidence
 from shapepose_fg.simulation import Scene, built_in_scene
 
 LEG = [BODY_25.joints.index(name) for name in ("RKnee", "RAnkle", "RHeel", "RBigToe", "RSmallToe")]
@@ -171,3 +174,55 @@ def test_a_probability_that_creeps_is_drafted_anew_when_it_has_gone_far(fitter):
         )
         fitted.append(counting.rows[:1])
     assert fitted == [[], [1], []]
+
+
+I3 = np.eye(3)
+
+
+def message(sigma_m, known=None):
+    """Information of joints (N, J) known alike in all directions, at the origin; sigma infinite:
+    none.
+    """
+    sigma = np.asarray(sigma_m, dtype=float)
+    information = np.where(np.isfinite(sigma), sigma, np.inf)[..., None, None] ** -2.0 * I3
+    known = np.isfinite(sigma) if known is None else np.asarray(known)
+    return SimpleNamespace(information=information, known=known, xyz=np.zeros((*sigma.shape, 3)))
+
+
+def evidence(points, sigma_m) -> ViewEvidence:
+    """Views that put joints exactly at `points` (N, J, 3), known to `sigma_m` (N, J); infinite: not
+    at all.
+    """
+    information = message(sigma_m).information
+    none = np.zeros((*np.shape(sigma_m), 1))
+    return ViewEvidence(points, none > 0, none, information, np.zeros_like(points))
+
+
+def body_at(joints, sigma_m, ok=True) -> BodyFit:
+    covariance = np.broadcast_to(sigma_m**2 * I3, (*joints.shape, 3))
+    return SimpleNamespace(joints=joints, covariance=covariance, ok=np.full(len(joints), ok))  # type: ignore[return-value]
+
+
+def test_a_draft_is_between_views_and_body_by_what_each_knows():
+    """A body 4 cm off, known to 3 cm and 2 for the model; views to 2 cm: 13 to 4. Views 30 cm off
+    do not count.
+    """
+    views = np.array([[[0.04, 0, 0], [0.3, 0, 0], [0.04, 0, 0]]])
+    sigma = np.array([[0.02, 0.02, np.inf]])
+    at, covariance = drafted(evidence(views, sigma), body_at(np.zeros((1, 3, 3)), 0.03))
+    whole = 0.03**2 + 0.02**2
+    share = whole / (whole + 0.02**2)
+    np.testing.assert_allclose(at[0], [[share * 0.04, 0, 0], [0, 0, 0], [0, 0, 0]], atol=1e-12)
+    np.testing.assert_allclose(covariance[0, 0], I3 * whole * 0.02**2 / (whole + 0.02**2))
+    np.testing.assert_allclose(covariance[0, 1:], np.stack([whole * I3] * 2))
+
+
+def test_a_draft_without_a_body_is_the_views_and_without_both_nothing():
+    views = np.array([[[1.0, 2, 3], [4, 5, 6], [7, 8, 9]]])
+    fit = body_at(np.full((1, 3, 3), np.nan), 0.03, ok=False)
+    at, covariance = drafted(evidence(views, np.array([[0.02, 0.9, 1.1]])), fit)
+    np.testing.assert_allclose(at[0, :2], views[0, :2])
+    np.testing.assert_allclose(covariance[0, :2], np.stack([0.02**2 * I3, 0.9**2 * I3]))
+    assert np.isnan(at[0, 2]).all() and np.isnan(covariance[0, 2]).all(), (
+        "determined to a metre, or not at all"
+    )

@@ -138,25 +138,6 @@ def test_a_shared_point_of_the_user_s_own(five_cameras, seen):
     assert all(np.isfinite(of_both[n][0, R]).all() for n in range(2))
 
 
-def test_joints_that_another_person_s_factors_tie_are_coupled(five_cameras, seen):
-    """A body's prior for one wrist must not have the other's views, where both are tied to a
-    third.
-    """
-    truth, xy = seen
-    people = graphs(five_cameras, truth, xy)
-
-    def both_wrists(window, keys):
-        for other in window.partners:
-            for wrist in (R, L):
-                yield gtsam.RangeFactor3(
-                    int(keys[0, wrist]), int(other.keys[0, R]), 0.5, isotropic(1, 0.05)
-                )
-
-    add_factors(people[:2], [both_wrists])
-    assert people[0].coupled == [{R, L}] and people[1].coupled == []
-    assert np.flatnonzero(people[1].touched).tolist() == [R]
-
-
 def test_factors_that_cannot_count_are_refused_or_counted(five_cameras, seen):
     truth, xy = seen
     people = graphs(five_cameras, truth, xy)

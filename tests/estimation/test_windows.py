@@ -14,13 +14,12 @@ from numpy.typing import NDArray
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, FitStatus
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.observations import Observations, window_rows
 from shapepose_fg.core.reconstruction import Status
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.estimator_config import EstimatorConfig, RefineConfig
 from shapepose_fg.estimation.in_time import near_in_time
 from shapepose_fg.estimation.motion_model import MotionConfig, MotionModel
-from shapepose_fg.estimation.state import window_rows
 from shapepose_fg.estimation.window_solution import WindowSolution
 from shapepose_fg.pipeline.solve_window import solve_window
 
@@ -55,8 +54,8 @@ class BesideFitter(BodyFitter):
         covariance = np.tile(self.sigma_m**2 * np.eye(3), (*seen.shape, 1, 1))
         return replace(
             failed,
-            prior_xyz=np.where(ok[:, None, None], xyz, np.nan),
-            prior_covariance=np.where(ok[:, None, None, None], covariance, np.nan),
+            joints=np.where(ok[:, None, None], xyz, np.nan),
+            covariance=np.where(ok[:, None, None, None], covariance, np.nan),
         )
 
 
@@ -65,16 +64,6 @@ class NobodyFitter(BodyFitter):
 
     def fit(self, targets, initial=None, groups=None) -> BodyFit:
         return BodyFit.failed(np.full(len(targets), FitStatus.TOO_FEW_JOINTS), targets.xyz.shape[1])
-
-
-class PlacingFitter(BesideFitter):
-    """The same, with a body, known to `sigma_m`: its joints are not aside, only what it says
-    without them is.
-    """
-
-    def fit(self, targets, initial=None, groups=None) -> BodyFit:
-        fit = super().fit(targets, initial, groups)
-        return replace(fit, joints=fit.prior_xyz - self.beside, covariance=fit.prior_covariance)
 
 
 @pytest.fixture(scope="module")
@@ -138,8 +127,8 @@ def test_a_lone_row_is_what_it_is_by_itself_beside_somebody_s_window(
     row = np.array([31])
     for view in range(1, 5):
         seen = one_view_less(seen, row, WRIST, view)
-    together = solve(seen, five_cameras, PlacingFitter(two_people[0], (0.0, 0.05, 0.0)))
-    alone = solve(seen.rows(row), five_cameras, PlacingFitter(two_people[0], (0.0, 0.05, 0.0)))
+    together = solve(seen, five_cameras, BesideFitter(two_people[0], (0.0, 0.05, 0.0)))
+    alone = solve(seen.rows(row), five_cameras, BesideFitter(two_people[0], (0.0, 0.05, 0.0)))
     for name in ("joints", "covariance", "confidence", "inlier", "known", "status"):
         np.testing.assert_array_equal(getattr(alone, name)[0], getattr(together, name)[31])
 
@@ -177,15 +166,6 @@ def box(window, keys):
     """Hands 40 cm apart, to within 1 cm."""
     for right, left in keys[:, [WRIST, OTHER_WRIST]].tolist():
         yield gtsam.RangeFactor3(right, left, 0.4, gtsam.noiseModel.Isotropic.Sigma(1, 0.01))
-
-
-@pytest.mark.slow
-def test_joints_tied_to_each_other_get_the_body_without_any_of_their_targets(
-    walk, five_cameras, two_people
-):
-    fitter = BesideFitter(two_people[0])
-    solve(walk[0], five_cameras, fitter, box)
-    assert {WRIST, OTHER_WRIST} in fitter.without and set() in fitter.without
 
 
 def test_a_joint_thrown_away_is_a_status_with_a_name(walk, five_cameras, two_people):

@@ -14,8 +14,7 @@ from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.estimation.body_step import JOINT_SIGMA_M, MODEL_SIGMA_M, BodyStep, joint_targets
-from shapepose_fg.estimation.estimator_config import EstimatorConfig
+from shapepose_fg.estimation.alternation import JOINT_SIGMA_M
 from shapepose_fg.estimation.linearisation import linearise, observation_sigmas
 from shapepose_fg.io.config import read_config
 from shapepose_fg.pipeline.pipeline import PipelineConfig, find_people
@@ -28,9 +27,7 @@ WRIST, KNEE = BODY_25.index("RWrist"), BODY_25.index("LKnee")
 
 
 class OneBody(BodyFitter):
-    """Fits the same body to everything: as it is without leaving anything out 5 cm from its
-    priors.
-    """
+    """Fits the same body to everything."""
 
     def __init__(self, joints, sigma_m=0.1):
         self.joints, self.sigma_m, self.targets = joints, sigma_m, []
@@ -43,8 +40,6 @@ class OneBody(BodyFitter):
             BodyFit.failed(np.full(N, FitStatus.OK), J),
             joints=self.joints,
             covariance=covariance,
-            prior_xyz=self.joints + 0.05,
-            prior_covariance=4 * covariance,
         )
 
 
@@ -115,38 +110,22 @@ def test_e_shape_has_one_weight(five_cameras, two_people):
     np.testing.assert_allclose(at.gradient[:, KNEE], 0.0, atol=1.0)
 
 
-def test_the_body_is_fitted_to_x_and_its_prior_has_seen_the_joint(five_cameras, two_people):
-    """Algorithm 1: E_shape(X_n, Theta) over all joints alike, and no leave-one-out; a joint that is
-    not there is missing.
+def test_the_body_is_fitted_to_x(five_cameras, two_people):
+    """Algorithm 1: E_shape(X_n, Theta) over all joints alike; a joint that is not there is
+    missing.
     """
     observations = seen(five_cameras, two_people)
     observations.initial[1, KNEE] = np.nan
-    moved = observations.initial + 0.01
     body = OneBody(two_people)
-    step = BodyStep(body, (), STAGE_II)
-    views = Views.of(five_cameras)
-    sigmas = observation_sigmas(observations, two_people, views, PAPER.observations, BODY_25.joints)
-    evidence = linearise(observations, sigmas, moved, views, PAPER.observations)
-    targets = step.targets(evidence, np.array([True, True]))
-    known = np.isfinite(moved).all(axis=-1)
-    np.testing.assert_array_equal(targets.xyz[known], moved[known])
+    config = replace(STAGE_II, refine=replace(STAGE_II.refine, alternations=1))
+    solve_window(observations, Views.of(five_cameras), body, config)
+    (targets,) = body.targets
+    known = np.isfinite(observations.initial).all(axis=-1)
+    np.testing.assert_array_equal(targets.xyz[known], observations.initial[known])
     np.testing.assert_array_equal(
         targets.information[known], np.broadcast_to(np.eye(3) / JOINT_SIGMA_M**2, (49, 3, 3))
     )
     assert not targets.information[1, KNEE].any()
-    nothing = BodyFit.failed(np.full(2, FitStatus.TOO_FEW_JOINTS), 25)
-    fit = step.fit(targets, nothing)
-    np.testing.assert_array_equal(fit.prior_xyz, body.joints)
-    expected = (body.sigma_m**2 + MODEL_SIGMA_M**2) * np.eye(3)
-    np.testing.assert_allclose(
-        fit.prior_covariance, np.broadcast_to(expected, fit.prior_covariance.shape)
-    )
-    ours = BodyStep(body, (), EstimatorConfig())
-    np.testing.assert_array_equal(ours.fit(targets, nothing).prior_xyz, body.joints + 0.05)
-    np.testing.assert_array_equal(
-        ours.targets(evidence, np.array([True, False])).information,
-        joint_targets(evidence, np.array([True, False])).information,
-    )
 
 
 def test_the_paper_makes_n_rounds_and_starts_from_stage_i_alone(five_cameras, two_people):
@@ -168,7 +147,7 @@ def test_the_paper_makes_n_rounds_and_starts_from_stage_i_alone(five_cameras, tw
 @pytest.mark.parametrize(
     ("part", "value"),
     [
-        ("refine", {"disagreement": -1.0}),
+        ("refine", {"settled_m": -1.0}),
         ("window_graph", {"shape_sigma_m": -1}),
     ],
 )
@@ -247,12 +226,7 @@ def test_stage_two_s_settings_of_the_paper():
     """
     r, w, o = PAPER.refine, PAPER.window_graph, PAPER.observations
     assert (r.alternations, w.rho_3d, o.confidence_power, o.kernel) == (10, 0.25, 1.0, "none")
-    assert (r.complete_start, r.body_from_views, r.settled_m, r.disagreement) == (
-        False,
-        False,
-        0.0,
-        0.0,
-    )
+    assert (r.complete_start, r.with_body, r.settled_m) == (False, False, 0.0)
     assert not PAPER.temporal and PAPER.offsets.source == "none"
 
 
