@@ -2,7 +2,7 @@
 0.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from shapepose_fg.calibration.adjustment import MOVE, Adjusted
 from shapepose_fg.calibration.people import People
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.decompositions import nearest_rotation
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.floor import Floor, find_floor
@@ -118,6 +119,30 @@ def scaled(rig: Rig, factor: float, fixed: Array | float = 0.0) -> Rig:
     wTc = rig.wTc
     wTc[:, :3, 3] = fixed + factor * (wTc[:, :3, 3] - fixed)
     return rig.at_poses(wTc)
+
+
+def grown(adjusted: Adjusted, factor: float) -> Adjusted:
+    """Cameras, people and covariances scaled by `factor` about the origin."""
+    unit = np.ones(adjusted.covariance.shape[1])
+    unit[MOVE] = factor
+    return replace(
+        adjusted,
+        rig=scaled(adjusted.rig, factor),
+        covariance=adjusted.covariance * unit[:, None, None] * unit,
+        people=replace(adjusted.people, points=factor * adjusted.people.points),
+    )
+
+
+def apart(one: Rig, other: Rig) -> tuple[Array, Array]:
+    """(V,) degrees and metres between the cameras of two rigs, after alignment by a similarity."""
+    near, far = (np.stack([camera.wTc[:3, :3] for camera in each.cameras]) for each in (one, other))
+    a, b = (each.centres - each.centres.mean(axis=0) for each in (one, other))
+    size = max(float(np.linalg.norm(a) * np.linalg.norm(b)) / len(one), 1e-9)
+    R = nearest_rotation(b.T @ a / size + np.einsum("vij,vkj->ik", far, near))
+    grown = float(np.linalg.norm(b) / max(np.linalg.norm(a), 1e-9))
+    turned = np.einsum("ij,vjk,vik->v", R, near, far)  # the traces of far' R near
+    turns = np.degrees(np.arccos(np.clip((turned - 1) / 2, -1.0, 1.0)))
+    return turns, np.linalg.norm(grown * a @ R.T - b, axis=1)
 
 
 def at_once(people: People) -> int:
