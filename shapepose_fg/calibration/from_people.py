@@ -26,15 +26,15 @@ from shapepose_fg.calibration.levelling import (
     scale_of,
     sigma_of_scale,
 )
-from shapepose_fg.calibration.people import LEAST_PEOPLE, Footage, People, missed_px
+from shapepose_fg.calibration.people import LEAST_PEOPLE, Footage, missed_px
 from shapepose_fg.calibration.refinement import FILM, Steps, Undetermined, halves, settle
 from shapepose_fg.calibration.relative import Relative, relative
 from shapepose_fg.calibration.tracks import OneClock, Tracks, seen_at
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig, Views
+from shapepose_fg.core.decompositions import rigid
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.frame_times import FrameTimes
-from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.setup_check.matching import Sightings
 
 _BURST_S, _BURSTS = 10.0, 6
@@ -156,10 +156,7 @@ def calibrate(
         pairs = _pairs(detections, rig, times, frames, told)
         if len(connected := parts(pairs, views)) > 1:
             raise Undetermined(tuple(_apart(rig, connected)))
-        edges = {
-            pair: _edge(each, detections.skeleton, measured.stature_m)
-            for pair, each in pairs.items()
-        }
+        edges = {pair: _edge(each, scale) for pair, each in pairs.items()}
         few = footage.at(taken[np.unique(np.linspace(0, len(taken) - 1, _FEW).astype(np.intp))])
         start = fit(few, rig.at_poses(arranged(edges, views)), _ROUGH).rig
     adjusted = fit(footage, start, _ROUNDS)
@@ -239,15 +236,9 @@ def _named(rig: Rig, views: Iterable[int]) -> str:
     return f"camera{'s' if len(names) > 1 else ''} {' '.join(names)}"
 
 
-def _edge(pair: Relative, skeleton: Skeleton, stature_m: float | None) -> Edge:
-    people = People(
-        np.zeros(len(pair.points), np.intp),
-        pair.points[..., None, :2],
-        pair.points[..., :1],
-        pair.points,
-    )
-    metres = scale_of(people, skeleton, stature_m)
-    return Edge.of(pair, metres if np.isfinite(metres) else 3.0)
+def _edge(pair: Relative, scale: Callable[[Array], float]) -> Edge:
+    metres = scale(pair.points)
+    return Edge(rigid(pair.R, (metres if np.isfinite(metres) else 3.0) * pair.t), pair.score)
 
 
 def _judged(

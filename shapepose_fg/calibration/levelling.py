@@ -107,11 +107,11 @@ class World:
     most."""
 
 
-def scale_of(people: People, skeleton: Skeleton, stature_m: float | None) -> float:
-    """Metres per unit of the people's positions, for a median stature `stature_m`, or an adult's;
-    NaN without bones.
+def scale_of(points: Array, skeleton: Skeleton, stature_m: float | None) -> float:
+    """Metres per unit of people's joints (P, J, 3), for a median stature `stature_m`, or an
+    adult's; NaN without bones.
     """
-    return (stature_m or ADULT_M) / build_of(people.points, skeleton).stature
+    return (stature_m or ADULT_M) / build_of(points, skeleton).stature
 
 
 def scaled(rig: Rig, factor: float, fixed: Array | float = 0.0) -> Rig:

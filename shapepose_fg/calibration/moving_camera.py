@@ -13,8 +13,6 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
 from shapepose_fg.calibration.adjustment import Adjusted, changed
@@ -26,7 +24,7 @@ from shapepose_fg.core.camera import Camera, Rig, Views
 from shapepose_fg.core.decompositions import nearest_rotation, rigid
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.trajectory import Trajectory
-from shapepose_fg.setup_check.matching import Sightings, median_of
+from shapepose_fg.setup_check.matching import Sightings, follow, median_of
 
 _STEP_S, _LONGEST_S = 0.2, 180.0
 """Time between the moments at which people are placed, and duration used of a longer recording,
@@ -100,26 +98,19 @@ class Placed:
         cls, time_s: Array, moment: Index, points: Array, spread: Array | None = None
     ) -> "Placed":
         """People at times (P,), linked between consecutive moments."""
-        one, other = list[int](), list[int]()
-        for now in np.unique(moment).tolist():
-            here, there = np.flatnonzero(moment == now), np.flatnonzero(moment == now + 1)
-            if len(there) == 0:
-                continue
-            away = median_of(
-                np.linalg.norm(points[here][:, None] - points[there], axis=-1), _FEWEST
-            )
-            near = away.argmin(axis=1)
-            mutual = away.argmin(axis=0)[near] == np.arange(len(here))
-            mutual &= away.min(axis=1) < _SAME_M
-            one += here[mutual].tolist()
-            other += there[near[mutual]].tolist()
-        links = coo_array((np.ones(len(one)), (one, other)), shape=(len(moment),) * 2)
+
+        def away(one: Index, other: Index) -> Array:
+            far = np.linalg.norm(points[one][:, None] - points[other], axis=-1)
+            return median_of(far, _FEWEST)
+
+        track = follow(moment, away, _SAME_M, 1)
+        order = np.lexsort((moment, track))
+        one, other = (pair[np.diff(track[order]) == 0] for pair in (order[:-1], order[1:]))
         before, after = np.arange(len(moment)), np.arange(len(moment))
         before[other], after[one] = one, other
         lasts = np.maximum(time_s[after] - time_s[before], _STEP_S / 2)[:, None, None]
         velocity = np.nan_to_num((points[after] - points[before]) / lasts)
         spread = np.zeros((0, *points.shape)) if spread is None else spread
-        track = connected_components(links, False)[1]
         return cls(time_s, moment, points, velocity, track, spread)
 
     @classmethod

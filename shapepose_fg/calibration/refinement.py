@@ -256,14 +256,14 @@ def settle(
     freedom: Freedom | Sequence[Freedom],
     told: Callable[[int], None],
     reference: int | None = None,
-    scale: Callable[[People], float] | None = None,
+    scale: Callable[[Array], float] | None = None,
 ) -> Adjusted:
     """Associate people and adjust cameras alternately, starting at `now`, until the cameras stand
     still.
 
     The prior has the `freedom` about the cameras `given`. With `scale`, the metres per unit of the
-    people's positions, it has only their lenses, and the rig is scaled. `told` gets the number of
-    rounds that are done. Raises Undetermined if too few people are seen.
+    people's joints (P, J, 3), it has only their lenses, and the rig is scaled. `told` gets the
+    number of rounds that are done. Raises Undetermined if too few people are seen.
     """
     adjusted: Adjusted | None = None
     for step in range(rounds):
@@ -279,7 +279,7 @@ def settle(
         spread, off = dilution(times.frame_s[np.unique(people.frame)]), misfit(people, now)
         adjusted = adjust(prior, now, people, freedom, spread, off, reference, scale is not None)
         if scale is not None:
-            if not np.isfinite(factor := scale(adjusted.people)):
+            if not np.isfinite(factor := scale(adjusted.people.points)):
                 raise Undetermined(
                     (f"no arms and legs are seen by two cameras, so the scale is unknown; {FILM}",)
                 )

@@ -39,9 +39,6 @@ in simulated recordings."""
 _FINALISTS = 6
 """Number of hypotheses that are refined."""
 _STEPS = 8
-_DILUTION = 25.0
-"""Number of correlated errors of joints that count as one independent error: of a person in one
-frame, and in frames close in time."""
 
 
 @dataclass(frozen=True)
@@ -57,9 +54,6 @@ class Relative:
     match with zero residual, and 0 if none match."""
     seconds: float
     """Person-seconds that are matched."""
-    covariance: Array
-    """(6, 6) covariance of a small rotation w before R, rad, and of a change of t, which is 0 along
-    t."""
     points: Array
     """(N, J, 3) matched people in camera a's frame, in lengths of t; NaN unless seen by both."""
 
@@ -182,7 +176,7 @@ def _settled(E: Array, seen: _Together, fps: float, looks: Index) -> Relative | 
             return best
         a, b, size = seen.joints(kept)
         pose = _in_front(E, a, b) if best is None else (best.R, best.t)
-        R, t, covariance = refined_pose(*pose, a, b, size)
+        R, t = refined_pose(*pose, a, b, size)
         E = hat(t) @ R
         new, score = seen.chosen(seen.misses(E[None])[0])
         if best is not None and score <= best.score:
@@ -192,7 +186,7 @@ def _settled(E: Array, seen: _Together, fps: float, looks: Index) -> Relative | 
             float(ahead[np.isfinite(points[..., 0])].mean()) if np.isfinite(points).any() else 0.0
         )
         step = float(np.median(np.diff(looks))) / fps if len(looks) > 1 else _LOOK_S
-        best = Relative(R, t, score * max(0.0, 2 * share - 1), len(a) * step, covariance, points)
+        best = Relative(R, t, score * max(0.0, 2 * share - 1), len(a) * step, points)
         kept = new
     return best
 
@@ -217,13 +211,12 @@ def _meeting(R: Array, t: Array, a: Array, b: Array) -> tuple[Array, Mask]:
     return (s[..., None] * a + centre + u[..., None] * back) / 2, (s > 0) & (u > 0)
 
 
-def refined_pose(R: Array, t: Array, a: Array, b: Array, size: Array) -> tuple[Array, Array, Array]:
+def refined_pose(R: Array, t: Array, a: Array, b: Array, size: Array) -> tuple[Array, Array]:
     """The pose with minimum Sampson residuals (Cauchy) of rays a, b (N, J, 3) of people with `size`
-    (N,) rad, and its covariance as in `Relative`.
+    (N,) rad.
     """
     known = np.isfinite(a[..., 0]) & np.isfinite(b[..., 0])
     size, a, b = np.broadcast_to(size[:, None], known.shape)[known], a[known], b[known]
-    to, H, usual = np.zeros((5, 6)), np.eye(5), 1.0
     for _ in range(_STEPS):
         E, turned = hat(t) @ R, a @ R.T
         Ea, Eb = a @ E.T, b @ E
@@ -248,7 +241,7 @@ def refined_pose(R: Array, t: Array, a: Array, b: Array, size: Array) -> tuple[A
         t = t / np.linalg.norm(t)
         if np.linalg.norm(step) < 1e-6:
             break
-    return R, t, to.T @ np.linalg.inv(H) @ to * _DILUTION * usual**2
+    return R, t
 
 
 def _crossed(a: Array, b: Array) -> Array:

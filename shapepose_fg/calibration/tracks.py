@@ -5,13 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import correlate1d
-from scipy.optimize import linear_sum_assignment
 
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.setup_check.matching import MIN_JOINTS, Sightings, median_of, rays_of
+from shapepose_fg.setup_check.matching import MIN_JOINTS, Sightings, follow, median_of, rays_of
 
 _SAME = 0.08
 """Maximum median motion of a person's joints between frames of a track, as a share of the person's
@@ -183,26 +182,14 @@ def seen_at(detections: "DetectionSequence | OneClock", frames: Iterable[int]) -
 
 def _followed(seen: Sightings) -> list[Index]:
     """Rows of each track, ordered by frame; single missing frames are bridged."""
-    open_, done = list[list[int]](), list[list[int]]()
-    order = np.argsort(seen.frame, kind="stable")
-    frames, starts = np.unique(seen.frame[order], return_index=True)
-    for frame, rows in zip(frames.tolist(), np.split(order, starts[1:]), strict=True):
-        done += [each for each in open_ if frame - seen.frame[each[-1]] > 2]
-        open_ = [each for each in open_ if frame - seen.frame[each[-1]] <= 2]
-        free = set(rows.tolist())
-        if open_:
-            last = np.array([each[-1] for each in open_])
-            away = (
-                np.linalg.norm(seen.xy[last][:, None] - seen.xy[rows], axis=-1)
-                / seen.size_px[rows][:, None]
-            )
-            cost = np.minimum(median_of(away, MIN_JOINTS), 1.0)
-            for one, other in zip(*linear_sum_assignment(cost), strict=True):
-                if cost[one, other] < _SAME:
-                    open_[one].append(int(rows[other]))
-                    free.discard(int(rows[other]))
-        open_ += [[row] for row in sorted(free)]
-    return [np.array(each, dtype=np.intp) for each in done + open_]
+
+    def away(one: Index, other: Index) -> Array:
+        apart_px = np.linalg.norm(seen.xy[one][:, None] - seen.xy[other], axis=-1)
+        return median_of(apart_px / seen.size_px[other][:, None], MIN_JOINTS)
+
+    who = follow(seen.frame, away, _SAME, 2)
+    order = np.lexsort((seen.frame, who))
+    return np.split(order, np.flatnonzero(np.diff(who[order])) + 1)
 
 
 def _smoothed(rays: Array, frame: Index, width: float) -> tuple[Array, Array]:

@@ -4,14 +4,13 @@ All errors are relative to the person's size in the picture, so that matches do 
 calibration's unit.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index
-from shapepose_fg.core.assignment import least_cost_pairs
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.detections import Detections, DetectionSequence
 from shapepose_fg.core.rows import Rows
@@ -362,29 +361,39 @@ _REACH, _FORGOTTEN = 1.4, 40
 thirds of a metre), and the number of frames after which a lost person is forgotten."""
 
 
-def followed(frame: Index, points: Array) -> Index:
-    """(P,) identities of people (P, J, 3) over frames: each continues the nearest of the frame
-    before, if near.
+def follow(frame: Index, away: Callable[[Index, Index], Array], reach: float, gap: int) -> Index:
+    """(N,) identities of rows over frames (N,): rows of a frame and of the `gap` frames before
+    are the same if they are nearest to each other, and within `reach`.
+
+    `away` are the distances (A, B) of rows (A,) of earlier frames from rows (B,).
     """
-    middle = _middle(points)
-    spread = _middle((points - middle[:, None]) ** 2).sum(axis=-1) ** 0.5
-    reach = _REACH * float(np.median(spread)) if len(frame) > 0 else 0.0
     who, last, count = np.full(len(frame), -1, dtype=np.intp), np.zeros(0, dtype=np.intp), 0
     for now in np.unique(frame).tolist():
-        here = np.flatnonzero(frame == now)
-        away = np.linalg.norm(middle[here, None] - middle[last], axis=-1)
-        before, after = least_cost_pairs(np.minimum(np.nan_to_num(away, nan=np.inf), reach).T)
-        near = away[after, before] < reach
-        who[here[after[near]]] = who[last[before[near]]]
-        new, lost = here[who[here] < 0], last[~np.isin(who[last], who[here])]
-        if len(new) == len(lost) == 1:  # the only possible pair, e.g. after a cut
-            who[new], lost = who[lost], lost[:0]
-        else:
-            who[new] = count + np.arange(len(new))
-            count += len(new)
-        gone = lost[frame[lost] > now - _FORGOTTEN]
-        last = np.concatenate([here, gone])
+        here, last = np.flatnonzero(frame == now), last[frame[last] >= now - gap]
+        if len(last) > 0:
+            far = away(last, here)
+            nearest = far.argmin(axis=1)
+            mutual = far.argmin(axis=0)[nearest] == np.arange(len(last))
+            mutual &= far.min(axis=1) < reach
+            who[here[nearest[mutual]]] = who[last[mutual]]
+        new = here[who[here] < 0]
+        who[new] = count + np.arange(len(new))
+        count += len(new)
+        last = np.concatenate([here, last[~np.isin(who[last], who[here])]])
     return who
+
+
+def followed(frame: Index, points: Array) -> Index:
+    """(P,) identities of people (P, J, 3) over frames (P,), by the mean of their joints."""
+    middle = _middle(points)
+    spread = _middle((points - middle[:, None]) ** 2).sum(axis=-1) ** 0.5
+
+    def away(one: Index, other: Index) -> Array:
+        far = np.linalg.norm(middle[one, None] - middle[other], axis=-1)
+        return far if far.size > 1 else 0 * far  # one person is the same one after a cut
+
+    reach = _REACH * float(np.median(spread)) if len(frame) > 0 else 0.0
+    return follow(frame, away, reach, _FORGOTTEN)
 
 
 def _middle(points: Array) -> Array:
