@@ -58,7 +58,7 @@ class Relative:
     """(N, J, 3) matched people in camera a's frame, in lengths of t; NaN unless seen by both."""
 
 
-class _Together:
+class Together:
     """Sightings of two cameras in the same frames: N pairs of rows, K pairs of tracks."""
 
     def __init__(self, one: Tracks, other: Tracks, looks: Index) -> None:
@@ -116,7 +116,7 @@ def relative(one: Tracks, other: Tracks, fps: float) -> Relative | None:
         return None
     looks = np.unique((frames // max(1, round(_LOOK_S * fps))) * max(1, round(_LOOK_S * fps)))
     looks = looks[np.unique(np.linspace(0, len(looks) - 1, _MOST_LOOKS).astype(np.intp))]
-    seen = _Together(one, other, looks)
+    seen = Together(one, other, looks)
     guesses = _guesses(one, other, seen)
     if len(guesses) == 0:
         return None
@@ -129,7 +129,7 @@ def relative(one: Tracks, other: Tracks, fps: float) -> Relative | None:
     return found
 
 
-def _guesses(one: Tracks, other: Tracks, seen: _Together) -> Array:
+def _guesses(one: Tracks, other: Tracks, seen: Together) -> Array:
     """(H, 3, 3) essential matrices, each from a pair of tracks."""
     found = list[Array]()
     for pair in np.argsort(-seen.count, kind="stable")[:_MOST_TRIED].tolist():
@@ -167,7 +167,7 @@ def _guesses(one: Tracks, other: Tracks, seen: _Together) -> Array:
     return np.stack(found) if found else np.zeros((0, 3, 3))
 
 
-def _settled(E: Array, seen: _Together, fps: float, looks: Index) -> Relative | None:
+def _settled(E: Array, seen: Together, fps: float, looks: Index) -> Relative | None:
     """Pose of a hypothesis, refined alternately with the set of agreeing tracks."""
     kept, score = seen.chosen(seen.misses(E[None])[0])
     best: Relative | None = None
