@@ -28,6 +28,7 @@ from shapepose_fg.core.camera import Camera, Rig, Views
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import FrameTimes
+from shapepose_fg.estimation.trajectory_graph import correlated
 from shapepose_fg.setup_check.diagnosis import build_of, put_right
 from shapepose_fg.setup_check.evidence import gather
 from shapepose_fg.setup_check.findings import SURE, Finding, Kind
@@ -43,12 +44,6 @@ FILM = (
     "their arms"
 )
 """Cure for motion that does not determine the cameras."""
-_SAME_PERSON = 2.5
-"""Number of joints of one person in one view whose correlated errors count as one independent
-error."""
-_ERRORS = ((0.45, 3.5), (0.25, 0.25), (0.30, 0.0))
-"""Shares of a detector's errors, and their time constants, s: measured on simulated recordings,
-whose detector has Shelf's statistics (0.8 after a frame, 0.35 after a second, 0.1 after four)."""
 _UNKNOWN = 0.8
 """Ratio of posterior to prior standard deviation above which a parameter is undetermined."""
 
@@ -308,11 +303,7 @@ def dilution(time_s: Array) -> float:
     """Number of correlated errors of a detection, over time and joints, that count as one, for
     frames at `time_s` (T,).
     """
-    apart = np.abs(time_s[:, None] - time_s)
-    alike = sum(
-        share * (np.exp(-apart / lasts) if lasts > 0 else apart == 0) for share, lasts in _ERRORS
-    )
-    return float(_SAME_PERSON * np.sum(alike) / len(time_s))
+    return float(correlated(time_s[:, None] - time_s).sum() / len(time_s))
 
 
 def _undetermined(adjusted: Adjusted, freedom: Freedom, counts: Index) -> list[str]:
