@@ -21,11 +21,12 @@ from shapepose_fg.calibration.people import People
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.decompositions import nearest_rotation
+from shapepose_fg.setup_check import fit
+from shapepose_fg.setup_check.fit import CENTRE, FOCAL, MOVE, TURN
 
-TURN, MOVE, FOCAL, CENTRE, LENS = slice(0, 3), slice(3, 6), slice(6, 7), slice(7, 9), slice(9, 13)
-"""Slices of a camera's parameters: rotation, rad, and translation, m, along its own axes; log of
-the focal length; principal point, px; k1 k2 p1 p2."""
-Q = 13
+LENS = [9, 10, 11, 12]
+"""Parameters of a camera beside `fit.PARAMETERS`: k1 k2 p1 p2."""
+Q = fit.Q + len(LENS)
 _HELD = 1e-6
 """Standard deviation of fixed parameters, rad or m."""
 _HELD_PX = 0.1
@@ -61,7 +62,7 @@ class Freedom:
         """(Q,) prior standard deviation of each parameter of a camera."""
         turn, move = np.radians(self.turn_deg) / np.sqrt(3), self.move_m / np.sqrt(3)
         return np.array(
-            [turn] * 3 + [move] * 3 + [self.focal] + [self.centre_px] * 2 + [self.lens] * 4
+            [turn] * 3 + [move] * 3 + [self.centre_px] * 2 + [self.focal] + [self.lens] * 4
         )
 
 
@@ -80,7 +81,7 @@ class Adjusted:
     """Ratio of the detector's errors to those measured for detectors: robust, from the
     residuals."""
 
-    def sigma(self, part: slice) -> Array:
+    def sigma(self, part: list[int]) -> Array:
         """(V,) standard deviation of some of the parameters together: root of their summed
         variances.
         """
@@ -192,8 +193,8 @@ def _lens(camera: Camera, relative_to: Camera) -> gtsam.Cal3DS2:
 def _lens_columns(camera: Camera) -> Array:
     """(9, Q - 6) derivatives of fx fy s u v k1 k2 p1 p2 by the parameters."""
     columns = np.zeros((9, Q - 6))
-    columns[0, 0], columns[1, 0] = camera.K[0, 0], camera.K[1, 1]
-    columns[3, 1] = columns[4, 2] = 1.0
+    columns[3, 0] = columns[4, 1] = 1.0
+    columns[0, 2], columns[1, 2] = camera.K[0, 0], camera.K[1, 1]
     columns[5:, 3:] = np.eye(4)
     return columns
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from shapepose_fg.calibration.adjustment import FOCAL, MOVE, TURN, Adjusted, Freedom
+from shapepose_fg.calibration.adjustment import Adjusted, Freedom
 from shapepose_fg.calibration.arrangement import Edge, arranged, parts
 from shapepose_fg.calibration.levelling import (
     ADULT_M,
@@ -35,6 +35,7 @@ from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.decompositions import rigid
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.frame_times import FrameTimes
+from shapepose_fg.setup_check.fit import FOCAL, MOVE, TURN
 from shapepose_fg.setup_check.matching import Sightings
 
 _BURST_S, _BURSTS = 10.0, 6

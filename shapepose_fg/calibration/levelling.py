@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from shapepose_fg.calibration.adjustment import MOVE, Adjusted
+from shapepose_fg.calibration.adjustment import Adjusted
 from shapepose_fg.calibration.people import People
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Rig
@@ -16,6 +16,7 @@ from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.floor import Floor, find_floor
 from shapepose_fg.setup_check.diagnosis import build_of
 from shapepose_fg.setup_check.findings import ADULT_M as ADULT_M
+from shapepose_fg.setup_check.fit import MOVE
 
 _PERSON, _KNOWN_PERSON, _COMMON = 0.07, 0.02, 0.025
 """Standard deviations of the scale from `build_of`, as shares: of bones among adults, and among

@@ -10,17 +10,7 @@ from typing import Any
 import numpy as np
 
 from shapepose_fg.body.model.rotation import exp_so3
-from shapepose_fg.calibration.adjustment import (
-    CENTRE,
-    FOCAL,
-    LENS,
-    MOVE,
-    TURN,
-    Adjusted,
-    Freedom,
-    adjust,
-    misfit,
-)
+from shapepose_fg.calibration.adjustment import LENS, Adjusted, Freedom, adjust, misfit
 from shapepose_fg.calibration.levelling import apart, grown, scaled
 from shapepose_fg.calibration.people import LEAST_PEOPLE, Footage, People, missed_px
 from shapepose_fg.core.arrays import Array, Index
@@ -32,7 +22,7 @@ from shapepose_fg.estimation.trajectory_graph import correlated
 from shapepose_fg.setup_check.diagnosis import build_of, put_right
 from shapepose_fg.setup_check.evidence import gather
 from shapepose_fg.setup_check.findings import SURE, Finding, Kind
-from shapepose_fg.setup_check.fit import difference
+from shapepose_fg.setup_check.fit import CENTRE, FOCAL, MOVE, TURN, Q, difference
 from shapepose_fg.setup_check.small_errors import Problem
 
 _ROUNDS = 4
@@ -214,8 +204,7 @@ def refine(
     notes = tuple(_undetermined(found, freedom, counts))
     sure = 1.0
     if all(new is old for new, old in zip(start.cameras, rig.cameras, strict=True)):
-        order = [*range(6), 7, 8, 6]  # order of parameters in the check
-        sure = Problem.of(given).off(freedom.sigmas[order], reference)
+        sure = Problem.of(given).off(freedom.sigmas[:Q], reference)
     return Refinement(rig, found, freedom, was, now, counts, notes, missed, stature, sure)
 
 

@@ -11,7 +11,7 @@ import pytest
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.rotation import exp_so3
 from shapepose_fg.body.shapes import statures_m
-from shapepose_fg.calibration.adjustment import MOVE, TURN, Freedom, adjust
+from shapepose_fg.calibration.adjustment import Freedom, adjust
 from shapepose_fg.calibration.arrangement import Edge, arranged, parts
 from shapepose_fg.calibration.from_people import Undetermined, calibrate
 from shapepose_fg.calibration.levelling import Measured, scale_of, sigma_of_scale
@@ -29,6 +29,7 @@ from shapepose_fg.io.detections import read_detections
 from shapepose_fg.io.lenses import lenses_of
 from shapepose_fg.io.write_detections import write_openpose
 from shapepose_fg.setup_check.diagnosis import build_of
+from shapepose_fg.setup_check.fit import MOVE, TURN
 from shapepose_fg.simulation.motion import Motion
 from shapepose_fg.simulation.scene import keypoints_of
 from tests.calibration.conftest import FPS, off_by
