@@ -12,7 +12,7 @@ from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.linearisation import ObservationConfig
-from shapepose_fg.setup_check.evidence import observed, triangulate
+from shapepose_fg.setup_check.evidence import left_out, observed, triangulate
 from shapepose_fg.setup_check.matching import GATE, Pairs, Sightings, size_of
 
 LEAST_PEOPLE = 10
@@ -132,17 +132,7 @@ def missed_px(people: People, rig: Rig) -> Array:
 
     NaN if fewer than two others see it. With only two cameras, from the prediction by both.
     """
-    missed = np.full(people.sigma_px.shape, np.nan)
-    weight = np.where(np.isfinite(people.sigma_px), 1.0, 0.0)
-    size = size_of(np.moveaxis(people.xy, 2, 1))
-    if len(rig) == 2:
-        return np.where(
-            weight > 0, triangulate(people.xy, weight, size, Views.of(rig)).miss_px, np.nan
-        )
-    for view, camera in enumerate(rig.cameras):
-        others, xy = weight.copy(), people.xy.copy()
-        others[:, :, view], xy[:, :, view] = 0.0, np.nan
-        placed = triangulate(xy, others, size, Views.of(rig))
-        seen, _ = camera.project(placed.points)
-        missed[:, :, view] = np.linalg.norm(seen - people.xy[:, :, view], axis=-1)
-    return np.where(weight > 0, missed, np.nan)
+    seen, size = np.isfinite(people.sigma_px), size_of(np.moveaxis(people.xy, 2, 1))
+    given = people.xy, seen.astype(float), size, Views.of(rig)
+    missed = triangulate(*given).miss_px if len(rig) == 2 else left_out(*given, seen)[0]
+    return np.where(seen, missed, np.nan)
