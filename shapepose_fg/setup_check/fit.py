@@ -252,37 +252,27 @@ def _solved(
     points: Array, xy: Array, width_px: Array, camera: Pinhole, columns: list[int]
 ) -> Pinhole:
     """The camera fitted robustly (Cauchy) to points (N, 3) observed at xy (N, 2)."""
+    from scipy.optimize import least_squares  # takes long to import
+
     ahead = camera.project(points)[1] > 0
     if ahead.sum() < 4:
         return camera
     points, xy, width_px = points[ahead, None], xy[ahead], width_px[ahead, None]
 
-    def linearised(views: Views) -> tuple[float, Array, Array]:
-        at, place, by_point = seen_by(points, views)
-        error = (at[:, 0, 0] - xy) / width_px
-        cost = float(np.log1p(error**2).sum()) if (place[..., 2] > 0).all() else np.inf
-        return (
-            cost,
-            error,
-            by_parameters(at, place, by_point, views)[:, 0, 0][..., columns] / width_px[..., None],
-        )
+    given = Views(camera.K[None], camera.cTw[None])
 
-    views = Views(camera.K[None], camera.cTw[None])
-    cost, error, J = linearised(views)
-    for _ in range(_STEPS):
-        weight, step = 1 / (1 + error**2), np.zeros((1, Q))
-        H = np.einsum("nij,ni,nik->jk", J, weight, J)
-        step[0, columns] = -np.linalg.lstsq(
-            H, np.einsum("nij,ni,ni->j", J, weight, error), rcond=1e-12
-        )[0]
-        for part in (1.0, 0.25, 0.06):
-            tried = changed(views, part * step)
-            new = linearised(tried)
-            if new[0] < cost:
-                views, (cost, error, J) = tried, new
-                break
-        else:
-            break
+    def moved(x: Array) -> Views:
+        change = np.zeros((1, Q))
+        change[0, columns] = x
+        return changed(given, change)
+
+    def residuals(x: Array) -> Array:
+        at, place, _ = seen_by(points, moved(x))
+        behind = (place[..., 2] <= 0).any()
+        return np.full(xy.size, np.inf) if behind else np.ravel((at[:, 0, 0] - xy) / width_px)
+
+    start = np.zeros(len(columns))
+    views = moved(least_squares(residuals, start, loss="cauchy", x_scale="jac", max_nfev=_STEPS).x)
     return Pinhole(views.K[0], views.cTw[0])
 
 
