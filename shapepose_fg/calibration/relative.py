@@ -17,7 +17,7 @@ from shapepose_fg.calibration.tracks import Tracks
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.compiled import kernel
 from shapepose_fg.core.decompositions import basis_across
-from shapepose_fg.setup_check.matching import MIN_JOINTS
+from shapepose_fg.setup_check.matching import MIN_JOINTS, depths_of_meeting
 
 _LOOK_S = 0.2
 """Interval between compared frames, s: people's joints move by more than a detector's error."""
@@ -206,9 +206,7 @@ def _meeting(R: Array, t: Array, a: Array, b: Array) -> tuple[Array, Mask]:
     front of both.
     """
     back, centre = b @ R, -R.T @ t
-    cosine, along_a, along_b = (a * back).sum(axis=-1), a @ centre, back @ centre
-    sine2 = np.maximum(1 - cosine**2, 1e-6)
-    s, u = (along_a - cosine * along_b) / sine2, (cosine * along_a - along_b) / sine2
+    s, u, _ = depths_of_meeting(a, back, centre)
     return (s[..., None] * a + centre + u[..., None] * back) / 2, (s > 0) & (u > 0)
 
 

@@ -235,6 +235,17 @@ def centres_of(views: Views) -> Array:
     return -np.einsum("vji,vj->vi", views.cTw[:, :, :3], views.cTw[:, :, 3])
 
 
+def depths_of_meeting(a: Array, b: Array, between: Array) -> tuple[Array, Array, Array]:
+    """Depths (...) along unit rays `a` and `b` (..., 3) where they are nearest to each other, and
+    the sines (...) of their angles; `between` (..., 3) is the second camera from the first.
+    """
+    cosine = (a * b).sum(axis=-1)
+    along_a, along_b = ((each * between).sum(axis=-1) for each in (a, b))
+    sine2 = np.maximum(1 - cosine**2, 1e-12)
+    s, t = (along_a - cosine * along_b) / sine2, (cosine * along_a - along_b) / sine2
+    return s, t, np.sqrt(sine2)
+
+
 def _meeting(
     sightings: Sightings, views: Views, first: Index, second: Index
 ) -> tuple[Array, Array]:
@@ -246,16 +257,9 @@ def _meeting(
     """
     rays, centres = rays_of(sightings, views), centres_of(views)
     a, b = rays[first], rays[second]
-    between = (centres[sightings.view[first]] - centres[sightings.view[second]])[:, None]
-    cosine = np.einsum("mji,mji->mj", a, b)
-    along_a, along_b = (
-        np.einsum("mji,mji->mj", a, between + 0 * a),
-        np.einsum("mji,mji->mj", b, between + 0 * b),
-    )
-    sine2 = np.maximum(1 - cosine**2, 1e-12)
-    s, t = (cosine * along_b - along_a) / sine2, (along_b - cosine * along_a) / sine2
-    on_a = s[..., None] * a
-    on_b = t[..., None] * b - between
+    between = (centres[sightings.view[second]] - centres[sightings.view[first]])[:, None]
+    s, t, sine = depths_of_meeting(a, b, between)
+    on_a, on_b = s[..., None] * a, between + t[..., None] * b
     half_gap = np.linalg.norm(on_a - on_b, axis=-1) / 2
     focal, size = views.focal_px[sightings.view], sightings.size_px
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -263,7 +267,7 @@ def _meeting(
             half_gap / s * (focal / size)[first, None], half_gap / t * (focal / size)[second, None]
         )
     error = np.where(np.isfinite(half_gap) & ((s <= 0) | (t <= 0)), np.inf, error)
-    angle = median_of(np.arcsin(np.minimum(np.sqrt(sine2), 1.0)))
+    angle = median_of(np.arcsin(np.minimum(sine, 1.0)))
     median = np.where(angle > _MIN_ANGLE, median_of(error, MIN_JOINTS), np.inf)
     points = centres[sightings.view[first]][:, None] + (on_a + on_b) / 2
     return median, points
