@@ -16,13 +16,11 @@ import numpy as np
 from gtsam.symbol_shorthand import B, C, L, X
 
 from factors.noise import diagonal, gaussian, isotropic_models, robust_kernel
-from shapepose_fg.body.model.rotation import exp_so3
 from shapepose_fg.calibration.people import People
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.decompositions import nearest_rotation
 from shapepose_fg.setup_check import fit
-from shapepose_fg.setup_check.fit import CENTRE, FOCAL, MOVE, TURN
 
 LENS = [9, 10, 11, 12]
 """Parameters of a camera beside `fit.PARAMETERS`: k1 k2 p1 p2."""
@@ -203,16 +201,6 @@ def _lens_covariance(camera: Camera, sigmas: Array) -> Array:
     columns, held = _lens_columns(camera), np.repeat(_HELD_PX, 9)
     held[5:] /= camera.K[0, 0]
     return columns @ np.diag(sigmas[6:] ** 2) @ columns.T + np.diag(held**2)
-
-
-def changed(camera: Camera, by: Array) -> Camera:
-    """The camera with pose and lens changed by small amounts (Q,) of its parameters."""
-    K, wTc = camera.K.copy(), camera.wTc.copy()
-    K[[0, 1], [0, 1]] *= np.exp(by[FOCAL])
-    K[:2, 2] += by[CENTRE]
-    wTc[:3, 3] += wTc[:3, :3] @ by[MOVE]
-    wTc[:3, :3] = wTc[:3, :3] @ exp_so3(by[TURN])
-    return replace(camera, K=K, wTc=wTc)
 
 
 def _camera(camera: Camera, values: gtsam.Values, view: int, freedom: Freedom) -> Camera:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from shapepose_fg.calibration.adjustment import Adjusted, changed
+from shapepose_fg.calibration.adjustment import Adjusted
 from shapepose_fg.calibration.from_people import Undetermined
 from shapepose_fg.calibration.people import Footage, People
 from shapepose_fg.calibration.refinement import dilution
@@ -24,6 +24,7 @@ from shapepose_fg.core.camera import Camera, Rig, Views
 from shapepose_fg.core.decompositions import nearest_rotation, rigid
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.trajectory import Trajectory
+from shapepose_fg.setup_check.fit import POSE, Q, by_parameters, seen_by
 from shapepose_fg.setup_check.matching import Sightings, follow, median_of
 
 _STEP_S, _LONGEST_S = 0.2, 180.0
@@ -157,18 +158,16 @@ def _moved_by(people: People, found: Adjusted) -> Array:
     values, vectors = np.linalg.eigh(square / scale / scale[:, None])
     kept = values > _LEAST_VARIANCE
     errors = (sigma[:, None] * vectors[:, kept] * np.sqrt(values[kept])).T
-    points = np.nan_to_num(people.points)
-    xy, _, by_point = Views.of(rig).project(points)
-    weight = np.where(people.seen, 1 / people.sigma_px, 0.0)[..., None]
-    by_point = np.nan_to_num(by_point) * weight[..., None]
+    views, points = Views.of(rig), np.nan_to_num(people.points)
+    xy, at, by_place = seen_by(points, views)
+    by_camera = by_parameters(xy, at, by_place, views)
+    by_camera[..., POSE] *= -1  # poses are those of the cameras in the world
+    weight = np.where(people.seen, 1 / people.sigma_px, 0.0)[..., None, None]
+    by_point, by_camera = weight * (by_place @ views.cTw[:, :, :3]), weight * by_camera
     inverse = np.linalg.pinv(np.einsum("pjvri,pjvrk->pjik", by_point, by_point), hermitian=True)
-    moved = list[Array]()
-    for error in errors.reshape(len(errors), *found.covariance.shape[:2]):
-        cameras = tuple(map(changed, rig.cameras, _TINY * error))
-        other, *_ = Views.of(replace(rig, cameras=cameras)).project(points)
-        missed = np.nan_to_num(weight * (other - xy) / _TINY)
-        moved.append(-np.einsum("pjik,pjvrk,pjvr->pji", inverse, by_point, missed))
-    return np.reshape(moved, (len(moved), *points.shape))
+    errors = errors.reshape(len(errors), len(rig), -1)[..., :Q]
+    missed = np.einsum("pjvrq,mvq->mpjvr", by_camera, errors)
+    return -np.einsum("pjik,pjvrk,mpjvr->mpji", inverse, by_point, missed, optimize=True)
 
 
 @dataclass(frozen=True)
