@@ -17,6 +17,7 @@ from shapepose_fg.calibration.adjustment import Adjusted, Freedom
 from shapepose_fg.calibration.arrangement import Edge, arranged, parts
 from shapepose_fg.calibration.levelling import (
     ADULT_M,
+    CONTRADICTS,
     Measured,
     World,
     apart,
@@ -49,8 +50,6 @@ _LEAST_SCORE, _LEAST_S = 0.15, 3.0
 _MOST_SIGMA_DEG, _MOST_APART_DEG = 1.0, 2.0
 """Maximum standard deviation of a rotation, and maximum difference between halves of the recording,
 degrees."""
-_UNUSUAL = 3.0
-"""Maximum deviation of stature, in standard deviations, for people assumed to be adults."""
 KNOWN_LENS = Freedom()
 """Lenses that are not adjusted."""
 
@@ -179,7 +178,7 @@ def calibrate(
     if not measured.distances:
         return found
     notes, tall = measured.better(adjusted, sigma), np.log(world.stature_m / ADULT_M)
-    if abs(tall) >= _UNUSUAL * sigma_of_scale(world.persons, False):
+    if abs(tall) >= CONTRADICTS * sigma_of_scale(world.persons, False):
         what = f"the median stature of people is {world.stature_m:.2f} m"
         notes += (f"{what}; if they are adults, measure the distance of the cameras again",)
     return replace(found, notes=notes)

@@ -25,7 +25,7 @@ _TAPE_M = 0.02
 """Standard deviation of a distance between lenses that was measured with a tape, m."""
 _CLEARLY = 1.3
 """Ratio of standard deviations from which another measurement is recommended."""
-_CONTRADICTS = 4.0
+CONTRADICTS = 3.0
 """Number of standard deviations above which measurements contradict each other."""
 _LEAN_RAD = np.radians(3.0)
 """Maximum lean of people's mean trunk for the search of the floor, rad."""
@@ -81,7 +81,7 @@ class Measured:
         weight, said = 1 / sigma**2, np.log(metres / length)
         log = float(np.average(said, weights=weight))
         worst = int(np.abs((said - log) / sigma).argmax())
-        if abs(said[worst] - log) > _CONTRADICTS * sigma[worst]:
+        if abs(said[worst] - log) > CONTRADICTS * sigma[worst]:
             a, b, given = self.distances[worst]
             raise InputError(
                 f"distance of {rig.names[a]} and {rig.names[b]}: people and the other distances "

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from shapepose_fg.calibration.adjustment import Adjusted
 from shapepose_fg.calibration.from_people import Undetermined
-from shapepose_fg.calibration.people import Footage, People
+from shapepose_fg.calibration.people import MIN_DEPTH_M, Footage, People
 from shapepose_fg.calibration.refinement import dilution
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Camera, Rig, Views
@@ -66,9 +66,9 @@ _WIDTH = 2.385
 _RIGID, _LONG_M, _FEWEST = 0.1, 0.25, 3
 """Maximum relative variation of the distance of two joints of a bone, its minimum, m, and minimum
 number of bones that give the distance of a person."""
-_LEAST_DEPTH_M, _SIGMA_M, _MOUNT_RAD = 0.3, 0.03, np.radians(0.5)
-"""Minimum depth, and standard deviation of a detected joint from its position by other cameras, m;
-and that of the principal point of a lens without calibration, as an angle."""
+_SIGMA_M, _MOUNT_RAD = 0.03, np.radians(0.5)
+"""Standard deviation of a detected joint from its position by other cameras, m, and of the
+principal point of a lens without calibration, as an angle."""
 _QUARTERS = rigid(
     Rotation.from_euler("z", [[90 * n] for n in range(4)], degrees=True).as_matrix(),
     np.zeros((4, 3)),
@@ -397,8 +397,8 @@ class Filmed:
         person = away.argmin(axis=1)
         away = away[np.arange(len(rows)), person]
         inside = (middle > 0).all(axis=1) & (middle < self.camera.image_size).all(axis=1)
-        inside &= depth > _LEAST_DEPTH_M
-        return rows, frame, person, np.where(depth > _LEAST_DEPTH_M, away, np.inf), inside
+        inside &= depth > MIN_DEPTH_M
+        return rows, frame, person, np.where(depth > MIN_DEPTH_M, away, np.inf), inside
 
     def _seen(self, start: Start, placed: Placed, rows: Index, frame: Index) -> Array:
         """(N, J, 3) joints of placed people in the camera, at the times of the frames (N,)."""
@@ -513,7 +513,7 @@ class _Fit:
 
         def data(now: Start, placed: Placed) -> Array:
             at = filmed._seen(now, placed, self.rows, self.frame)
-            depth = np.maximum(at[known][:, 2:], _LEAST_DEPTH_M)
+            depth = np.maximum(at[known][:, 2:], MIN_DEPTH_M)
             return np.ravel(rays[known][:, :2] / now.focal * depth - at[known][:, :2])
 
         def residuals(x: Array) -> Array:

@@ -8,14 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from shapepose_fg.calibration.tracks import LEAST_MISS
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.compiled import kernel
 from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS, Sightings, centres_of, rays_of
 
-_LEAST_SPREAD = 0.004
-"""Minimum spread of the residuals over offsets, as a share of people's size, for a detector's
-noise."""
 _ANCHORS = 150
 """Number of frames of one camera that are compared with those of another, at every offset."""
 
@@ -147,7 +145,7 @@ def chosen(
         if known.sum() < 3:
             return np.zeros(len(apart))
         middle = np.median(curve[known])
-        spread = max(1.5 * float(np.median(np.abs(curve[known] - middle))), _LEAST_SPREAD)
+        spread = max(1.5 * float(np.median(np.abs(curve[known] - middle))), LEAST_MISS)
         place = np.clip(apart + half, 0, len(lags) - 1)
         inside = (np.abs(apart) <= half) & known[place]
         return np.where(inside, (middle - curve[place]) / spread, 0.0)

@@ -17,13 +17,11 @@ from scipy.signal import fftconvolve
 
 from shapepose_fg.calibration.pairwise import fast_part
 from shapepose_fg.calibration.relative import relative
-from shapepose_fg.calibration.tracks import Tracks
+from shapepose_fg.calibration.tracks import FASTEST, Tracks
 from shapepose_fg.core.arrays import Array, Index
 
 _STEP_S = 0.04
 """Interval between compared frames, s."""
-_FASTEST = 2.0
-"""Maximum vertical speed of a joint, statures per second; faster ones are identity switches."""
 _BRISK_S = 0.5
 """Time scale of the high-pass filter, s: a person who walks towards one camera sinks in its picture
 and rises in another's."""
@@ -139,7 +137,7 @@ class _Rises(NamedTuple):
 def _rises(tracks: Tracks, step: int, fps: float) -> _Rises:
     """Vertical speeds of joints, one sample every `step` frames."""
     values = tracks.speed[:, :, 1] / tracks.size[:, None]
-    known = np.abs(values) < _FASTEST / fps  # false for NaN
+    known = np.abs(values) < FASTEST / fps  # false for NaN
     (values,) = fast_part(
         (np.where(known, values, 0.0),), known, tracks.track, tracks.track, _BRISK_S * fps
     )

@@ -8,7 +8,7 @@ from itertools import combinations
 import numpy as np
 
 from shapepose_fg.calibration.pairwise import Pairwise, fast_part
-from shapepose_fg.calibration.tracks import FAST_S, Tracks, block_frames
+from shapepose_fg.calibration.tracks import FAST_S, FASTEST, LEAST_MISS, Tracks, block_frames
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Views
 from shapepose_fg.setup_check.evidence import triangulate
@@ -23,15 +23,11 @@ from shapepose_fg.setup_check.matching import (
 
 _MOST_PLACED = 20_000
 """Maximum number of rows of tracks that are triangulated, over all cameras."""
-_LEAST_MISS = 0.004
-"""Minimum error of a detector as a share of a person's size: 7 mm."""
 _REWEIGHED = 10
 _NUDGE = 0.25
 """Shift of a clock for numerical derivatives, frames: more than the errors to be found."""
 _LEAST_OTHERS = 0.2
 """Minimum total weight of all other blocks, in the correction for one block."""
-_FASTEST = 2.5
-"""Maximum speed of a joint, statures per second; faster ones are identity switches."""
 
 
 @dataclass(frozen=True)
@@ -200,14 +196,14 @@ class InSpace:
         each = np.stack([mine - there[rows], theirs[rows], speed[rows, :, view]])
         each /= size[rows, view][:, None, None]
         length = np.linalg.norm(each, axis=-1)
-        known = (length[0] < GATE / 2) & (length[1:] < _FASTEST / self.fps).all(axis=0)
+        known = (length[0] < GATE / 2) & (length[1:] < FASTEST / self.fps).all(axis=0)
         miss, calm, fast = fast_part(
             tuple(each), known[..., None], whom, whom, FAST_S * self.fps / self.step
         )
         if not known.any():
             return 0.0, np.full(blocks, np.inf)
         length = np.linalg.norm(miss, axis=-1)
-        width = 3.0 * np.maximum(median_of(np.where(known, length, np.nan).T), _LEAST_MISS)
+        width = 3.0 * np.maximum(median_of(np.where(known, length, np.nan).T), LEAST_MISS)
         weight = np.where(known, 1 / (1 + (length / width) ** 2) ** 2 / width**2, 0.0)
         # Velocities from the others are independent of this camera's errors; its own give the
         # change per frame.

@@ -12,6 +12,7 @@ from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.linearisation import ObservationConfig
+from shapepose_fg.estimation.trajectory_graph import WEAKEST_M
 from shapepose_fg.setup_check.evidence import left_out, observed, triangulate
 from shapepose_fg.setup_check.matching import GATE, Pairs, Sightings, size_of
 
@@ -23,9 +24,8 @@ _MOST_FRAMES = 100
 _MOST_SIGHTINGS = 5_000
 """Maximum number of sightings; more of them, or of frames, cost time and add little information,
 because errors within a second are correlated."""
-_MIN_DEPTH_M = 0.3
-_WEAKEST_M = 0.15
-"""Maximum standard deviation, m, of a used joint in its worst direction."""
+MIN_DEPTH_M = 0.3
+"""Minimum depth of a used joint, m."""
 _NOISE = ObservationConfig()
 
 
@@ -104,7 +104,7 @@ class Footage:
         groups = Pairs.of(sightings, views).groups(len(sightings), tuple(range(len(rig))))
         xy, confidence, size = observed(groups, sightings)
         placed = triangulate(xy, confidence, size, views)
-        near = (placed.depth > _MIN_DEPTH_M) & (placed.miss_px < GATE * size[:, None])
+        near = (placed.depth > MIN_DEPTH_M) & (placed.miss_px < GATE * size[:, None])
         weight = _NOISE.weight(confidence) / _NOISE.scatter(self.joints)[:, None] ** 2
         at = np.where(near, placed.depth, np.nan)
         sigma = np.hypot(
@@ -123,7 +123,7 @@ def _well_placed(points: Array, sigma_m: Array, rig: Rig) -> Mask:
     rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
     across = np.eye(3) - rays[..., :, None] * rays[..., None, :]
     information = np.nansum(across / sigma_m[..., None, None] ** 2, axis=2)
-    return np.asarray(np.linalg.eigvalsh(information)[..., 0] > 1 / _WEAKEST_M**2)
+    return np.asarray(np.linalg.eigvalsh(information)[..., 0] > 1 / WEAKEST_M**2)
 
 
 def missed_px(people: People, rig: Rig) -> Array:

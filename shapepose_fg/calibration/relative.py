@@ -17,7 +17,8 @@ from shapepose_fg.calibration.tracks import Tracks
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.compiled import kernel
 from shapepose_fg.core.decompositions import basis_across
-from shapepose_fg.setup_check.matching import MIN_JOINTS, depths_of_meeting
+from shapepose_fg.setup_check.evidence import KERNEL
+from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS, depths_of_meeting
 
 _LOOK_S = 0.2
 """Interval between compared frames, s: people's joints move by more than a detector's error."""
@@ -28,12 +29,8 @@ _MOST_TRIED = 30
 _JOINTS_A_TRY = 240
 _LEAST_TRY = 60
 """Maximum and minimum number of joints of a pair of tracks for a hypothesis."""
-_RANSAC = 0.02
-"""Maximum residual of an inlier, as a share of a person's size: a detector errs by 3 cm of 170."""
-_GATE = 0.06
+_GATE = 3 * KERNEL
 """Maximum mean residual of tracks of one person, as a share of the person's size."""
-_CLIP = 0.15
-"""Limit of a joint's residual in the mean; larger ones are of other people."""
 _SAMPLES = 60
 """Number of samples of five joints per pair of tracks; two thirds of a person's joints are inliers
 in simulated recordings."""
@@ -84,7 +81,7 @@ class Together:
         total, count = (np.zeros((len(E), len(self.tracks))) for _ in range(2))
         _misses(*self.rays, *self.size, self.rows, self.pair, np.ascontiguousarray(E), total, count)
         enough = count >= 0.5 * self.count
-        return np.where(enough & (count > 0), total / np.maximum(count, 1), _CLIP)
+        return np.where(enough & (count > 0), total / np.maximum(count, 1), GATE)
 
     def chosen(self, miss: Array) -> tuple[Mask, float]:
         """Which pairs of tracks (K,) are one person each, greedily by residual, and their total
@@ -153,7 +150,7 @@ def _guesses(one: Tracks, other: Tracks, seen: Together) -> Array:
         flat_x, flat_y = (
             np.ascontiguousarray(each[both][:, :2] / each[both][:, 2:]) for each in (x, y)
         )
-        agree = _RANSAC * size
+        agree = KERNEL * size
         E, _ = cv2.findEssentialMat(
             flat_x,
             flat_y,
@@ -230,7 +227,7 @@ def refined_pose(R: Array, t: Array, a: Array, b: Array, size: Array) -> tuple[A
         scale = size * np.sqrt((Ea**2).sum(axis=1) + (Eb**2).sum(axis=1))
         return (b * Ea).sum(axis=1) / scale
 
-    usual = max(_RANSAC / 2, float(np.median(np.abs(residuals(np.zeros(5))))))
+    usual = max(KERNEL / 2, float(np.median(np.abs(residuals(np.zeros(5))))))
     found = least_squares(residuals, np.zeros(5), loss="cauchy", f_scale=usual, max_nfev=_STEPS)
     return moved(found.x)
 
@@ -284,7 +281,7 @@ def _misses(
                     abs(dot) / (np.sqrt(square) * size_b[other] + 1e-12),
                     abs(dot) / (np.sqrt(other_square) * size_a[one] + 1e-12),
                 )
-                miss += min(away, _CLIP)
+                miss += min(away, GATE)
                 seen += 1
             if seen >= MIN_JOINTS:
                 total[h, pair[n]] += miss / seen

@@ -20,10 +20,12 @@ _SHORTEST_S = 0.4
 _SMOOTH_S = 0.05
 """Standard deviation of the smoothing kernel of tracks, s."""
 FAST_S = 1.0
-"""Time scale above which changes are removed from residuals, s: errors of detectors and cameras are
-correlated."""
-_BLOCK_S = 1.0
-"""Duration within which errors count as one correlated error, s."""
+"""Time scale above which changes are removed from residuals, s, and duration within which errors
+count as one: errors of detectors and cameras are correlated."""
+FASTEST = 2.0
+"""Maximum speed of a joint, statures per second; faster ones are identity switches."""
+LEAST_MISS = 0.004
+"""Minimum error of a detector as a share of a person's size: 7 mm."""
 
 _SAME_TIME = 1e-3
 """Difference of times that is ignored, frames."""
@@ -231,4 +233,4 @@ def block_frames(fps: float, lasts: float) -> float:
     """Number of frames that count as one correlated error; fewer in short recordings of `lasts`
     frames.
     """
-    return max(1.0, min(_BLOCK_S * fps, lasts / 12))
+    return max(1.0, min(FAST_S * fps, lasts / 12))

@@ -45,7 +45,7 @@ carriers."""
 _REACHES_M = (0.5, 0.15, 0.15)
 """Maximum distance of a used detection from its joint, by round, m; the odometry may be wrong at
 first."""
-_WEAKEST_M = 0.15
+WEAKEST_M = 0.15
 """Maximum standard deviation, in the worst direction, of a joint used for camera poses, m."""
 _SAME_PERSON = 2.5
 """Number of joints of a person in a view that count as one, because their errors are correlated."""
@@ -55,7 +55,7 @@ whose detector has Shelf's statistics (0.8 after a frame, 0.35 after a second, 0
 _AVERAGED_S = 1.0
 """Time, s, over which an odometry of 1 % is more accurate than people's constraints on a pose;
 errors average out over it."""
-_ANYWHERE_M = 10.0
+ANYWHERE_M = 10.0
 """Standard deviation of a weak prior on joints, m; one behind its cameras would make the system
 singular."""
 _GAUGE = np.diag([1e-5**2] * 3 + [1e-4**2] * 3)
@@ -276,7 +276,7 @@ class TrajectoryGraph:
         there = chosen.any(axis=2)
         joints = self._joint_keys[there].tolist()
         deque(map(self.values.insert, joints, points[there]), maxlen=0)
-        near = isotropic(3, _ANYWHERE_M)
+        near = isotropic(3, ANYWHERE_M)
         deque(map(self.graph.addPriorPoint3, joints, points[there], [near] * len(joints)), maxlen=0)
         for factor in self._own(self, self.keys) if self._own is not None else ():
             self.graph.add(factor)
@@ -297,7 +297,7 @@ class TrajectoryGraph:
         depth = views.pixels(evidence.target)[1]
         away_m = np.linalg.norm(evidence.residual_px, axis=-1) * depth / views.focal[:, None]
         with np.errstate(invalid="ignore"):
-            chosen = rows.seen & (away_m < reach_m) & (evidence.sigma_m < _WEAKEST_M)[..., None]
+            chosen = rows.seen & (away_m < reach_m) & (evidence.sigma_m < WEAKEST_M)[..., None]
         on = self.mounted.rig.carrier
         groups = np.sum(
             [chosen[..., on == each].any(axis=-1) for each in np.unique(on).tolist()], axis=0

@@ -42,8 +42,6 @@ _TRIES = 40
 correct."""
 _ROUNDS = 6
 """Number of rounds of matching and fitting."""
-_WIDTH = 0.03
-"""Width of the Cauchy kernel, as a share of a person's size in the picture."""
 _STEPS = 4
 """Number of steps between matchings."""
 CORNER = np.array([-0.5, -0.5])
@@ -244,7 +242,7 @@ def refined(others: Others, seen: Sightings, camera: Pinhole, columns: list[int]
         points, xy = others.points[found.person], seen.xy[found.sighting]
         both = ~np.isnan(points[..., 0]) & ~np.isnan(xy[..., 0])
         size = np.broadcast_to(seen.size_px[found.sighting][:, None], both.shape)[both]
-        camera = _solved(points[both], xy[both], _WIDTH * size, camera, columns)
+        camera = _solved(points[both], xy[both], ERROR * size, camera, columns)
     return camera
 
 
@@ -271,8 +269,19 @@ def _solved(
         behind = (place[..., 2] <= 0).any()
         return np.full(xy.size, np.inf) if behind else np.ravel((at[:, 0, 0] - xy) / width_px)
 
-    start = np.zeros(len(columns))
-    views = moved(least_squares(residuals, start, loss="cauchy", x_scale="jac", max_nfev=_STEPS).x)
+    def slopes(x: Array) -> Array:
+        J = by_parameters(*seen_by(points, moved(x)), moved(x))[:, 0, 0][..., columns]
+        return (J / width_px[..., None]).reshape(-1, len(columns))
+
+    found = least_squares(
+        residuals,
+        np.zeros(len(columns)),
+        slopes,  # type: ignore[arg-type]
+        loss="cauchy",
+        x_scale="jac",
+        max_nfev=_STEPS,
+    )
+    views = moved(found.x)
     return Pinhole(views.K[0], views.cTw[0])
 
 

@@ -49,25 +49,26 @@ _STRIDE = 4
 _MOST_PEOPLE = 400
 """Number of people sufficient for estimating an offset."""
 _LEAST_FRAMES = 40
-"""Minimum number of frames. In fewer, people hardly move enough to separate a small time offset
-from chance: in 20 frames of the built-in scene a correct camera looked 4 frames early."""
+"""Minimum number of frames for time offsets, and number sufficient for mistakes of all cameras. In
+fewer, people hardly move enough to separate a small time offset from chance: in 20 frames of the
+built-in scene a correct camera looked 4 frames early."""
 
 
 @dataclass(frozen=True)
 class Lag:
     """Time offset of a camera."""
 
-    frames: int
+    frames: int = 0
     """The camera shows at t + frames what the others show at frame t; positive is late."""
-    gain: float
+    gain: float = 0.0
     """Mean decrease of the joints' errors, as a share of people's size."""
-    likely: float
+    likely: float = 0.0
     """Gain in log-likelihood."""
-    agreement: float
+    agreement: float = 0.0
     """The gain relative to the motion of the joints within the offset: near 1 for a true offset,
     near -1 without any, 0 without motion. The minimum over both halves of the frames: a true offset
     is in both, while in one of them people may come by chance to where they were."""
-    followed: float
+    followed: float = 0.0
     """Agreement of people seen near enough both with and without the offset; when people occlude
     each other, others are near by chance at some offset."""
 
@@ -84,7 +85,7 @@ class Lag:
         return self.exceeds(1.0)
 
 
-NONE = Lag(0, 0.0, 0.0, 0.0, 0.0)
+NONE = Lag()
 
 
 def lags(look: Look) -> list[Lag]:
@@ -175,7 +176,7 @@ def _compare(
     way = np.where(np.isnan(way), GATE, np.minimum(way, GATE))
     both = ~np.isnan(error_a) & ~np.isnan(error_b)
     if both.sum() < 10 * MIN_JOINTS:
-        return Lag(lag, 0.0, 0.0, 0.0, 0.0)
+        return Lag(lag)
     better, way = np.where(both, error_a - error_b, 0.0), np.where(both, way, 0.0)
     late = frame[usable] > np.median(frame[usable])
     halves = [(float(better[half].sum()), float(way[half].sum())) for half in (late, ~late)]
@@ -224,8 +225,6 @@ GAIN, _LIKELY = 0.12, 10.0
 """Minimum gain of a change in a camera's score, and in log-likelihood."""
 _EXPLAINED = 0.65
 """Total score above which no other explanation than detector errors is searched for."""
-_FEW = 40
-"""Number of frames sufficient for mistakes common to all cameras."""
 _PRICE = 0.02
 """Minimum gain in score per fitted parameter: half a centimetre of a person's joints is 0.02."""
 _SLIGHT = 0.08
@@ -275,7 +274,7 @@ def mistake_of_cameras(look: Look, rng: np.random.Generator) -> Change | None:
     best = max((gain for gain, _ in found), default=0.0) + look.total
     poor = [view for view in weak if look.beside_biases(view) < GOOD]
     if len(poor) > look.view_count / 2 and best < _EXPLAINED:
-        few = replace(look, evidence=look.evidence.thinned(_FEW))
+        few = replace(look, evidence=look.evidence.thinned(_LEAST_FRAMES))
         found += [
             (
                 judged(few, change),

@@ -19,6 +19,8 @@ from shapepose_fg.proposal.people_2d import group_people
 
 MIN_JOINTS = 5
 """Minimum number of core joints in view for a person to be used."""
+MIN_SIGHTINGS = 20
+"""Minimum number of people seen for any statement on a camera or on the order of joints."""
 _STATURE_PER_SPREAD = 3.4
 """Stature of a standing person over the root of the joints' summed variances: 1 / 0.29 for a
 uniform spread."""
