@@ -36,7 +36,8 @@ _SAMPLES = 60
 in simulated recordings."""
 _FINALISTS = 6
 """Number of hypotheses that are refined."""
-_STEPS = 8
+_STEPS = 12
+"""Maximum number of evaluations for a hypothesis."""
 
 
 @dataclass(frozen=True)

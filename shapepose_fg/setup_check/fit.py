@@ -40,7 +40,7 @@ _MOST_ZOOM = 5.0
 _TRIES = 40
 """Number of pairs of a person and a sighting that are tried; with two people, half of them are
 correct."""
-_ROUNDS = 6
+_ROUNDS = 4
 """Number of rounds of matching and fitting."""
 _STEPS = 4
 """Number of steps between matchings."""
