@@ -373,7 +373,7 @@ MALFORMED = {
     "Pose2Sim": (
         "matrix = [[",
         "matrix = [[1.0, ",
-        'camera "cam_0": matrix must hold 9 numbers, got 10; write',
+        'camera "cam_0": matrix must have rows of equal length; write',
     ),
     "AniPose": ("rotation = [", "rotation = [[", "cannot be read as TOML"),
     "FreeMoCap": (
