@@ -20,6 +20,7 @@ from shapepose_fg.calibration.people import People
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.decompositions import nearest_rotation
+from shapepose_fg.estimation.trajectory_graph import ANYWHERE_M, optimised
 from shapepose_fg.setup_check import fit
 
 LENS = [9, 10, 11, 12]
@@ -30,9 +31,6 @@ _HELD = 1e-6
 _HELD_PX = 0.1
 """Standard deviation added to those of intrinsics and distortion, pixels; tighter constraints on
 single parameters would slow the convergence of shared ones."""
-_ANYWHERE_M = 10.0
-_STEPS = 6
-_ENOUGH = 1e-4
 _PRIOR_WIDTH = 4.0
 """Width of the robust kernel of a camera's prior, in standard deviations of six parameters; a
 bumped camera must not pull the rig."""
@@ -138,17 +136,9 @@ def adjust(
         priors.add(gtsam.PriorFactorCal3DS2(C(each), _lens(before, camera), noise))
     priors.addPriorPose3(B(0), gtsam.Pose3(), diagonal(np.full(6, _HELD)))
     last = [B(0), *(letter(each) for letter in (X, C) for each in range(len(start)))]
-    order = gtsam.Ordering()
-    for each in [*dict.fromkeys(joints), *last]:
-        order.push_back(each)
-    # Ceres' damping uses each parameter's own information, since pixels and metres are mixed.
-    params = gtsam.LevenbergMarquardtParams.CeresDefaults()
-    params.setMaxIterations(_STEPS)
-    params.setRelativeErrorTol(_ENOUGH)
-    params.setOrdering(order)
     both = gtsam.NonlinearFactorGraph(graph)
     both.push_back(priors)
-    found = gtsam.LevenbergMarquardtOptimizer(both, values, params).optimize()
+    found = optimised(both, values, [*dict.fromkeys(joints), *last])
     cameras = [
         _camera(camera, found, view, freedoms[view]) for view, camera in enumerate(start.cameras)
     ]
@@ -160,7 +150,7 @@ def adjust(
     depth = np.moveaxis(rig.project(moved)[1], 0, 2)[person, joint, view]
     for each in dict.fromkeys(joints[place] for place in np.flatnonzero(depth <= 0).tolist()):
         graph.addPriorPoint3(
-            each, found.atPoint3(each), gtsam.noiseModel.Isotropic.Sigma(3, _ANYWHERE_M)
+            each, found.atPoint3(each), gtsam.noiseModel.Isotropic.Sigma(3, ANYWHERE_M)
         )
     information = (
         _information(graph, found, list(dict.fromkeys(joints)), view.tolist(), rig) / dilution
@@ -221,9 +211,7 @@ def _information(
     rig: Rig,
 ) -> Array:
     """(V Q, V Q) information about the cameras' parameters, joints eliminated."""
-    first, last = gtsam.Ordering(), gtsam.Ordering()
-    for each in joints:
-        first.push_back(each)
+    first, last = gtsam.Ordering(joints), gtsam.Ordering()
     # Map GTSAM's parameters to ours; a camera without sightings is in no factor.
     seen, count = sorted(set(views)), len(rig)
     to = np.zeros((len(seen) * 15, count * Q))

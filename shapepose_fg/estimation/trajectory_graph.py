@@ -207,15 +207,7 @@ class TrajectoryGraph:
                 return
             both = gtsam.NonlinearFactorGraph(anchors)
             both.push_back(self.graph)
-            # Ceres' damping uses each parameter's own information, since radians and metres are
-            # mixed.
-            parameters = gtsam.LevenbergMarquardtParams.CeresDefaults()
-            parameters.setMaxIterations(10)
-            parameters.setRelativeErrorTol(1e-4)
-            parameters.setOrdering(gtsam.Ordering([*joints, *self.keys.ravel().tolist()]))
-            self.values = gtsam.LevenbergMarquardtOptimizer(
-                both, self.values, parameters
-            ).optimize()
+            self.values = optimised(both, self.values, [*joints, *self.keys.ravel().tolist()])
             self.poses = poses_of(self.values, self.keys)
 
     def of_poses(self) -> list[gtsam.NonlinearFactor]:
@@ -303,6 +295,19 @@ class TrajectoryGraph:
             [chosen[..., on == each].any(axis=-1) for each in np.unique(on).tolist()], axis=0
         )
         return chosen & (groups >= 2)[..., None], evidence.target, sigmas
+
+
+def optimised(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, order: Sequence[int]
+) -> gtsam.Values:
+    """The solution by Levenberg-Marquardt; `order` are the keys in order of elimination."""
+    # Ceres' damping uses each parameter's own information, since radians, metres and pixels are
+    # mixed.
+    parameters = gtsam.LevenbergMarquardtParams.CeresDefaults()
+    parameters.setMaxIterations(10)
+    parameters.setRelativeErrorTol(1e-4)
+    parameters.setOrdering(gtsam.Ordering(order))
+    return gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
 
 
 def poses_of(values: gtsam.Values, keys: NDArray[np.int64]) -> Array:
