@@ -129,8 +129,7 @@ class Refinement:
 
     def sigma(self) -> dict[str, Array]:
         """(V,) standard deviations of what `change` gives, in the same units."""
-        each = {name: self.adjusted.sigma(PARTS[name]) * unit for name, unit in _UNITS.items()}
-        return each
+        return {name: self.adjusted.sigma(PARTS[name]) * unit for name, unit in _UNITS.items()}
 
     def as_dict(self) -> dict[str, Any]:
         """All figures as plain values."""
