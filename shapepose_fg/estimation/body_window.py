@@ -50,9 +50,10 @@ _PLACED_M = 0.05
 _STRAYS_M = 0.07
 """Standard deviation, m, of an unseen joint of the body at which its own deviation is as large:
 errors of poses that nothing shows are larger than their Gaussian when they are large."""
-LASTS = 1.1
-"""Factor on the covariances of a window, besides how much it averages (`Marginals.lasting`).
-Measured as that with which the 95 % regions hold in most recordings (docs/evaluation.md)."""
+_NEW, _LASTING = 0.5, 1.25
+"""Factors on the covariances that new and lasting errors of detections leave (`Marginals.lasting`),
+since residuals show fewer of the lasting ones. With them 95 % regions hold in most recordings
+(docs/evaluation/covariances.md)."""
 _LOOKS = 8
 """Number of frames, evenly over the window, from which it is taken how much it averages."""
 _STEPS, _SETTLED_M = 8, 2e-3
@@ -489,13 +490,21 @@ class Marginals:
 
         Errors that are new in every frame are averaged over time, and leave the covariances of the
         window. Those that last are not, and leave what the same views cause in a frame by itself.
-        The geometric mean of both is reported.
+        The share that lasts is measured: it is the correlation of a detection's residuals in
+        different frames of the window.
         """
         window, last = self.window, self.window.last
+        used = np.asarray(last.evidence.inlier)
+        sigma = np.where(used, window.sigmas_px, np.inf)[..., None]
+        ratio = np.where(used[..., None], last.evidence.residual_px, 0.0) / sigma
+        total, squares = ratio.sum(axis=0) ** 2, (ratio**2).sum(axis=0)
+        others = used.sum(axis=0)[..., None] - 1
+        pairs = np.where(others > 0, (total - squares) / np.maximum(others, 1), 0.0).sum()
+        share = np.clip(pairs / max(np.where(others > 0, squares, 0.0).sum(), 1e-9), 0.0, 1.0)
+        if not others.max() > 0:
+            return _LASTING
         some = slice(None, None, max(len(window) // _LOOKS, 1))
-        seen = np.asarray(last.evidence.inlier.any(axis=-1))[some]
-        if not seen.any():
-            return LASTS
+        seen = np.asarray(used.any(axis=-1))[some]
         slope, gain = self.slopes[some, ..., 10:], last.gain[some]
         variance = window.variance[some, ..., None, None]
         (T, J), N = seen.shape, slope.shape[-1]
@@ -508,7 +517,8 @@ class Marginals:
         kept = np.eye(3) - gain
         alone = np.trace(kept @ of_body @ kept.mT + variance * kept, axis1=-2, axis2=-1)
         over_time = np.trace(self.joints()[some], axis1=-2, axis2=-1)
-        return LASTS * float(np.exp(np.log(alone / over_time)[seen].mean() / 2))
+        mean = np.exp(np.log(alone / over_time)[seen].mean()) if seen.any() else 1.0
+        return float(_NEW * (1 - share) + _LASTING * share * mean)
 
     def velocities(self, joints: Index | slice = slice(None)) -> Array:
         """(T, J, 3, 3) covariances of the velocities of J `joints` as in `in_time.velocities`,
