@@ -47,9 +47,9 @@ def option(group: str, text: str, default: Any = None, *names: str, **more: Any)
     return field(default=default, metadata={"typer": typer.Option(*names, **how | more)})
 
 
-def argument(metavar: str, text: str) -> Any:
+def argument(metavar: str, text: str, default: Any = MISSING) -> Any:
     """Declare a positional argument of a command."""
-    return field(metadata={"typer": typer.Argument(metavar=metavar, help=text)})
+    return field(default=default, metadata={"typer": typer.Argument(metavar=metavar, help=text)})
 
 
 class Preset(StrEnum):

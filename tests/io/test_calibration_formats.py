@@ -427,7 +427,7 @@ def test_malformed_panoptic(tmp_path):
     content = json.loads(panoptic(tmp_path).read_text())
     content["cameras"][1]["R"][0][0] += 0.5
     path = written(tmp_path / "c.json", json.dumps(content))
-    refuses(path, "cameras[1]: the rotation of R is not orthonormal")
+    refuses(path, 'camera "1": the rotation of R is not orthonormal')
 
 
 def test_malformed_multiview(tmp_path):
