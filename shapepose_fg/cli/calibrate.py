@@ -283,7 +283,7 @@ def _with_moving(
     """
     from shapepose_fg.calibration.moving_camera import Filmed, Placed
     from shapepose_fg.core.camera import Rig
-    from shapepose_fg.io.calibration import carried
+    from shapepose_fg.io.calibration import with_first_poses
     from shapepose_fg.io.recording import own_times
 
     rig = found.rig
@@ -314,7 +314,7 @@ def _with_moving(
     begin = np.nanmin(time_s) if most > 0 else 0.0
     moving = tuple(replace(each, time_s=each.time_s - begin) for each in trajectories.values())
     moved = Rig(tuple(cameras[name] for name in whole.names), "z", trajectories=moving)
-    return carried(moved), time_s - begin, starts
+    return with_first_poses(moved), time_s - begin, starts
 
 
 _CAPTION = (

@@ -131,7 +131,7 @@ def solve_window(
         # Bodies: the Theta step.
         step = BodyStep(fitter, moving, config)
         targets = step.targets(evidence, state.enough[rows])
-        body, anew = step.fit_changed(targets, state.fit.rows(rows), state.told.rows(rows))
+        body, anew = step.fit_changed(targets, state.fit.rows(rows), state.targets.rows(rows))
         fitted = evidence.target
         wrong = disagreement(evidence, body) > config.refine.contradiction
         if wrong.any():
@@ -145,7 +145,7 @@ def solve_window(
                 body.with_rows(again, step.fit(targets, body, again)),
                 np.union1d(anew, again),
             )
-        state.told.put(rows[anew], targets.rows(anew))
+        state.targets.put(rows[anew], targets.rows(anew))
         # delta of Eq. 4; joints that their views do not determine need the body despite a confident
         # single view.
         pulled = mean_confidence(observed, evidence.inlier) <= config.graph.rho_3d

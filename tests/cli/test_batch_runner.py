@@ -54,7 +54,7 @@ class Stage:
 class FakeLeader:
     def __init__(self, stage: Stage, assignment: Assignment) -> None:
         self.stage, self.assignment, self.began = stage, assignment, 0.0
-        self.told, tell = Pipe(duplex=False)
+        self.messages, tell = Pipe(duplex=False)
         if assignment.name in stage.frameless:
             stage.frameless.remove(assignment.name)
         else:
@@ -65,16 +65,16 @@ class FakeLeader:
         self.asked = False
 
     def next(self):
-        return self.told.recv()
+        return self.messages.recv()
 
     def ask_to_stop(self) -> None:
         self.asked = True
 
     def end(self):
         self.stage.alive -= 1
-        if self.asked and self.told.poll():
-            while self.told.poll():
-                last = self.told.recv()
+        if self.asked and self.messages.poll():
+            while self.messages.poll():
+                last = self.messages.recv()
             return last if isinstance(last, Ended) else None
         return None
 

@@ -103,8 +103,8 @@ class BatchRunner:
                     leaders.append(Leader(Assignment(entry.name, entry.request, folder, *how)))
                 if len(leaders) == 0:
                     break
-                for ready in wait([leader.told for leader in leaders]):
-                    leader = next(each for each in leaders if each.told is ready)
+                for ready in wait([leader.messages for leader in leaders]):
+                    leader = next(each for each in leaders if each.messages is ready)
                     if self._heard(leader, batch_status, watcher):
                         leaders.remove(leader)
         finally:
@@ -142,21 +142,21 @@ class BatchRunner:
 
     def _heard(self, leader: "Leader", batch_status: BatchStatus, watcher: Bars) -> bool:
         """Process the next message of a coordinator; returns whether it has ended."""
-        name, told = leader.assignment.name, leader.next()
-        if isinstance(told, tuple):
+        name, message = leader.assignment.name, leader.next()
+        if isinstance(message, tuple):
             if batch_status.of[name].anew:  # what is saved from now on belongs to this run
                 batch_status.set(name, replace(batch_status.of[name], anew=False))
-            watcher.frames(name, *told)
+            watcher.frames(name, *message)
             return False
         leader.end()
-        if isinstance(told, Ended):
-            self._done(leader, told, batch_status)
+        if isinstance(message, Ended):
+            self._done(leader, message, batch_status)
             watcher.ended(name, failed=None, again=False)
         else:
             # Maximum number of attempts for a recording.
-            now = batch_status.of[name].failed(told, time.monotonic() - leader.began, 2)
+            now = batch_status.of[name].failed(message, time.monotonic() - leader.began, 2)
             batch_status.set(name, now)
-            watcher.ended(name, failed=told, again=now.status == "waiting")
+            watcher.ended(name, failed=message, again=now.status == "waiting")
         return True
 
     def _done(self, leader: "Leader", found: Ended, batch_status: BatchStatus) -> None:
@@ -173,7 +173,7 @@ class Leader:
         self.assignment = assignment
         self.began = time.monotonic()
         """Start time, by `time.monotonic`."""
-        self.told, tell = Pipe(duplex=False)
+        self.messages, tell = Pipe(duplex=False)
         """Messages of the process: (finished frames, all frames); at the end `Ended`, or the reason
         of the failure."""
         self._process = Processes(1, _tell_by, tell)
@@ -184,7 +184,7 @@ class Leader:
     def next(self) -> tuple[int, int] | Ended | str:
         """The next message; if the process has died, the reason."""
         try:
-            return self.told.recv()
+            return self.messages.recv()
         except (EOFError, OSError):
             return "its process was killed; there may be too little memory"
 
@@ -197,12 +197,12 @@ class Leader:
         self._process.shutdown()
         found = None
         try:
-            while self.told.poll():
-                told = self.told.recv()
-                found = told if isinstance(told, Ended) else found
+            while self.messages.poll():
+                message = self.messages.recv()
+                found = message if isinstance(message, Ended) else found
         except (EOFError, OSError):
             pass
-        self.told.close()
+        self.messages.close()
         return found
 
     def ask_to_stop(self) -> None:
@@ -233,7 +233,7 @@ def _lead(assignment: Assignment) -> None:
         reconfigure: Any = getattr(stream, "reconfigure", lambda **_: None)
         reconfigure(encoding="utf-8", line_buffering=True)
     execution = Execution(
-        None, assignment.cluster, assignment.sharing, progress=lambda *told: _tell.send(told)
+        None, assignment.cluster, assignment.sharing, progress=lambda *message: _tell.send(message)
     )
     try:
         with stoppable():
