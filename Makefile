@@ -7,8 +7,9 @@ BIN := $(VENV)/bin
 JOBS ?= 2
 # What Python and pytest make of the sources is kept, or each process of the tests makes it anew.
 export PYTHONDONTWRITEBYTECODE :=
-# One thread each, too. A file's tests share what they have made: one process runs them.
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) --dist loadfile
+# One thread each, too. A file's tests share what they have made: one process runs them, in the
+# order of tests/conftest.py.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
 .PHONY: demo test test-all lint check format docs benchmark install clean
 .DEFAULT_GOAL := demo

@@ -12,7 +12,7 @@ import typer
 
 from shapepose_fg.cli.found_cameras import (
     MOST_S,
-    check_most,
+    Most,
     from_zero,
     report_option,
     show_clocks,
@@ -23,6 +23,7 @@ from shapepose_fg.cli.options import (
     RESULT,
     TIME,
     RateOptions,
+    Stature,
     grouped,
     json_option,
     names_of,
@@ -113,7 +114,7 @@ def calibrate(
         "Refine focal lengths; prior sigma 2 % from a calibration, 20 % from a field of view.",
         False,
     ),
-    stature: float | None = option(
+    stature: Stature | None = option(
         _CAMERAS, "Median stature of the people, metres; by default 1.70, of adults."
     ),
     distance: list[str] | None = option(
@@ -143,7 +144,7 @@ def calibrate(
             "too."
         ),
     ),
-    most: float = option(TIME, "Largest offset between cameras for --times, seconds.", MOST_S),
+    most: Most = option(TIME, "Largest offset between cameras for --times, seconds.", MOST_S),
     report: Path | None = report_option(),
     as_json: bool = json_option(),
 ) -> None:
@@ -162,9 +163,6 @@ def calibrate(
     from shapepose_fg.io.recording import own_times
     from shapepose_fg.io.timestamps import write_timestamps
 
-    if stature is not None and not 0.5 <= stature <= 2.5:
-        raise InputError(f"--stature {stature:g}: must be 0.5 to 2.5 metres")
-    check_most(most)
     within = _within(tolerance)
     if times is not None and rate.timestamps is not None:
         raise InputError(

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -11,8 +11,8 @@ from shapepose_fg.cli.options import (
     INPUT,
     REQUIRED,
     RESULT,
+    Hertz,
     argument,
-    check_fps,
     frames_option,
     grouped,
     option,
@@ -23,8 +23,6 @@ from shapepose_fg.core.errors import InputError
 
 if TYPE_CHECKING:
     from shapepose_fg.evaluation.score import Score
-
-_FORMATS = ("text", "markdown", "latex", "json")
 
 
 @grouped
@@ -43,9 +41,11 @@ def evaluate(
     up: str | None = option(
         INPUT, "World axis that points up, for AMASS, if cameras.json is missing.", metavar="AXIS"
     ),
-    fps: float | None = option(INPUT, "Frame rate of the results, Hz, to which AMASS is thinned."),
+    fps: Hertz | None = option(INPUT, "Frame rate of the results, Hz, to which AMASS is thinned."),
     body: Path | None = option(INPUT, "Body model of AMASS's shapes."),
-    format: str = option(RESULT, "text, markdown, latex or json.", "text"),
+    format: Literal["text", "markdown", "latex", "json"] = option(
+        RESULT, "text, markdown, latex or json.", "text"
+    ),
 ) -> None:
     """Score results against a truth: PCP, MPJPE, PA-MPJPE, MOTA, IDF1, HOTA, and the coverage of
     the covariances.
@@ -59,11 +59,8 @@ def evaluate(
     from shapepose_fg.evaluation.truth import read_people
     from shapepose_fg.io.calibration import read_rig
 
-    if format not in _FORMATS:
-        raise InputError(f"--format {format}: must be one of {' '.join(_FORMATS)}")
     if up is not None and up not in get_args(Axis):
         raise InputError(f"--up {up}: must be one of {' '.join(get_args(Axis))}")
-    check_fps(fps)
     cameras = results[0] / CAMERAS
     axis: Any = up or (read_rig(cameras).up if cameras.is_file() else None)
     how: Any = {"up": axis, "fps": fps, "body": body}

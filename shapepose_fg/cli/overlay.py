@@ -4,7 +4,9 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+from annotated_types import Interval
 
 from shapepose_fg.cli.options import (
     DRAW,
@@ -49,7 +51,9 @@ class Drawn:
     points: bool = option(
         DRAW, "Draw the 2D detections; red crosses were not used.", True, "--points/--no-points"
     )
-    width: int = option(DRAW, "Width of the grid, pixels.", 1920)
+    width: Annotated[int, Interval(ge=160, le=7680)] = option(
+        DRAW, "Width of the grid, pixels.", 1920
+    )
 
 
 @grouped
@@ -71,8 +75,6 @@ def overlay(
     inferred; squares are 2D detections that were used, red crosses those that were not. By default,
     the videos are those in which `detect` ran.
     """
-    if not 160 <= drawn.width <= 7680:
-        raise InputError(f"--width {drawn.width}: must be 160 to 7680 pixels")
     if drawn.stills is not None and frames is not None:
         raise InputError("--stills and --frames: both select frames; give one of them")
     from shapepose_fg.core.camera import choose

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from shapepose_fg.calibration import refinement
 from shapepose_fg.calibration.adjustment import MOVE, TURN, Freedom, adjust, misfit
 from shapepose_fg.calibration.people import Footage
 from shapepose_fg.calibration.refinement import dilution, refine
@@ -228,8 +229,11 @@ def test_places_and_names_are_looked_at_first(rig, recording, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_the_command_writes_cameras_and_says_what_changed(rig, recording, tmp_path, capsys):
+def test_the_command_writes_cameras_and_says_what_changed(
+    rig, recording, tmp_path, capsys, monkeypatch, once
+):
     """Of a Pose2Sim project, and of its files one by one."""
+    monkeypatch.setattr(refinement, "refine", once(refine))
     five_seconds, new = replace(recording, frames=recording.frames[:125]), tmp_path / "new.json"
     project = pose2sim_project(disturbed(rig, 4), five_seconds, tmp_path / "walk")
     page = ["--report", tmp_path / "page.html"]
