@@ -242,11 +242,17 @@ class Start:
             "sigma_move_mm": round(1e3 * self.sigma_move_m, 1),
         }
 
-    def tolerated(self) -> str:
-        """Degrees and mm, rounded up, that two standard deviations of the poses do not exceed."""
-        sigmas = (20 * self.sigma_turn_deg, 200 * self.sigma_move_m)
-        degrees, cm = np.ceil(sigmas)
-        return f"{degrees / 10:g},{10 * cm:g}"
+    def refusal(self, name: str, most_deg: float, most_m: float) -> str | None:
+        """A sentence on camera `name`, with the cure, if two standard deviations of its poses
+        exceed `most_deg` degrees or `most_m` metres; else None.
+        """
+        if 2 * self.sigma_turn_deg <= most_deg and 2 * self.sigma_move_m <= most_m:
+            return None
+        return (
+            f"camera {name}: its poses are known to {self.within()} only (two sigma), but "
+            f"{most_deg:g} degrees and {1e3 * most_m:g} mm are asked; calibrate the lenses, film "
+            "two people, or accept the cameras as they are"
+        )
 
     def within(self) -> str:
         """Two standard deviations of the poses, in words."""
@@ -288,16 +294,13 @@ class Filmed:
         placed: Placed,
         most_s: float,
         focal: bool,
-        most_deg: float,
-        most_m: float,
         sigma_scale: float = 0.0,
     ) -> Start:
         """The start on which most people agree, up to `most_s` from the fixed cameras' clock;
         `focal`: whether the focal length and the principal point are unknown, too; `sigma_scale`:
         standard deviation of the world's scale, as a share.
 
-        Raises Undetermined, with a sentence, if it is ambiguous, or if two standard deviations of
-        the poses exceed `most_deg` degrees or `most_m` metres.
+        Raises Undetermined, with a sentence, if it is ambiguous.
         """
         cure = (
             "film the people whom the other cameras see for half a minute while they walk about, "
@@ -324,13 +327,6 @@ class Filmed:
         others = [each.agreeing for each in best[1:] if self._differ(each, first)]
         if first.agreeing < _LEAST_LEAD * max(others, default=0.0):
             raise refuse("two starts of its trajectory agree with the people about equally well")
-        if 2 * first.sigma_turn_deg > most_deg or 2 * first.sigma_move_m > most_m:
-            problem = (
-                f"camera {self.camera.name}: its poses are known to {first.within()} only (two "
-                f"sigma), but {most_deg:g} degrees and {1e3 * most_m:g} mm are asked; calibrate "
-                f"the lenses, film two people, or accept this with --tolerance {first.tolerated()}"
-            )
-            raise Undetermined((problem,))
         return first
 
     def _differ(self, one: Start, other: Start) -> bool:

@@ -207,15 +207,23 @@ def calibrate(
                 rate,
                 0.0 if times is None else most,
                 guessed if seen.calibration is None else set(whole.names) if focal else set(),
-                within,
             )
         except Undetermined as error:
             note(*error.problems)
             raise typer.Exit(1) from None
     note(*found.notes)
+    refused = [each for name, start in starts.items() if (each := start.refusal(name, *within))]
+    if refused:
+        output, times = (
+            each and each.with_name(f"{each.stem}.refused{each.suffix}") for each in (output, times)
+        )
     (write_pose2sim if form == "pose2sim" else write_rig)(whole, output)
     if times is not None and clocks is not None:
         write_timestamps(times, whole.names, time_s)
+    if refused:
+        kept = f"--calibration {output}" + f" --timestamps {times}" * (clocks is not None)
+        note(*refused, f"they are kept, so that they can be accepted: {kept}")
+        raise typer.Exit(1)
     heads, rows = _figures(found, focal)
     lines = [_CAPTION, *_world(found, stature, distance or [])]
     if report is not None:
@@ -271,7 +279,6 @@ def _with_moving(
     rate: RateOptions,
     most: float,
     guessed: set[str],
-    within: tuple[float, float],
 ) -> "tuple[Rig, Array, dict[str, Start]]":
     """The rig `whole` with the fixed cameras as calibrated in `rig`, and with moving ones, whose
     start is found, with the lens of those in `guessed`; the times (T, V) of frames, from 0 on; and
@@ -300,7 +307,7 @@ def _with_moving(
             odometry = trajectories[name].from_start(own_s)
             filmed = Filmed.of(own, given.cameras[0], odometry, own_s)
             starts[name] = start = filmed.started(
-                placed, most, name in guessed, *within, found.world.sigma_scale
+                placed, most, name in guessed, found.world.sigma_scale
             )
         cameras[name], trajectories[name] = start.of(given.cameras[0], odometry)
         columns[name] = own_s + start.offset_s
