@@ -103,8 +103,8 @@ class BatchRunner:
                     leaders.append(Leader(Assignment(entry.name, entry.request, folder, *how)))
                 if len(leaders) == 0:
                     break
-                for ready in wait([leader.messages for leader in leaders]):
-                    leader = next(each for each in leaders if each.messages is ready)
+                for ready in wait([leader.told for leader in leaders]):
+                    leader = next(each for each in leaders if each.told is ready)
                     if self._heard(leader, batch_status, watcher):
                         leaders.remove(leader)
         finally:
@@ -112,7 +112,7 @@ class BatchRunner:
                 leader.ask_to_stop()
             for leader in leaders:
                 found = leader.end()
-                if found is not None:  # it finished before it was asked to stop
+                if isinstance(found, Ended):  # it finished before it was asked to stop
                     self._done(leader, found, batch_status)
 
     def _next(self, batch_status: BatchStatus, leaders: "Sequence[Leader]") -> Entry | None:
@@ -142,21 +142,21 @@ class BatchRunner:
 
     def _heard(self, leader: "Leader", batch_status: BatchStatus, watcher: Bars) -> bool:
         """Process the next message of a coordinator; returns whether it has ended."""
-        name, message = leader.assignment.name, leader.next()
-        if isinstance(message, tuple):
+        name, told = leader.assignment.name, leader.next()
+        if told is not None:
             if batch_status.of[name].anew:  # what is saved from now on belongs to this run
                 batch_status.set(name, replace(batch_status.of[name], anew=False))
-            watcher.frames(name, *message)
+            watcher.frames(name, *told)
             return False
-        leader.end()
-        if isinstance(message, Ended):
-            self._done(leader, message, batch_status)
+        found = leader.end()
+        if isinstance(found, Ended):
+            self._done(leader, found, batch_status)
             watcher.ended(name, failed=None, again=False)
         else:
             # Maximum number of attempts for a recording.
-            now = batch_status.of[name].failed(message, time.monotonic() - leader.began, 2)
+            now = batch_status.of[name].failed(found, time.monotonic() - leader.began, 2)
             batch_status.set(name, now)
-            watcher.ended(name, failed=message, again=now.status == "waiting")
+            watcher.ended(name, failed=found, again=now.status == "waiting")
         return True
 
     def _done(self, leader: "Leader", found: Ended, batch_status: BatchStatus) -> None:
@@ -173,37 +173,32 @@ class Leader:
         self.assignment = assignment
         self.began = time.monotonic()
         """Start time, by `time.monotonic`."""
-        self.messages, tell = Pipe(duplex=False)
-        """Messages of the process: (finished frames, all frames); at the end `Ended`, or the reason
-        of the failure."""
+        self.told, tell = Pipe(duplex=False)
+        """Messages of the process: (finished frames, all frames). It is closed at the end."""
         self._process = Processes(1, _tell_by, tell)
         tell.close()
         self._pid = self._process.submit(os.getpid)
         self._end = self._process.submit(_lead, assignment)
 
-    def next(self) -> tuple[int, int] | Ended | str:
-        """The next message; if the process has died, the reason."""
+    def next(self) -> tuple[int, int] | None:
+        """The next message; None if the process has ended."""
         try:
-            return self.messages.recv()
+            return self.told.recv()
         except (EOFError, OSError):
-            return "its process was killed; there may be too little memory"
+            return None
 
-    def end(self) -> Ended | None:
-        """Wait for the process to end, and terminate it if necessary; returns the last `Ended`
-        message, if there is one.
+    def end(self) -> Ended | str:
+        """Wait for the process to end, and terminate it if necessary; returns its result, or the
+        reason of its failure.
         """
         # Maximum time for a coordinator to stop, s.
         wait_for([self._end], 20.0)
         self._process.shutdown()
-        found = None
+        self.told.close()
         try:
-            while self.messages.poll():
-                message = self.messages.recv()
-                found = message if isinstance(message, Ended) else found
-        except (EOFError, OSError):
-            pass
-        self.messages.close()
-        return found
+            return self._end.result(0)
+        except (BrokenProcessPool, OSError):
+            return "its process was killed; there may be too little memory"
 
     def ask_to_stop(self) -> None:
         """Ask the process to save finished work and to stop; `end` waits for it."""
@@ -221,8 +216,10 @@ def _tell_by(tell: Connection) -> None:
     _tell = tell
 
 
-def _lead(assignment: Assignment) -> None:
-    """Entry point of a coordinator process; all output is appended to the log of the recording."""
+def _lead(assignment: Assignment) -> Ended | str:
+    """Reconstruct a recording in a coordinator process; returns the result, or the reason of a
+    failure. All output is appended to the log of the recording.
+    """
     use_any_streams()
     log = inside(assignment.folder, LOG)
     with log.open("ab", buffering=0) as stream:
@@ -233,22 +230,23 @@ def _lead(assignment: Assignment) -> None:
         reconfigure: Any = getattr(stream, "reconfigure", lambda **_: None)
         reconfigure(encoding="utf-8", line_buffering=True)
     execution = Execution(
-        None, assignment.cluster, assignment.sharing, progress=lambda *message: _tell.send(message)
+        None, assignment.cluster, assignment.sharing, progress=lambda *told: _tell.send(told)
     )
     try:
         with stoppable():
             known = prepare(assignment.request, assignment.folder)
             again = {"resume": assignment.resume, "restart": assignment.restart, "overwrite": True}
-            _tell.send(carry_out(known, execution, **again))
+            return carry_out(known, execution, **again)
     except Stopped as stop:
         print(f"stopped: {stop.message}", flush=True)
+        return "its process was stopped"
     except InputError as error:
         print(f"error: {error}", flush=True)
-        _tell.send(" ".join(str(error).split()))
+        return " ".join(str(error).split())
     except Exception as error:
         traceback.print_exc()
         words = " ".join(str(error).split())[:300]
-        _tell.send(f"{type(error).__name__}: {words} (details in {log})")
+        return f"{type(error).__name__}: {words} (details in {log})"
     finally:
         _tell.close()
 
