@@ -165,7 +165,7 @@ def _moved_by(people: People, found: Adjusted) -> Array:
     weight = np.where(people.seen, 1 / people.sigma_px, 0.0)[..., None, None]
     by_point, by_camera = weight * (by_place @ views.cTw[:, :, :3]), weight * by_camera
     inverse = np.linalg.pinv(np.einsum("pjvri,pjvrk->pjik", by_point, by_point), hermitian=True)
-    errors = errors.reshape(len(errors), len(rig), -1)[..., :Q]
+    errors = errors.reshape(len(errors), *found.covariance.shape[:2])[..., :Q]
     missed = np.einsum("pjvrq,mvq->mpjvr", by_camera, errors)
     return -np.einsum("pjik,pjvrk,mpjvr->mpji", inverse, by_point, missed, optimize=True)
 

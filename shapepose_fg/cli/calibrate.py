@@ -214,9 +214,8 @@ def calibrate(
     note(*found.notes)
     refused = [each for name, start in starts.items() if (each := start.refusal(name, *within))]
     if refused:
-        output, times = (
-            each and each.with_name(f"{each.stem}.refused{each.suffix}") for each in (output, times)
-        )
+        output = output.with_name(f"{output.stem}.refused{output.suffix}")
+        times = times and times.with_name(f"{times.stem}.refused{times.suffix}")
     (write_pose2sim if form == "pose2sim" else write_rig)(whole, output)
     if times is not None and clocks is not None:
         write_timestamps(times, whole.names, time_s)
