@@ -342,7 +342,7 @@ def _figures(found: "Calibrated", focal: bool) -> tuple[list[str], list[tuple[st
 
 def _world(found: "Calibrated", stature: float | None, distances: list[str]) -> list[str]:
     """Scale, up axis, fit, and how far to trust them, one line each."""
-    from shapepose_fg.calibration.adjustment import MOVE, TURN
+    from shapepose_fg.setup_check.fit import MOVE, TURN
 
     world = found.world
     if distances:

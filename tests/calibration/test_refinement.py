@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from shapepose_fg.calibration import refinement
-from shapepose_fg.calibration.adjustment import MOVE, TURN, Freedom, adjust, misfit
+from shapepose_fg.calibration.adjustment import Freedom, adjust, misfit
 from shapepose_fg.calibration.people import Footage
 from shapepose_fg.calibration.refinement import dilution, refine
 from shapepose_fg.cli.main import main
@@ -21,6 +21,7 @@ from shapepose_fg.io.calibration import read_rig, write_rig
 from shapepose_fg.io.write_detections import write_openpose
 from shapepose_fg.setup_check.diagnosis import build_of
 from shapepose_fg.setup_check.evidence import Look, gather
+from shapepose_fg.setup_check.fit import MOVE, TURN
 from shapepose_fg.setup_check.small_errors import Problem
 from tests.calibration.conftest import FPS, disturbed, off_by
 from tests.setup_check.spoiled_setups import biased, lasting
