@@ -3,12 +3,13 @@ PYTHON ?= python3
 VENV ?= .venv
 PIP_ARGS ?=
 BIN := $(VENV)/bin
-# With more processes than this, the solvers' own threads fight over the cores.
-JOBS ?= 2
+# Three for two cores: a process often waits for the disk, or for programs that it has started.
+JOBS ?= 3
 # What Python and pytest make of the sources is kept, or each process of the tests makes it anew.
 export PYTHONDONTWRITEBYTECODE :=
-# One thread each, too. A file's tests share what they have made: one process runs them.
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) --dist loadfile
+# One thread each, too. A file's tests share what they have made: one process runs them, in the
+# order of tests/conftest.py.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
 .PHONY: demo test test-all lint check format docs benchmark install clean
 .DEFAULT_GOAL := demo
@@ -17,9 +18,9 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) --dist loadfile
 demo: $(VENV)/installed
 	$(BIN)/shapepose-fg demo --output demo
 
-## Run the linter and the fast tests.
+## Run the linter and the fast tests (of some folders only: `make test TESTS=tests/io`).
 test: lint
-	$(PYTEST) -m "not slow"
+	$(PYTEST) -m "not slow" $(TESTS)
 
 ## Run what CI runs: linter, type checker and all tests, with all extras installed (torch among them).
 test-all: check

@@ -13,20 +13,19 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
-from shapepose_fg.calibration.adjustment import Adjusted, changed
+from shapepose_fg.calibration.adjustment import Adjusted
 from shapepose_fg.calibration.from_people import Undetermined
-from shapepose_fg.calibration.people import Footage, People
+from shapepose_fg.calibration.people import MIN_DEPTH_M, Footage, People
 from shapepose_fg.calibration.refinement import dilution
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Camera, Rig, Views
 from shapepose_fg.core.decompositions import nearest_rotation, rigid
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.trajectory import Trajectory
-from shapepose_fg.setup_check.matching import Sightings, median_of
+from shapepose_fg.setup_check.fit import POSE, Q, by_parameters, seen_by
+from shapepose_fg.setup_check.matching import Sightings, follow, median_of
 
 _STEP_S, _LONGEST_S = 0.2, 180.0
 """Time between the moments at which people are placed, and duration used of a longer recording,
@@ -67,9 +66,9 @@ _WIDTH = 2.385
 _RIGID, _LONG_M, _FEWEST = 0.1, 0.25, 3
 """Maximum relative variation of the distance of two joints of a bone, its minimum, m, and minimum
 number of bones that give the distance of a person."""
-_LEAST_DEPTH_M, _SIGMA_M, _MOUNT_RAD = 0.3, 0.03, np.radians(0.5)
-"""Minimum depth, and standard deviation of a detected joint from its position by other cameras, m;
-and that of the principal point of a lens without calibration, as an angle."""
+_SIGMA_M, _MOUNT_RAD = 0.03, np.radians(0.5)
+"""Standard deviation of a detected joint from its position by other cameras, m, and of the
+principal point of a lens without calibration, as an angle."""
 _QUARTERS = rigid(
     Rotation.from_euler("z", [[90 * n] for n in range(4)], degrees=True).as_matrix(),
     np.zeros((4, 3)),
@@ -100,26 +99,19 @@ class Placed:
         cls, time_s: Array, moment: Index, points: Array, spread: Array | None = None
     ) -> "Placed":
         """People at times (P,), linked between consecutive moments."""
-        one, other = list[int](), list[int]()
-        for now in np.unique(moment).tolist():
-            here, there = np.flatnonzero(moment == now), np.flatnonzero(moment == now + 1)
-            if len(there) == 0:
-                continue
-            away = median_of(
-                np.linalg.norm(points[here][:, None] - points[there], axis=-1), _FEWEST
-            )
-            near = away.argmin(axis=1)
-            mutual = away.argmin(axis=0)[near] == np.arange(len(here))
-            mutual &= away.min(axis=1) < _SAME_M
-            one += here[mutual].tolist()
-            other += there[near[mutual]].tolist()
-        links = coo_array((np.ones(len(one)), (one, other)), shape=(len(moment),) * 2)
+
+        def away(one: Index, other: Index) -> Array:
+            far = np.linalg.norm(points[one][:, None] - points[other], axis=-1)
+            return median_of(far, _FEWEST)
+
+        track = follow(moment, away, _SAME_M, 1)
+        order = np.lexsort((moment, track))
+        one, other = (pair[np.diff(track[order]) == 0] for pair in (order[:-1], order[1:]))
         before, after = np.arange(len(moment)), np.arange(len(moment))
         before[other], after[one] = one, other
         lasts = np.maximum(time_s[after] - time_s[before], _STEP_S / 2)[:, None, None]
         velocity = np.nan_to_num((points[after] - points[before]) / lasts)
         spread = np.zeros((0, *points.shape)) if spread is None else spread
-        track = connected_components(links, False)[1]
         return cls(time_s, moment, points, velocity, track, spread)
 
     @classmethod
@@ -166,18 +158,16 @@ def _moved_by(people: People, found: Adjusted) -> Array:
     values, vectors = np.linalg.eigh(square / scale / scale[:, None])
     kept = values > _LEAST_VARIANCE
     errors = (sigma[:, None] * vectors[:, kept] * np.sqrt(values[kept])).T
-    points = np.nan_to_num(people.points)
-    xy, _, by_point = Views.of(rig).project(points)
-    weight = np.where(people.seen, 1 / people.sigma_px, 0.0)[..., None]
-    by_point = np.nan_to_num(by_point) * weight[..., None]
+    views, points = Views.of(rig), np.nan_to_num(people.points)
+    xy, at, by_place = seen_by(points, views)
+    by_camera = by_parameters(xy, at, by_place, views)
+    by_camera[..., POSE] *= -1  # poses are those of the cameras in the world
+    weight = np.where(people.seen, 1 / people.sigma_px, 0.0)[..., None, None]
+    by_point, by_camera = weight * (by_place @ views.cTw[:, :, :3]), weight * by_camera
     inverse = np.linalg.pinv(np.einsum("pjvri,pjvrk->pjik", by_point, by_point), hermitian=True)
-    moved = list[Array]()
-    for error in errors.reshape(len(errors), *found.covariance.shape[:2]):
-        cameras = tuple(map(changed, rig.cameras, _TINY * error))
-        other, *_ = Views.of(replace(rig, cameras=cameras)).project(points)
-        missed = np.nan_to_num(weight * (other - xy) / _TINY)
-        moved.append(-np.einsum("pjik,pjvrk,pjvr->pji", inverse, by_point, missed))
-    return np.reshape(moved, (len(moved), *points.shape))
+    errors = errors.reshape(len(errors), len(rig), -1)[..., :Q]
+    missed = np.einsum("pjvrq,mvq->mpjvr", by_camera, errors)
+    return -np.einsum("pjik,pjvrk,mpjvr->mpji", inverse, by_point, missed, optimize=True)
 
 
 @dataclass(frozen=True)
@@ -407,8 +397,8 @@ class Filmed:
         person = away.argmin(axis=1)
         away = away[np.arange(len(rows)), person]
         inside = (middle > 0).all(axis=1) & (middle < self.camera.image_size).all(axis=1)
-        inside &= depth > _LEAST_DEPTH_M
-        return rows, frame, person, np.where(depth > _LEAST_DEPTH_M, away, np.inf), inside
+        inside &= depth > MIN_DEPTH_M
+        return rows, frame, person, np.where(depth > MIN_DEPTH_M, away, np.inf), inside
 
     def _seen(self, start: Start, placed: Placed, rows: Index, frame: Index) -> Array:
         """(N, J, 3) joints of placed people in the camera, at the times of the frames (N,)."""
@@ -523,7 +513,7 @@ class _Fit:
 
         def data(now: Start, placed: Placed) -> Array:
             at = filmed._seen(now, placed, self.rows, self.frame)
-            depth = np.maximum(at[known][:, 2:], _LEAST_DEPTH_M)
+            depth = np.maximum(at[known][:, 2:], MIN_DEPTH_M)
             return np.ravel(rays[known][:, :2] / now.focal * depth - at[known][:, :2])
 
         def residuals(x: Array) -> Array:

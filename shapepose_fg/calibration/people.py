@@ -12,7 +12,8 @@ from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.linearisation import ObservationConfig
-from shapepose_fg.setup_check.evidence import observed, triangulate
+from shapepose_fg.estimation.trajectory_graph import WEAKEST_M
+from shapepose_fg.setup_check.evidence import left_out, observed, triangulate
 from shapepose_fg.setup_check.matching import GATE, Pairs, Sightings, size_of
 
 LEAST_PEOPLE = 10
@@ -23,9 +24,8 @@ _MOST_FRAMES = 100
 _MOST_SIGHTINGS = 5_000
 """Maximum number of sightings; more of them, or of frames, cost time and add little information,
 because errors within a second are correlated."""
-_MIN_DEPTH_M = 0.3
-_WEAKEST_M = 0.15
-"""Maximum standard deviation, m, of a used joint in its worst direction."""
+MIN_DEPTH_M = 0.3
+"""Minimum depth of a used joint, m."""
 _NOISE = ObservationConfig()
 
 
@@ -104,7 +104,7 @@ class Footage:
         groups = Pairs.of(sightings, views).groups(len(sightings), tuple(range(len(rig))))
         xy, confidence, size = observed(groups, sightings)
         placed = triangulate(xy, confidence, size, views)
-        near = (placed.depth > _MIN_DEPTH_M) & (placed.miss_px < GATE * size[:, None])
+        near = (placed.depth > MIN_DEPTH_M) & (placed.miss_px < GATE * size[:, None])
         weight = _NOISE.weight(confidence) / _NOISE.scatter(self.joints)[:, None] ** 2
         at = np.where(near, placed.depth, np.nan)
         sigma = np.hypot(
@@ -123,7 +123,7 @@ def _well_placed(points: Array, sigma_m: Array, rig: Rig) -> Mask:
     rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
     across = np.eye(3) - rays[..., :, None] * rays[..., None, :]
     information = np.nansum(across / sigma_m[..., None, None] ** 2, axis=2)
-    return np.asarray(np.linalg.eigvalsh(information)[..., 0] > 1 / _WEAKEST_M**2)
+    return np.asarray(np.linalg.eigvalsh(information)[..., 0] > 1 / WEAKEST_M**2)
 
 
 def missed_px(people: People, rig: Rig) -> Array:
@@ -132,17 +132,7 @@ def missed_px(people: People, rig: Rig) -> Array:
 
     NaN if fewer than two others see it. With only two cameras, from the prediction by both.
     """
-    missed = np.full(people.sigma_px.shape, np.nan)
-    weight = np.where(np.isfinite(people.sigma_px), 1.0, 0.0)
-    size = size_of(np.moveaxis(people.xy, 2, 1))
-    if len(rig) == 2:
-        return np.where(
-            weight > 0, triangulate(people.xy, weight, size, Views.of(rig)).miss_px, np.nan
-        )
-    for view, camera in enumerate(rig.cameras):
-        others, xy = weight.copy(), people.xy.copy()
-        others[:, :, view], xy[:, :, view] = 0.0, np.nan
-        placed = triangulate(xy, others, size, Views.of(rig))
-        seen, _ = camera.project(placed.points)
-        missed[:, :, view] = np.linalg.norm(seen - people.xy[:, :, view], axis=-1)
-    return np.where(weight > 0, missed, np.nan)
+    seen, size = np.isfinite(people.sigma_px), size_of(np.moveaxis(people.xy, 2, 1))
+    given = people.xy, seen.astype(float), size, Views.of(rig)
+    missed = triangulate(*given).miss_px if len(rig) == 2 else left_out(*given, seen)[0]
+    return np.where(seen, missed, np.nan)

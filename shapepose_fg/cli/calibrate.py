@@ -1,6 +1,5 @@
 """The command `calibrate`: estimates camera poses from walking people."""
 
-import json
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,7 +11,7 @@ import typer
 
 from shapepose_fg.cli.found_cameras import (
     MOST_S,
-    check_most,
+    Most,
     from_zero,
     report_option,
     show_clocks,
@@ -23,6 +22,7 @@ from shapepose_fg.cli.options import (
     RESULT,
     TIME,
     RateOptions,
+    Stature,
     grouped,
     json_option,
     names_of,
@@ -30,7 +30,7 @@ from shapepose_fg.cli.options import (
     option,
     picture_size,
 )
-from shapepose_fg.cli.terminal import note, progress, show, table
+from shapepose_fg.cli.terminal import note, progress, show, show_json, table
 from shapepose_fg.core.errors import InputError, naming
 
 if TYPE_CHECKING:
@@ -113,7 +113,7 @@ def calibrate(
         "Refine focal lengths; prior sigma 2 % from a calibration, 20 % from a field of view.",
         False,
     ),
-    stature: float | None = option(
+    stature: Stature | None = option(
         _CAMERAS, "Median stature of the people, metres; by default 1.70, of adults."
     ),
     distance: list[str] | None = option(
@@ -143,7 +143,7 @@ def calibrate(
             "too."
         ),
     ),
-    most: float = option(TIME, "Largest offset between cameras for --times, seconds.", MOST_S),
+    most: Most = option(TIME, "Largest offset between cameras for --times, seconds.", MOST_S),
     report: Path | None = report_option(),
     as_json: bool = json_option(),
 ) -> None:
@@ -162,9 +162,6 @@ def calibrate(
     from shapepose_fg.io.recording import own_times
     from shapepose_fg.io.timestamps import write_timestamps
 
-    if stature is not None and not 0.5 <= stature <= 2.5:
-        raise InputError(f"--stature {stature:g}: must be 0.5 to 2.5 metres")
-    check_most(most)
     within = _within(tolerance)
     if times is not None and rate.timestamps is not None:
         raise InputError(
@@ -246,7 +243,7 @@ def calibrate(
             {} if clocks is None else {"clocks": clocks.as_dict(rig)["cameras"]}
         )
         told |= {"moving": {name: each.as_dict() for name, each in starts.items()}}
-        print(json.dumps(told, indent=2, allow_nan=False))
+        show_json(told)
     else:
         show(table(("camera", *heads), [(name, *each) for name, each in rows], caption=_CAPTION))
         print("\n".join(lines[1:]))
@@ -345,7 +342,7 @@ def _figures(found: "Calibrated", focal: bool) -> tuple[list[str], list[tuple[st
 
 def _world(found: "Calibrated", stature: float | None, distances: list[str]) -> list[str]:
     """Scale, up axis, fit, and how far to trust them, one line each."""
-    from shapepose_fg.calibration.adjustment import MOVE, TURN
+    from shapepose_fg.setup_check.fit import MOVE, TURN
 
     world = found.world
     if distances:

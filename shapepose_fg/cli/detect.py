@@ -7,7 +7,9 @@ import time
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from annotated_types import Interval
 
 from shapepose_fg.cli.options import (
     INPUT,
@@ -57,11 +59,11 @@ class NetworkOptions:
         "Keypoint layout of an OpenPose network: tf-pose, openpose-coco, openpose-body25.",
         metavar="NAME",
     )
-    long_side: int | None = option(
+    long_side: Annotated[int, Interval(ge=128, le=4096)] | None = option(
         _NETWORK, "Longer side of the input of an OpenPose network, pixels (656)."
     )
-    backend: str | None = option(
-        RUN, "Backend of an OpenPose network: opencv (default) or onnxruntime.", metavar="NAME"
+    backend: Literal["opencv", "onnxruntime"] | None = option(
+        RUN, "Backend of an OpenPose network: opencv (default) or onnxruntime."
     )
     device: str = option(
         RUN, "Device of onnxruntime: cpu, cuda, cuda:1, rocm, coreml.", "cpu", metavar="NAME"
@@ -82,14 +84,10 @@ class NetworkOptions:
                 f"--download {self.download}: this is neither the name of --network nor of "
                 "--boxes; leave it out"
             )
-        if self.backend not in (None, "opencv", "onnxruntime"):
-            raise InputError(f"--backend {self.backend}: must be opencv or onnxruntime")
         if self.backend == "opencv" and self.device != "cpu":
             raise InputError(
                 f"--device {self.device}: opencv runs on the CPU only; leave out --backend"
             )
-        if self.long_side is not None and not 128 <= self.long_side <= 4096:
-            raise InputError(f"--long-side {self.long_side}: must be 128 to 4096 pixels")
         openpose = {"layout": self.layout, "long_side": self.long_side, "backend": self.backend}
         with progress("downloading the network", "bytes") as fetched:
             found = partial(named_file, fetch=self.download is not None, say=note, progress=fetched)

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -11,20 +11,18 @@ from shapepose_fg.cli.options import (
     INPUT,
     REQUIRED,
     RESULT,
+    Hertz,
     argument,
-    check_fps,
     frames_option,
     grouped,
     option,
     result_frames,
 )
 from shapepose_fg.cli.terminal import note, show, table
-from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.bounds import Axis
 
 if TYPE_CHECKING:
     from shapepose_fg.evaluation.score import Score
-
-_FORMATS = ("text", "markdown", "latex", "json")
 
 
 @grouped
@@ -40,30 +38,26 @@ def evaluate(
     ),
     frames: str | None = frames_option(),
     offset: int = option(INPUT, "Number of the truth's frame at frame 0 of the results.", 0),
-    up: str | None = option(
+    up: Axis | None = option(
         INPUT, "World axis that points up, for AMASS, if cameras.json is missing.", metavar="AXIS"
     ),
-    fps: float | None = option(INPUT, "Frame rate of the results, Hz, to which AMASS is thinned."),
+    fps: Hertz | None = option(INPUT, "Frame rate of the results, Hz, to which AMASS is thinned."),
     body: Path | None = option(INPUT, "Body model of AMASS's shapes."),
-    format: str = option(RESULT, "text, markdown, latex or json.", "text"),
+    format: Literal["text", "markdown", "latex", "json"] = option(
+        RESULT, "text, markdown, latex or json.", "text"
+    ),
 ) -> None:
     """Score results against a truth: PCP, MPJPE, PA-MPJPE, MOTA, IDF1, HOTA, and the coverage of
     the covariances.
     """
     from dataclasses import replace
-    from typing import Any, get_args
+    from typing import Any
 
-    from shapepose_fg.core.camera import Axis
     from shapepose_fg.core.rig_file import CAMERAS
     from shapepose_fg.evaluation.score import score
     from shapepose_fg.evaluation.truth import read_people
     from shapepose_fg.io.calibration import read_rig
 
-    if format not in _FORMATS:
-        raise InputError(f"--format {format}: must be one of {' '.join(_FORMATS)}")
-    if up is not None and up not in get_args(Axis):
-        raise InputError(f"--up {up}: must be one of {' '.join(get_args(Axis))}")
-    check_fps(fps)
     cameras = results[0] / CAMERAS
     axis: Any = up or (read_rig(cameras).up if cameras.is_file() else None)
     how: Any = {"up": axis, "fps": fps, "body": body}

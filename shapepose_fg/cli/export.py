@@ -1,10 +1,12 @@
 """The command `export`: writes a result in the formats of other programs."""
 
 from pathlib import Path
+from typing import Annotated, Literal
+
+from annotated_types import Interval
 
 from shapepose_fg.cli.options import RESULT, TakeOptions, argument, grouped, option
 from shapepose_fg.cli.terminal import note
-from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.result_files import results_folder
 from shapepose_fg.core.storage.files import inside
 
@@ -16,12 +18,12 @@ def export(
         "FORMAT...", "Formats: amass trc c3d bvh glb angles opensim csv parquet mcap rrd, or all."
     ),
     output: Path | None = option(RESULT, "Folder for the files; by default RESULTS/export."),
-    markers: str = option(
+    markers: Literal["opensim", "joints", "body"] = option(
         RESULT,
         "Marker set of trc and c3d: opensim (as Pose2Sim), joints (of the result), body (of SMPL).",
         "opensim",
     ),
-    fill_gaps: float = option(
+    fill_gaps: Annotated[float, Interval(ge=0, le=3600)] = option(
         RESULT, "Longest gap that is filled in amass and bvh, seconds.", 0.2, metavar="SECONDS"
     ),
 ) -> None:
@@ -31,11 +33,7 @@ def export(
     from shapepose_fg.io.export.markers import MarkerSet
     from shapepose_fg.io.export.registry import FORMATS, chosen, export_result
 
-    if markers not in set(MarkerSet):
-        raise InputError(f"--markers {markers}: must be one of {' '.join(MarkerSet)}")
     how = take.how()
-    if not 0 <= fill_gaps <= 3600:
-        raise InputError(f"--fill-gaps {fill_gaps:g}: must be 0 to 3600 seconds")
     wanted = list(FORMATS.values()) if "all" in formats else chosen(formats)
     output = inside(results_folder(take.results), "export") if output is None else output
     more = {"markers": MarkerSet(markers), "fill_gaps_s": fill_gaps, "body": take.body}

@@ -5,9 +5,10 @@ offsets.
 import math
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
+from annotated_types import Interval
 
 from shapepose_fg.cli.options import RESULT, frame_range, option
 from shapepose_fg.cli.terminal import note, progress, show, table
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
 
 MOST_S = 60.0
 """Default maximum offset between cameras that were started by hand, s."""
+Most = Annotated[float, Interval(gt=0, le=600)]
+"""The largest offset between cameras, s."""
 
 
 def report_option() -> Any:
@@ -71,12 +74,6 @@ def found_clocks(
 def from_zero(time_s: "Array") -> "Array":
     """(T, V) times of each camera's frames from 0 on, NaN for missing frames."""
     return time_s - np.nanmin(time_s, axis=0)
-
-
-def check_most(most: float) -> None:
-    """InputError for an invalid maximum offset."""
-    if not 0 < most <= 600:
-        raise InputError(f"--most {most:g}: must be above 0, up to 600 seconds")
 
 
 def show_clocks(found: "Synchronised", rig: "Rig") -> None:

@@ -9,7 +9,7 @@ from shapepose_fg.cli.options import (
     RUN,
     TIME,
     CameraOptions,
-    check_workers,
+    Workers,
     grouped,
     option,
 )
@@ -40,7 +40,7 @@ def live(
     covariances: Literal["none", "joints", "all"] = option(
         RESULT, "Covariances in lines and .mcap: none, of joints, or also of velocities.", "joints"
     ),
-    workers: int = option(RUN, "Number of processes, with this one.", 2),
+    workers: Workers = option(RUN, "Number of processes, with this one.", 2),
 ) -> None:
     """Reconstruct people while a detector runs: reads a line per camera and picture, writes lines
     of people.
@@ -61,7 +61,6 @@ def live(
     from shapepose_fg.live.online import OnlineReconstructor
     from shapepose_fg.live.outputs import published
 
-    check_workers(workers)
     rig, joints = cameras.rig(), find_skeleton(skeleton) or BODY_25
     with (
         SparingNotes(note) as of_lines,

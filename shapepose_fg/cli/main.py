@@ -61,13 +61,12 @@ for _panel, _commands in {
         live,
         batch,
     ),
-    _RESULT: (report, overlay, view, explain, export),
+    _RESULT: (report, overlay, view, explain, export, tracks),
     _TRY: (evaluate, train_fitter),
 }.items():
     for _command in _commands:
         app.command(rich_help_panel=_panel)(_command)
 app.command("compile", rich_help_panel=_TRY)(flowing(compile_kernels))
-app.add_typer(tracks, name="tracks", rich_help_panel=_RESULT)
 
 _UsageProblem = cast("type[Exception]", typer.BadParameter.__mro__[2])
 """typer's exception for an invalid command line; its place differs between versions."""
@@ -85,7 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             code = app(arguments or ["--help"], standalone_mode=False)
             sys.stdout.flush()
     except _UsageProblem as error:
-        message = cast(Any, error).format_message().rstrip(".")
+        message = cast(Any, error).format_message().rstrip(".").replace("Value error, ", "")
         code = _fail(f"{message}; see shapepose-fg --help")
     except InputError as error:
         code = _fail(str(error))

@@ -11,14 +11,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self, cast, get_type_hints
 
 import typer
+from annotated_types import Interval
 
 from shapepose_fg.cli.terminal import note
+from shapepose_fg.core.bounds import Axis, Unit, interval_of, violated
 from shapepose_fg.core.errors import InputError, naming
 
 if TYPE_CHECKING:
-    from shapepose_fg.core.camera import Axis, Rig
+    from shapepose_fg.core.camera import Rig
     from shapepose_fg.core.frame_times import FrameTimes
-    from shapepose_fg.io.calibration import Unit
     from shapepose_fg.io.detection_table import DetectionTable
     from shapepose_fg.io.detections.people import DeclaredJoints
     from shapepose_fg.io.pose2sim_project import Pose2SimProject
@@ -28,6 +29,12 @@ INPUT, TIME, RESULT, RUN, DRAW = "Input", "Time", "Result", "Run", "Drawing"
 """Headings under which `--help` lists options."""
 REQUIRED: Any = MISSING
 """Placeholder for the default of a required option."""
+Hertz = Annotated[float, Interval(ge=0.01, le=1e5)]
+"""A frame rate, Hz."""
+Workers = Annotated[int, Interval(ge=1, le=64)]
+"""A number of processes, or of recordings at once."""
+Stature = Annotated[float, Interval(ge=0.5, le=2.5)]
+"""A stature of people, m."""
 
 
 def option(group: str, text: str, default: Any = None, *names: str, **more: Any) -> Any:
@@ -39,9 +46,9 @@ def option(group: str, text: str, default: Any = None, *names: str, **more: Any)
     return field(default=default, metadata={"typer": typer.Option(*names, **how | more)})
 
 
-def argument(metavar: str, text: str) -> Any:
+def argument(metavar: str, text: str, default: Any = MISSING) -> Any:
     """Declare a positional argument of a command."""
-    return field(metadata={"typer": typer.Argument(metavar=metavar, help=text)})
+    return field(default=default, metadata={"typer": typer.Argument(metavar=metavar, help=text)})
 
 
 class Preset(StrEnum):
@@ -77,28 +84,34 @@ def preset_option(default: Preset | None) -> Any:
 
 def grouped(command: Callable[..., Any]) -> Callable[..., Any]:
     """Convert `command` for typer: each field of a parameter that is a dataclass becomes an
-    option.
+    option. Values outside the bounds in an option's type (`Interval`) are refused.
     """
     hints, parameters = get_type_hints(command), list[inspect.Parameter]()
     taken: dict[str, list[str]] = {}
+    bounds: dict[str, Interval | None] = {}
 
-    def take(name: str, hint: Any, given: Field[Any]) -> None:
+    def take(name: str, of: Any, given: Field[Any]) -> None:
         default = inspect.Parameter.empty if given.default is MISSING else given.default
         added = inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default)
-        parameters.append(added.replace(annotation=Annotated[hint, given.metadata["typer"]]))
+        hint = Annotated[get_type_hints(of)[name], given.metadata["typer"]]
+        parameters.append(added.replace(annotation=hint))
+        bounds[name] = interval_of(get_type_hints(of, include_extras=True)[name])
 
     for name, parameter in inspect.signature(command).parameters.items():
         if is_dataclass(group := hints[name]):
-            within = get_type_hints(group)
             options = [each for each in fields(group) if "typer" in each.metadata]
             taken[name] = [each.name for each in options]
             for each in options:
-                take(each.name, within[each.name], each)
+                take(each.name, group, each)
         else:
-            take(name, hints[name], parameter.default)
+            take(name, command, parameter.default)
 
     @wraps(command)
     def called(**given: Any) -> Any:
+        for name, interval in bounds.items():
+            value = given[name]
+            if interval and value is not None and (problem := violated(interval, value)):
+                raise InputError(f"--{name.replace('_', '-')} {value:g}: must {problem}")
         for name, keys in taken.items():
             given[name] = hints[name](**{key: given.pop(key) for key in keys})
         return command(**given)
@@ -136,7 +149,7 @@ def json_option() -> Any:
 class RunOptions:
     """Options of execution, and of interrupted runs."""
 
-    workers: int | None = workers_option()
+    workers: Workers | None = workers_option()
     cluster: str | None = option(
         RUN, "Dask scheduler for the solving (tcp://host:8786), or `local`.", metavar="ADDRESS"
     )
@@ -147,7 +160,6 @@ class RunOptions:
 
     def check(self) -> None:
         """InputError if options contradict each other."""
-        check_workers(self.workers)
         if self.workers is not None and self.cluster not in (None, "local"):
             raise InputError(
                 f"--workers and --cluster {self.cluster}: processes are either of this machine "
@@ -167,10 +179,10 @@ class CameraOptions:
     calibration: Path | None = option(
         INPUT, "Calibration of the cameras: a file or folder in a known format."
     )
-    up: str | None = option(
+    up: Axis | None = option(
         INPUT, "World axis that points up: x, -x, y, -y, z or -z.", metavar="AXIS"
     )
-    unit: str | None = option(INPUT, "Unit of the calibration: m, cm or mm.", metavar="UNIT")
+    unit: Unit | None = option(INPUT, "Unit of the calibration: m, cm or mm.", metavar="UNIT")
     image_size: str | None = option(
         INPUT, "Size of the calibrated pictures, if the file does not contain it.", metavar="WxH"
     )
@@ -184,9 +196,8 @@ class CameraOptions:
         if self.calibration is None:
             raise InputError("--calibration: missing; give the calibration file or folder")
         size = picture_size(self.image_size)
-        up, unit = cast("Axis | None", self.up), cast("Unit | None", self.unit)
         chosen = {"cameras": names_of(self.cameras), "without": names_of(self.without) or ()}
-        found = read_rig(self.calibration, up=up, unit=unit, image_size=size, **chosen)
+        found = read_rig(self.calibration, up=self.up, unit=self.unit, image_size=size, **chosen)
         note(*found.notes)
         return found
 
@@ -299,7 +310,7 @@ class ProjectOptions(DetectionOptions):
 class TimeOptions:
     """Options about the times of frames."""
 
-    fps: float | None = option(TIME, "Frame rate, Hz; by default that of times.csv, else 30.")
+    fps: Hertz | None = option(TIME, "Frame rate, Hz; by default that of times.csv, else 30.")
     timestamps: Path | None = option(
         TIME,
         "File with the time of every frame, seconds; by default times.csv beside the detections.",
@@ -318,7 +329,6 @@ class TimeOptions:
         """
         from shapepose_fg.io.recording import read_recording
 
-        check_fps(self.fps)
         recording, times = read_recording(
             detections, rig, skeleton, kept, self.fps, self.timestamps, own_frames=own_frames
         )
@@ -358,15 +368,14 @@ class ResultOptions:
     """Options: a saved result, and how it is read."""
 
     results: Path = argument("RESULTS", "Folder of a reconstruction.")
-    fps: float | None = option(TIME, "Frame rate, Hz, instead of the result's own times.")
-    up: str | None = option(
+    fps: Hertz | None = option(TIME, "Frame rate, Hz, instead of the result's own times.")
+    up: Axis | None = option(
         INPUT, "World axis that points up, if cameras.json is missing.", metavar="AXIS"
     )
     body: Path | None = option(INPUT, "Body model of the result, if its file has moved.")
 
     def how(self) -> dict[str, Any]:
         """Keyword arguments of the functions that read it."""
-        check_fps(self.fps)
         return {"fps": self.fps, "up": self.up}
 
 
@@ -419,20 +428,6 @@ def picture_size(text: str | None) -> tuple[int, int] | None:
     if match is None:
         raise InputError(f"--image-size {text}: must be WIDTHxHEIGHT in pixels, such as 1920x1080")
     return int(match[1]), int(match[2])
-
-
-def check_fps(fps: float | None) -> None:
-    """InputError for an invalid frame rate."""
-    if fps is not None and not 0.01 <= fps <= 1e5:
-        raise InputError(f"--fps {fps:g}: must be 0.01 to 100000 Hz, such as 25")
-
-
-def check_workers(workers: int | None) -> None:
-    """InputError for an invalid number of processes."""
-    if workers is not None and not 1 <= workers <= 64:
-        raise InputError(
-            f"--workers {workers}: must be 1 to 64; leave it out to use as many as are useful"
-        )
 
 
 def result_frames(text: str | None) -> range | None:

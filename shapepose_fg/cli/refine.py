@@ -1,10 +1,11 @@
 """The command `refine-calibration`: refines cameras by the people of a recording."""
 
-import json
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Annotated, cast
+
+from annotated_types import Interval
 
 from shapepose_fg.cli.found_cameras import report_option
 from shapepose_fg.cli.options import (
@@ -12,17 +13,17 @@ from shapepose_fg.cli.options import (
     RESULT,
     ProjectOptions,
     RateOptions,
+    Stature,
     grouped,
     json_option,
     next_reconstruct,
     option,
 )
-from shapepose_fg.cli.terminal import note, progress, show, table
+from shapepose_fg.cli.terminal import note, progress, show, show_json, table
 from shapepose_fg.core.errors import InputError
 
 if TYPE_CHECKING:
     from shapepose_fg.calibration.refinement import Refinement
-    from shapepose_fg.io.calibration import Unit
 
 _CAMERAS = "Prior uncertainty"
 
@@ -31,8 +32,12 @@ _CAMERAS = "Prior uncertainty"
 class FreedomOptions:
     """Options: prior standard deviations of the cameras around the given calibration."""
 
-    off_degrees: float = option(_CAMERAS, "Prior sigma of rotations, degrees.", 1.0)
-    off_cm: float = option(_CAMERAS, "Prior sigma of positions, centimetres.", 2.0)
+    off_degrees: Annotated[float, Interval(gt=0, le=20)] = option(
+        _CAMERAS, "Prior sigma of rotations, degrees.", 1.0
+    )
+    off_cm: Annotated[float, Interval(gt=0, le=200)] = option(
+        _CAMERAS, "Prior sigma of positions, centimetres.", 2.0
+    )
     focal: bool = option(_CAMERAS, "Refine focal lengths, too (prior sigma 2 %).", False, "--focal")
     centre: bool = option(
         _CAMERAS,
@@ -46,7 +51,7 @@ class FreedomOptions:
     reference: str | None = option(
         _CAMERAS, "Camera whose pose stays; by default the rig as a whole stays.", metavar="CAMERA"
     )
-    stature: float | None = option(
+    stature: Stature | None = option(
         _CAMERAS, "Mean stature of the people, metres; it then determines the scale."
     )
 
@@ -71,12 +76,6 @@ def refine_calibration(
     from shapepose_fg.calibration.refinement import refine
     from shapepose_fg.io.calibration import check_target, write_like
 
-    if not 0 < may.off_degrees <= 20 or not 0 < may.off_cm <= 200:
-        raise InputError(
-            "--off-degrees, --off-cm: must be above 0 and at most 20 degrees and 200 cm"
-        )
-    if may.stature is not None and not 0.5 <= may.stature <= 2.5:
-        raise InputError(f"--stature {may.stature:g}: must be 0.5 to 2.5 metres")
     seen = given.located()
     rate, source = seen.rate(rate), cast(Path, seen.calibration)
     rig = seen.still_rig("refine-calibration")
@@ -110,7 +109,7 @@ def refine_calibration(
             found = refine(recording, rig, times, span, freedom, reference, done)
     note(*found.notes)
     new = found.rig if may.stature is None else found.of_stature(may.stature)
-    form, output = write_like(source, new, output, cast("Unit | None", seen.unit))
+    form, output = write_like(source, new, output, seen.unit)
     heads, rows = _figures(found, may)
     lines = _words(found, may)
     if report is not None:
@@ -132,7 +131,7 @@ def refine_calibration(
         page.write(report)
         note(f"{report}: cameras and people in 3D, to open in a browser")
     if as_json:
-        print(json.dumps(found.as_dict(), indent=2, allow_nan=False))
+        show_json(found.as_dict())
     else:
         show(table(("camera", *heads), [(name, *each) for name, each in rows], caption=lines[0]))
         print("\n".join(lines[1:]))

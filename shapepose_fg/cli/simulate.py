@@ -4,14 +4,16 @@ import re
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import Annotated, Literal
+
+from annotated_types import Interval
 
 from shapepose_fg.cli.options import (
     INPUT,
     REQUIRED,
     RESULT,
+    Workers,
     argument,
-    check_workers,
     frame_range,
     frames_option,
     grouped,
@@ -19,11 +21,7 @@ from shapepose_fg.cli.options import (
     workers_option,
 )
 from shapepose_fg.cli.terminal import progress as progress_bar
-from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.output_folder import prepare_output
-
-if TYPE_CHECKING:
-    from shapepose_fg.simulation.files import Format
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +36,9 @@ class SceneOptions:
     )
     cameras: int = option(INPUT, "Number of cameras around the room, 2 to 12.", 6)
     people: int | None = option(INPUT, "Number of people in demo, 0 to 12.")
-    seed: int = option(INPUT, "Random seed of the detector's errors, and of the people of demo.", 0)
+    seed: Annotated[int, Interval(ge=0, le=2**32 - 1)] = option(
+        INPUT, "Random seed of the detector's errors, and of the people of demo.", 0
+    )
     mocap: Path | None = option(INPUT, "File of the recorded motions (.npz) for the sequences.")
 
 
@@ -47,19 +47,14 @@ def simulate(
     scene: SceneOptions,
     output: Path = option(RESULT, "Folder for cameras, detections and truth.", REQUIRED),
     frames: str | None = frames_option(),
-    format: str = option(
+    format: Literal["association", "openpose"] = option(
         RESULT, "Format of the detections: association (4D Association) or openpose.", "association"
     ),
-    workers: int | None = workers_option(),
+    workers: Workers | None = workers_option(),
 ) -> None:
     """Simulate a recording with known truth: cameras, 2D detections, and the true people as
     people.npz.
     """
-    if format not in ("association", "openpose"):
-        raise InputError(f"--format {format}: must be association or openpose")
-    if scene.seed < 0:
-        raise InputError(f"--seed {scene.seed}: must be 0 or more")
-    check_workers(workers)
     prepare_output(output)
     from shapepose_fg.pipeline.workers import suitable_workers
     from shapepose_fg.simulation import DetectorConfig
@@ -79,7 +74,7 @@ def simulate(
     )
     span = frame_range(frames, len(made))
     part = made.part(span)
-    check_output(part, output, cast("Format", format))
+    check_output(part, output, format)
     workers = suitable_workers(len(span), FRAMES_WORTH_A_WORKER) if workers is None else workers
     start = time.perf_counter()
     with progress_bar("simulating") as progress:
@@ -91,7 +86,7 @@ def simulate(
     about |= {"detector": DetectorConfig().as_dict()} | (
         {} if scene.name == "demo" else {"split": scene.split}
     )
-    written = write_simulated(part, detections, output, cast("Format", format), **about)
+    written = write_simulated(part, detections, output, format, **about)
     print(
         f"{len(span)} frames of {made.people} people, {scene.cameras} cameras,"
         f" {1e3 * seconds / len(span):.0f} ms a frame"

@@ -1,31 +1,30 @@
 """The command `synchronise`: estimates start times of cameras from people."""
 
-import json
 import shlex
 from pathlib import Path
 
 import typer
 
-from shapepose_fg.cli.found_cameras import MOST_S, check_most, found_clocks, show_clocks
+from shapepose_fg.cli.found_cameras import MOST_S, Most, found_clocks, show_clocks
 from shapepose_fg.cli.options import (
     RESULT,
     TIME,
+    Hertz,
     ProjectOptions,
-    check_fps,
     frames_option,
     grouped,
     json_option,
     next_reconstruct,
     option,
 )
-from shapepose_fg.cli.terminal import note
+from shapepose_fg.cli.terminal import note, show_json
 
 
 @grouped
 def synchronise(
     given: ProjectOptions,
-    fps: float | None = option(TIME, "Frame rate of all cameras, Hz; needed without times.csv."),
-    most: float = option(TIME, "Largest offset that is searched, seconds.", MOST_S),
+    fps: Hertz | None = option(TIME, "Frame rate of all cameras, Hz; needed without times.csv."),
+    most: Most = option(TIME, "Largest offset that is searched, seconds.", MOST_S),
     frames: str | None = frames_option(),
     output: Path | None = option(RESULT, "File for the times of all frames, for --timestamps."),
     as_json: bool = json_option(),
@@ -39,15 +38,13 @@ def synchronise(
 
     seen = given.located()
     fps = seen.source.fps if fps is None and seen.source is not None else fps
-    check_fps(fps)
-    check_most(most)
     rig = seen.still_rig("synchronise")
     found, taken_s = found_clocks(seen.detections, rig, seen.joints, fps, most, frames)
     problems = found.undetermined(rig)
     if output is not None and not problems:
         write_timestamps(output, rig.names, taken_s)
     if as_json:
-        print(json.dumps(found.as_dict(rig), indent=2, allow_nan=False))
+        show_json(found.as_dict(rig))
     else:
         show_clocks(found, rig)
     note(*problems)

@@ -1,14 +1,11 @@
 """The command `tracks`: lists the people of a result over time, and corrects identities by hand."""
 
-import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any, Literal
 
-import typer
-
-from shapepose_fg.cli.options import flowing
-from shapepose_fg.cli.terminal import note, show, table
+from shapepose_fg.cli.options import RESULT, argument, grouped, json_option, option
+from shapepose_fg.cli.terminal import note, show, show_json, table
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.result_files import results_folder, set_aside
 
@@ -21,97 +18,84 @@ if TYPE_CHECKING:
     from shapepose_fg.core.reconstruction import Reconstruction
     from shapepose_fg.tracking.edits import Solve
 
+_ACTIONS = {
+    "list": (),
+    "merge": ("person", "other"),
+    "split": ("person", "frame"),
+    "rename": ("person", "other"),
+    "drop": ("person",),
+    "swap": ("person", "other", "frame"),
+    "undo": (),
+}
+"""The numbers that follow each action."""
 
-tracks = typer.Typer(invoke_without_command=True)
 
-Person = Annotated[int, typer.Argument(metavar="A", help="Number of a person.", min=0)]
-Other = Annotated[int, typer.Argument(metavar="B", help="Number of another person.", min=0)]
-From = Annotated[int, typer.Argument(metavar="FRAME", help="First frame that changes.", min=0)]
-
-
-@tracks.callback()
-@flowing
-def people_over_time(
-    context: typer.Context,
-    results: Annotated[Path, typer.Argument(metavar="RESULTS", help="Folder of a reconstruction.")],
+@grouped
+def tracks(
+    results: Path = argument("RESULTS", "Folder of a reconstruction."),
+    action: Literal["list", "merge", "split", "rename", "drop", "swap", "undo"] = argument(
+        "ACTION", "What to do; without it, all people are listed.", "list"
+    ),
+    numbers: list[int] | None = argument("NUMBERS", "People, and first frame that changes.", None),
+    new: int | None = option(
+        RESULT, "split: number of the new person; by default the next free number."
+    ),
+    as_json: bool = json_option(),
 ) -> None:
     """List the people of a result over time, or correct identities: shapepose-fg tracks RESULTS
     merge 3 9.
 
-    Without a command, all people are listed. The original result stays in RESULTS/uncorrected, and
-    `undo` takes corrections back one by one.
+    - list: frames, gaps, stature, share of frames seen, distance walked of all people.
+
+    - merge A B: B's rows become A's.
+
+    - split A FRAME: from this frame on, A is a new person.
+
+    - rename A B: A gets the number B, which must be free.
+
+    - drop A: A is a false positive; its rows are removed.
+
+    - swap A B FRAME: A and B are exchanged from this frame on.
+
+    - undo: the last correction is taken back. The original result stays in RESULTS/uncorrected.
     """
-    context.obj = results
-    if context.invoked_subcommand is None:
-        list_people(context)
+    names, given = _ACTIONS[action], numbers or []
+    if len(given) != len(names):
+        raise InputError(f"{action}: needs {' '.join(names) or 'no number'}, got {len(given)}")
+    if action == "list" and as_json:
+        _print_as_json(results)
+    elif action == "undo":
+        _undo(results)
+    elif action != "list":
+        _correct(results, action, new, **dict(zip(names, given, strict=True)))
+    if not as_json:
+        show(_tracks_table(results))
+    if action not in ("list", "undo"):
+        print(f"to undo it: shapepose-fg tracks {results} undo")
+    if action != "list":
+        _renew_report(results_folder(results))
 
 
-@tracks.command("list")
-def list_people(
-    context: typer.Context,
-    as_json: Annotated[bool, typer.Option("--json", help="Print everything as JSON.")] = False,
-) -> None:
-    """List all people: frames, gaps, stature, share of frames seen, distance walked."""
+def _print_as_json(results: Path) -> None:
     from shapepose_fg.core.reconstruction import Reconstruction
     from shapepose_fg.tracking.listing import list_saved_tracks
 
-    if not as_json:
-        show(_tracks_table(context.obj))
-        return
-    with Reconstruction.open(context.obj) as opened:
+    with Reconstruction.open(results) as opened:
         listed = [asdict(track) for track in list_saved_tracks(opened, _body_of(opened.run))]
     plain = [
         {name: None if value != value else value for name, value in track.items()}
         for track in listed
     ]
-    print(json.dumps(plain, indent=2, allow_nan=False))
+    show_json(plain)
 
 
-@tracks.command("merge")
-def merge_people(context: typer.Context, person: Person, other: Other) -> None:
-    """Merge B into A: B's rows become A's."""
-    _correct(context, "merge", person, other=other)
-
-
-New = Annotated[
-    int | None, typer.Option(help="Number of the new person; by default the next free number.")
-]
-
-
-@tracks.command("split")
-def split_person(context: typer.Context, person: Person, frame: From, new: New = None) -> None:
-    """Split A at FRAME: from this frame on, A is a new person."""
-    _correct(context, "split", person, other=new, frame=frame)
-
-
-@tracks.command("rename")
-def rename_person(context: typer.Context, person: Person, other: Other) -> None:
-    """Rename A to B, which must be a free number."""
-    _correct(context, "rename", person, other=other)
-
-
-@tracks.command("drop")
-def drop_person(context: typer.Context, person: Person) -> None:
-    """Drop A, a false positive: its rows are removed."""
-    _correct(context, "drop", person)
-
-
-@tracks.command("swap")
-def swap_people(context: typer.Context, person: Person, other: Other, frame: From) -> None:
-    """Swap A and B from FRAME on."""
-    _correct(context, "swap", person, other=other, frame=frame)
-
-
-@tracks.command("undo")
-def undo_correction(context: typer.Context) -> None:
-    """Undo the last correction."""
+def _undo(results: Path) -> None:
+    """Take the last correction back."""
     from shapepose_fg.io.corrections import take_back
 
-    folder = results_folder(context.obj)
+    folder = results_folder(results)
     edit, _ = take_back(folder, _solver(folder))
     print(f"undone: {edit}")
-    show(_tracks_table(context.obj))
-    _renew_report(folder)
 
 
 def _tracks_table(results: Path) -> "RenderableType":
@@ -169,26 +153,24 @@ def _body_of(run: "Mapping[str, Any]") -> "SmplArrays | None":
         return None
 
 
-def _correct(context: typer.Context, action: str, person: int, **more: int | None) -> None:
+def _correct(results: Path, action: str, new: int | None, **numbers: int) -> None:
     """Apply one correction, and print its effect."""
     from shapepose_fg.core.reconstruction import Reconstruction
     from shapepose_fg.io.corrections import correct
     from shapepose_fg.tracking.edits import Action, Edit, free_number
 
-    folder = results_folder(context.obj)
-    if action == "split" and more["other"] is None:
+    folder = results_folder(results)
+    if action == "split" and new is None:
         with Reconstruction.open(folder) as opened:
-            more["other"] = free_number(opened.person)
-    edit = Edit(Action(action), person, **more)
+            new = free_number(opened.person)
+    given: dict[str, Any] = numbers | ({"other": new} if action == "split" else {})
+    edit = Edit(Action(action), **given)
     solve = _solver(folder)
     edited = correct(folder, edit, solve)
     words = "; joints and bodies were not solved again"
     if solve is not None:
         words = f"; solved again: {' '.join(map(str, sorted(edited.changed)))}"
     print(f"done: {edit}{words if len(edited.changed) > 0 else ''}")
-    show(_tracks_table(context.obj))
-    print(f"to undo it: shapepose-fg tracks {context.obj} undo")
-    _renew_report(folder)
 
 
 def _renew_report(folder: Path) -> None:

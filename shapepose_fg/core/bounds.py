@@ -1,9 +1,9 @@
 """Settings with bounds: declared in the type of a field, and checked whenever settings are
-created.
+created. Types of options with few values.
 """
 
 from functools import cache
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any, Literal, get_args, get_type_hints
 
 from annotated_types import Interval
 
@@ -23,6 +23,10 @@ Repeats = Annotated[int, Interval(ge=1, le=100)]
 """A number of repetitions, 1 or more."""
 RepeatsOrNone = Annotated[int, Interval(ge=0, le=100)]
 """A number of repetitions, 0 or more."""
+Axis = Literal["x", "-x", "y", "-y", "z", "-z"]
+"""A world axis, used to name the up direction of a calibration."""
+Unit = Literal["m", "cm", "mm"]
+"""A unit of lengths."""
 
 
 class Settings:
@@ -32,7 +36,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         for name, interval in _intervals(type(self)).items():
-            problem = _problem(interval, getattr(self, name))
+            problem = violated(interval, getattr(self, name))
             if problem is not None:
                 raise ValueError(f"{name} must {problem}, got {getattr(self, name)}")
 
@@ -49,15 +53,17 @@ def range_of(kind: type, name: str) -> str | None:
 @cache
 def _intervals(kind: type) -> dict[str, Interval]:
     """The bounds of each field that has bounds."""
-    found = {}
-    for name, hint in get_type_hints(kind, include_extras=True).items():
-        for each in getattr(hint, "__metadata__", ()):
-            if isinstance(each, Interval):
-                found[name] = each
-    return found
+    hints = get_type_hints(kind, include_extras=True)
+    return {name: found for name, hint in hints.items() if (found := interval_of(hint)) is not None}
 
 
-def _problem(interval: Interval, value: Any) -> str | None:
+def interval_of(hint: Any) -> Interval | None:
+    """The bounds in a type such as `Annotated[float, Interval(gt=0)] | None`, or None."""
+    parts = (part for each in (hint, *get_args(hint)) for part in getattr(each, "__metadata__", ()))
+    return next((part for part in parts if isinstance(part, Interval)), None)
+
+
+def violated(interval: Interval, value: Any) -> str | None:
     """The bound that a value violates, in words; None if it is within. NaN violates all bounds."""
     low, high = interval.gt if interval.ge is None else interval.ge, interval.le
     inside = low < value <= high if interval.ge is None else low <= value <= high

@@ -57,16 +57,21 @@ class ObservationTable(Table):
     not recorded."""
     xy: Annotated[NDArray[np.float32], Column("N J V 2", np.float32, "px")]
     """(N, J, V, 2) detection, undistorted pixels; NaN if there is none."""
-    confidence: Annotated[NDArray[np.float32], Column("N J V", np.float32)]
+    confidence: Annotated[NDArray[np.float32], Column("N J V", np.float32, least=0, finite=True)]
     """(N, J, V) score of the detection, 0 to 1; 0 if there is none."""
-    residual_px: Annotated[NDArray[np.float32], Column("N J V 2", np.float32, "px")]
+    residual_px: Annotated[NDArray[np.float32], Column("N J V 2", np.float32, "px", most=1e30)]
     """(N, J, V, 2) projected joint minus detection, pixels; NaN if either is missing."""
     gate: Annotated[NDArray[np.uint8], Column("N J V", np.uint8, codes=Gate)]
     """(N, J, V) codes of `Gate`."""
-    probability: Annotated[NDArray[np.float32], Column("N J V", np.float32, missing=1.0)] = None  # type: ignore[assignment]
+    probability: Annotated[
+        NDArray[np.float32],
+        Column("N J V", np.float32, least=0, most=1, finite=True, missing=1.0),
+    ] = None  # type: ignore[assignment]
     """(N, J, V) probability that the detection belongs to this person; 0 if there is none, 1 in
     files without this column."""
-    lead_s: Annotated[NDArray[np.float32], Column("N V", np.float32, "s", missing=0.0)] = None  # type: ignore[assignment]
+    lead_s: Annotated[
+        NDArray[np.float32], Column("N V", np.float32, "s", finite=True, missing=0.0)
+    ] = None  # type: ignore[assignment]
     """(N, V) time at which each view was exposed minus the row's time, seconds; 0 in older
     files."""
 
@@ -83,14 +88,7 @@ class ObservationTable(Table):
         seen = self.gate != Gate.NOT_SEEN
         if unsaid:
             object.__setattr__(self, "probability", seen.astype(np.float32))
-        if not ((self.confidence >= 0) & np.isfinite(self.confidence)).all():
-            raise ValueError("confidence must be 0 or more")
-        if not ((self.probability >= 0) & (self.probability <= 1)).all():
-            raise ValueError("probability must be 0 to 1")
-        if np.isinf(self.residual_px).any():
-            raise ValueError("residual_px must be finite, or NaN if there is none")
-        if not np.isfinite(self.lead_s).all():
-            raise ValueError("lead_s must be finite")
+        self.check_ranges()
         for name in self.shared():
             if len(set(getattr(self, name).tolist())) < len(getattr(self, name)):
                 raise ValueError(f"{name} must differ from each other")

@@ -2,11 +2,14 @@
 
 import json
 import math
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from shapepose_fg.core.frame_times import spans_of
 
 Run = dict[str, Any]
 MOST_FRAMES = 10_000_000
@@ -14,71 +17,36 @@ MOST_FRAMES = 10_000_000
 
 
 def merged_run(runs: Sequence[Run]) -> Run:
-    """Merge several runs into one: entries that are equal, the frames of all, and the other entries
-    under `parts`.
+    """Merge several runs: the entries that are equal in all of them, and the frames of all.
 
     `frames` becomes [start, stop], or a list of these if there are gaps; it is left out if a part
-    has none. ValueError if configurations or the checksum of an input differ, or if two parts cover
-    the same frame. If all `runs` are equal (parts of one run), a copy of it is returned.
+    has none. ValueError if configurations differ, or if two parts cover the same frame.
     """
-    distinct: list[Run] = []
-    for run in runs:
-        if not any(run is other or _same(run, other) for other in distinct):
-            distinct.append(run)
-    runs = distinct
+    runs = [run for n, run in enumerate(runs) if not any(_same(run, each) for each in runs[:n])]
     if len(runs) <= 1:
         return dict(runs[0]) if runs else {}
     settings = [run["configuration"] for run in runs if run.get("configuration") is not None]
     for other in settings[1:]:
-        found = difference(settings[0], other)
-        if found is not None:
+        if (found := difference(settings[0], other)) is not None:
             raise ValueError(
                 f"parts must have the same configuration, but {found[0]} differs; reconstruct "
                 "them with the same configuration"
             )
-    inputs: Run = {}
-    for file, digest in (pair for run in runs for pair in run.get("inputs", {}).items()):
-        if inputs.setdefault(file, digest) != digest:
-            raise ValueError(
-                f"parts must be made from the same inputs, but {file} changed between two of them"
-            )
-    together: Run = {"inputs": inputs} if inputs else {}
-    if settings:
-        together["configuration"] = settings[0]
+    first, *others = runs
+    together = {
+        key: value
+        for key, value in first.items()
+        if key != "frames" and all(_same(run.get(key), value) for run in others)
+    }
     spans = [covered_frames(run) for run in runs]
     if all(each is not None for each in spans):
-        together["frames"] = _joined([span for each in spans for span in each or []])
-    for key in dict.fromkeys(key for run in runs for key in run):
-        if key not in (*together, "frames") and all(
-            _same(run.get(key), runs[0].get(key)) for run in runs
-        ):
-            together[key] = runs[0][key]
-    own = [
-        {key: value for key, value in run.items() if key not in together or key == "frames"}
-        for run in runs
-    ]
-    return together | ({"parts": own} if any(each.keys() - {"frames"} for each in own) else {})
-
-
-def _joined(spans: Sequence[range]) -> list[Any]:
-    """Merge frame ranges to [start, stop], or to a list of these; ValueError if two parts cover the
-    same frame.
-    """
-    found: list[list[int]] = []
-    for span in sorted((span for span in spans if len(span) > 0), key=lambda span: span.start):
-        if found and span.start < found[-1][1]:
-            raise ValueError(f"parts must not overlap, but two of them cover frame {span.start}")
-        if found and span.start == found[-1][1]:
-            found[-1][1] = span.stop
-        else:
-            found.append([span.start, span.stop])
-    return (
-        [spans[0].start, spans[0].stop]
-        if len(found) == 0
-        else found[0]
-        if len(found) == 1
-        else found
-    )
+        covered = [frame for each in spans for span in each or [] for frame in span]
+        if len(set(covered)) < len(covered):
+            twice = min(frame for frame, count in Counter(covered).items() if count > 1)
+            raise ValueError(f"parts must not overlap, but two of them cover frame {twice}")
+        joined = [[span.start, span.stop] for span in spans_of(covered)]
+        together["frames"] = joined[0] if len(joined) == 1 else joined
+    return together
 
 
 def difference(one: Any, other: Any, name: str = "") -> tuple[str, Any, Any] | None:

@@ -13,7 +13,7 @@ from typing import Any, TypeVar, cast, get_type_hints
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
-from shapepose_fg.core.bounds import range_of
+from shapepose_fg.core.bounds import interval_of, range_of, violated
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import read_toml
 from shapepose_fg.io.validation import describe, first_problem
@@ -50,6 +50,7 @@ def config_from(
     `read_config` does, with `cure` at its end.
     """
     hints, prefix = get_type_hints(kind), f"{place}." if place else ""
+    bounded = get_type_hints(kind, include_extras=True)
     known = [field.name for field in fields(cast(Any, kind)) if field.init]
     replaced: dict[str, str] = getattr(kind, "replaced", {})
     values = {}
@@ -78,6 +79,9 @@ def config_from(
             inside, problem = first_problem(error)
             index = "".join(f"[{part}]" for part in inside if isinstance(part, int))
             raise InputError(f"{path}: {name}{index} {problem}; {cure}") from None
+        interval = interval_of(bounded[key])
+        if interval and values[key] is not None and (problem := violated(interval, values[key])):
+            raise InputError(f"{path}: {name} must {problem}, got {values[key]}; {cure}")
     try:
         return kind(**values)
     except ValueError as error:

@@ -2,10 +2,13 @@
 
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any, TypeVar
 
-from pydantic import BaseModel, TypeAdapter, ValidationError
+import numpy as np
+from pydantic import BaseModel, ValidationError
 
+from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.errors import InputError
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -22,30 +25,11 @@ def validated(
     try:
         return model.model_validate(value)
     except ValidationError as error:
-        raise _refused(error, place, cure) from None
-
-
-def validated_list(
-    kind: TypeAdapter[list[Model]], value: object, place: object, cure: str, start: int = 0
-) -> list[Model]:
-    """Validate a list like `validated`; its first item has the number `start` in the file."""
-    try:
-        return kind.validate_python(value)
-    except ValidationError as error:
-        raise _refused(error, place, cure, start) from None
-
-
-def _refused(
-    error: ValidationError, place: object, cure: str | Mapping[str, str], start: int = 0
-) -> InputError:
-    """The first problem in `error`, as a sentence."""
-    keys, problem = first_problem(error)
-    if start > 0 and isinstance(keys[0], int):
-        keys = (keys[0] + start, *keys[1:])
+        keys, problem = first_problem(error)
     if not isinstance(cure, str):
         default = "see docs/conventions.md for the format"
         cure = next((cure[str(key)] for key in reversed(keys) if key in cure), default)
-    return InputError(f"{place}: {key_text(keys)} {problem}; {cure}")
+    raise InputError(f"{place}: {key_text(keys)} {problem}; {cure}")
 
 
 def first_problem(error: ValidationError) -> tuple[tuple[int | str, ...], str]:
@@ -93,6 +77,32 @@ def describe(value: object) -> str:
     if isinstance(value, float) and not math.isfinite(value):
         return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
     return str(value)[:40]
+
+
+def numbers(value: object, name: str, cure: str, *, may_lack: bool = False) -> Array:
+    """One or more numbers: of a list, whose rows have equal lengths, or a single one. InputError
+    naming the entry that is none. With `may_lack` an entry may be NaN.
+    """
+    found = np.zeros(0, dtype=object)
+    with suppress(ValueError):  # rows of different lengths
+        found = np.array(value)
+    # Detections are millions of numbers, which are not looked at one by one.
+    fine = may_lack and found.dtype.kind in "iuf" and not np.isinf(found).any()
+    problem = None if fine else _no_number(value, name, may_lack)
+    if problem is None and found.dtype != object:
+        return np.atleast_1d(found.astype(np.float64))
+    raise InputError(f"{problem or f'{name} must have rows of equal length'}; {cure}")
+
+
+def _no_number(value: object, name: str, may_lack: bool) -> str | None:
+    """The first entry of nested lists that is no finite number, in words."""
+    if isinstance(value, list | np.ndarray):
+        entries = (_no_number(each, f"{name}[{n}]", may_lack) for n, each in enumerate(value))
+        return next(filter(None, entries), None)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return f"{name} must be a number, got {describe(value)}"
+    fine = math.isfinite(value) or (may_lack and math.isnan(value))
+    return None if fine else f"{name} must be a finite number, got {describe(value)}"
 
 
 def is_number(word: str) -> bool:

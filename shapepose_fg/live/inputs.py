@@ -5,14 +5,15 @@ unreadable line, or sends ten in a row, is refused: a client is disconnected and
 continue; for a file, InputError is raised.
 """
 
-import selectors
+import select
 import socket
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
 from pathlib import Path
+from threading import Lock, Thread
 from typing import IO, Any
 
 from shapepose_fg.core.camera import Rig
@@ -27,8 +28,6 @@ Push = Callable[..., None]
 """Function with the parameters of `OnlineReconstructor.push_view`; raises ValueError if it refuses
 a view."""
 Note = Callable[[str], None]
-_PIECE = 2**16
-"""Maximum number of bytes read at a time."""
 _RECONNECT_S = 2.0
 """Time for which a socket stays open after its last client has left, s: clients may reconnect."""
 
@@ -51,10 +50,14 @@ def feed(where: str | None, rig: Rig, skeleton: Skeleton, note: Note, push: Push
     elif where in (None, "-"):
         if sys.stdin is None:
             raise InputError("standard input is closed; name a file or a socket with --detections")
-        _from_file(sys.stdin.buffer, _Sender("standard input", given))
+        sender = _Sender("standard input", given)
+        _read_lines(sys.stdin.buffer, sender.line)
+        sender.end()
     else:
+        sender = _Sender(str(where), given)
         with Path(str(where)).open("rb") as stream:
-            _from_file(stream, _Sender(str(where), given))
+            _read_lines(stream, sender.line)
+        sender.end()
 
 
 @dataclass(frozen=True)
@@ -140,42 +143,13 @@ class _Sender:
         return read_view_line(text, place, self.given.rig, self.given.skeleton)
 
 
-@dataclass
-class _Lines:
-    """Cuts bytes into lines as they come, in bounded memory."""
-
-    _begun: bytearray = field(default_factory=bytearray)
-    _too_long: bool = False
-    """Whether the current line is too long."""
-
-    def split(self, piece: bytes) -> Iterator[bytes | None]:
-        """Lines completed by the next bytes, or the last line if `piece` is empty; None for one
-        that is too long.
-        """
-        *ended, begun = piece.split(b"\n") if piece else (b"", b"")
-        for part in ended:
-            self._begun += part
-            if len(self._begun) > SMALL and not self._too_long:
-                yield None
-            elif not self._too_long:
-                yield bytes(self._begun)
-            self._begun.clear()
-            self._too_long = False
-        self._begun += begun
-        if len(self._begun) > SMALL:
-            if not self._too_long:
-                yield None
-            self._begun.clear()
-            self._too_long = True
-
-
-def _from_file(stream: IO[bytes], sender: _Sender) -> None:
-    lines, piece = _Lines(), b"-"
-    while piece:
-        piece = stream.read1(_PIECE) if hasattr(stream, "read1") else stream.read(_PIECE)  # pyright: ignore
-        for line in lines.split(piece):
-            sender.line(line)
-    sender.end()
+def _read_lines(stream: IO[bytes], take: Callable[[bytes | None], None]) -> None:
+    """Pass the lines of a file, a pipe or a connection to `take`; None for one that is too long."""
+    while line := stream.readline(SMALL + 1):
+        too_long = len(line) > SMALL
+        while len(line) > SMALL and not line.endswith(b"\n"):
+            line = stream.readline(SMALL + 1)
+        take(None if too_long else line)
 
 
 @dataclass(eq=False)
@@ -184,90 +158,87 @@ class _Client:
 
     connection: socket.socket
     sender: _Sender
-    lines: _Lines
     heard_s: float
-    """Time of its last data, or of its connection, on the monotonic clock, s."""
+    """Time of its last line, or of its connection, on the monotonic clock, s."""
 
 
 def _from_socket(where: str, given: _Given) -> None:
-    with ExitStack() as ending, listen(where) as listening, selectors.DefaultSelector() as ready:
-        clients = list[_Client]()
-        ending.callback(lambda: [each.connection.close() for each in clients])
-        ready.register(listening, selectors.EVENT_READ)
-        served, served_s, full_s = False, time.monotonic(), -1.0
+    """Serve clients, each in a thread that processes one line at a time, until all that sent
+    something have left.
+    """
+    clients, one_at_a_time, failed = list[_Client](), Lock(), list[Exception]()
+    served, over, served_s = False, False, time.monotonic()
 
-        def cut_off(client: _Client, why: object = "") -> None:
+    def cut_off(client: _Client, why: object) -> None:
+        if client in clients:
+            clients.remove(client)
             if why:
                 given.note(f"{client.sender.name}: {why}; the connection is closed")
-            ready.unregister(client.connection)
-            client.connection.close()
-            clients.remove(client)
+        with suppress(OSError):  # it may have left
+            client.connection.shutdown(socket.SHUT_RDWR)
 
-        def come() -> None:
-            found = accept(listening)
-            if found is None:
-                return
-            connection, name = found
-            client = _Client(
-                connection, _Sender(f"{where}, {name}", given), _Lines(), time.monotonic()
-            )
-            if len(clients) >= MOST_CLIENTS:
-                # The first to go is one without any accepted line, then the longest silent.
-                first = min(clients, key=lambda each: (each.sender.good > 0, each.heard_s))
-                # Time of silence, s, after which a client may be disconnected
-                # to make room for another.
-                if first.sender.good > 0 and client.heard_s - first.heard_s < 60.0:
-                    connection.close()
-                    given.note(
-                        f"{where}: {name} is rejected, because {MOST_CLIENTS} clients are "
-                        "connected already"
-                    )
-                    return
-                cut_off(
-                    first,
-                    (
-                        f"at most {MOST_CLIENTS} clients are served, and this one was silent for "
-                        "the longest time"
-                    ),
-                )
-            clients.append(client)
-            ready.register(connection, selectors.EVENT_READ, client)
-
-        def hear(client: _Client) -> None:
-            try:
-                piece = client.connection.recv(_PIECE)
+    def serve(client: _Client) -> None:
+        def take(line: bytes | None) -> None:
+            nonlocal served
+            with one_at_a_time:
+                if over:
+                    raise ConnectionAbortedError
                 client.heard_s = time.monotonic()
-                for line in client.lines.split(piece):
-                    client.sender.line(line)
-            except BlockingIOError:
-                return
-            except InputError as error:
-                cut_off(client, str(error).removeprefix(f"{client.sender.name}, "))
-            except OSError as error:
-                cut_off(client, error.strerror or error)
-            else:
-                if not piece:
-                    cut_off(client)
+                client.sender.line(line)
+                served |= client.sender.good > 0
 
-        while True:
-            for key, _ in ready.select(timeout=_RECONNECT_S / 4):
-                if key.data is not None:
-                    served |= key.data.sender.good > 0
-                    if key.data in clients:
-                        hear(key.data)
-                    served |= key.data.sender.good > 0
-                    continue
-                try:
-                    come()
-                except OSError as error:
-                    given.note(f"{where}: no further client can be served ({error.strerror})")
-                    ready.unregister(listening)
-                    full_s = time.monotonic()
-            now_s = time.monotonic()
-            if 0 <= full_s < now_s - 1.0:
-                ready.register(listening, selectors.EVENT_READ)
-                full_s = -1.0
-            if not served or any(each.sender.good > 0 for each in clients):
-                served_s = now_s
-            if now_s - served_s > _RECONNECT_S:
+        why: object = ""
+        try:
+            with client.connection.makefile("rb") as stream:
+                _read_lines(stream, take)
+        except InputError as error:
+            why = str(error).removeprefix(f"{client.sender.name}, ")
+        except OSError as error:
+            why = error.strerror or error
+        except Exception as error:  # not the client's fault
+            failed.append(error)
+        with client.connection, one_at_a_time:
+            cut_off(client, why)
+
+    def come(connection: socket.socket, name: str) -> None:
+        now_s = time.monotonic()
+        client = _Client(connection, _Sender(f"{where}, {name}", given), now_s)
+        if len(clients) >= MOST_CLIENTS:
+            # The first to go is one without any accepted line, then the longest silent.
+            first = min(clients, key=lambda each: (each.sender.good > 0, each.heard_s))
+            # Time of silence, s, after which a client may be disconnected to make room for
+            # another.
+            if first.sender.good > 0 and now_s - first.heard_s < 60.0:
+                connection.close()
+                told = f"because {MOST_CLIENTS} clients are connected already"
+                given.note(f"{where}: {name} is rejected, {told}")
                 return
+            told = "and this one was silent for the longest time"
+            cut_off(first, f"at most {MOST_CLIENTS} clients are served, {told}")
+        clients.append(client)
+        connection.setblocking(True)
+        Thread(target=serve, args=(client,), daemon=True).start()
+
+    def end() -> None:
+        nonlocal over
+        with one_at_a_time:
+            over = True
+            for client in list(clients):
+                cut_off(client, "")
+
+    with ExitStack() as ending, listen(where) as listening:
+        ending.callback(end)
+        while not failed and time.monotonic() - served_s <= _RECONNECT_S:
+            waits = select.select([listening], [], [], _RECONNECT_S / 4)[0]
+            try:
+                with one_at_a_time:
+                    found = accept(listening) if waits else None
+                    if found is not None:
+                        come(*found)
+                    if not served or any(each.sender.good > 0 for each in clients):
+                        served_s = time.monotonic()
+            except OSError as error:
+                given.note(f"{where}: no further client can be served ({error.strerror})")
+                time.sleep(1.0)
+    if failed:
+        raise failed[0]

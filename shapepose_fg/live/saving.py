@@ -31,58 +31,58 @@ from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.tracking.motion_filter import JointStates
 from shapepose_fg.tracking.tracker import Tracks
 
-FORMAT = "shapepose-fg live state 3"
+FORMAT = "shapepose-fg live state 4"
 _CURE = "start without it"
 _WHOLE, _SEEN = np.int64, ("view", "joint", "xy", "confidence", "place", "mirrored")
 _DETECTIONS = (*_SEEN, "pairs", "affinity")
 """Columns of detections in a saved state."""
 _POSES = ("time_s", "wTb", "covariance")
 """Columns of poses of moving cameras, in addition to the carrier's name."""
-_MOST_PIXELS, _MOST_APART_M, _MOST_AFFINITY = 1e9, 1e3, 10
-"""Maximum coordinate of a detection, px, joint-to-detection distance of a camera, m,
-and affinity."""
 _LEAST_VARIANCE = 1e-12
 """Minimum variance of a position in any direction, m²: smaller ones have no finite inverse."""
 _COUNTS = ("frames", "late", "dropped", "unrefined", "not_taken", "jumps")
 """Names of the counters in a saved state."""
 _CAMERAS = {
     "counts": Column(f"{len(_COUNTS)}", _WHOLE, most=MOST_NUMBER),
-    "cameras": Column("4 V"),
+    "apart_m": Column("V", least=0, most=1e3),
+    "heard_s": Column("V"),
+    "state": Column("V", _WHOLE, most=len(CameraState), codes=CameraState),
+    "last_s": Column("V"),
     "clock": Column("2"),
     "waiting_s": Column("V"),
 }
 """Arrays of the cameras and of the views that wait for a frame."""
 _COLUMNS = {
-    "slots": Column("T 8", _WHOLE),
+    "slots": Column("T 8", _WHOLE, most=MOST_NUMBER),
     "times": Column("T 2"),
-    "time_s": Column("T V", most=1e12),
+    "time_s": Column("T V", most=1e12, finite=True),
     "out": Column("T V", _WHOLE),
     "candidate": Column("A J V", _WHOLE),
     "ids": Column("A", _WHOLE),
     "world": Column("A", _WHOLE),
-    "mean": Column("A J S", most=1e9),
-    "covariance": Column("A J S S", most=1e18),
+    "mean": Column("A J S", most=1e9, finite=True),
+    "covariance": Column("A J S S", most=1e18, finite=True),
     "evident_s": Column("A", most=1e12),
     "views": Column("A J", _WHOLE),
     "identity": Column("A", _WHOLE),
     "running_s": Column("A", most=1e9),
-    "peak_s": Column("A", most=1e9),
+    "peak_s": Column("A", least=0, most=1e9, finite=True),
     "born_s": Column("A", most=1e12),
     "place": Column("A 3", most=1e6),
-    "length_m": Column("A B", most=1e12),
-    "count": Column("A B", most=1e12),
+    "length_m": Column("A B", least=0, most=1e12, finite=True),
+    "count": Column("A B", least=0, most=1e12, finite=True),
     "gone.identity": Column("G", _WHOLE),
     "gone.time_s": Column("G", most=1e12),
     "gone.place": Column("G 3", most=1e6),
     "gone.bones": Column("G B", most=1e6),
     "seen.view": Column("D", _WHOLE),
     "seen.joint": Column("D", _WHOLE),
-    "seen.xy": Column("D 2", most=1e9),
-    "seen.confidence": Column("D", most=1e3),
+    "seen.xy": Column("D 2", most=1e9, finite=True),
+    "seen.confidence": Column("D", least=0, most=1, finite=True),
     "seen.place": Column("D", _WHOLE),
-    "seen.mirrored": Column("D", most=1),
+    "seen.mirrored": Column("D", least=0, most=1, finite=True),
     "seen.pairs": Column("E 2", _WHOLE),
-    "seen.affinity": Column("E", most=1e9),
+    "seen.affinity": Column("E", least=0, most=10, finite=True),
 }
 """Arrays of the frames, concatenated. `slots` has for each frame its number, whether it is settled,
 the next track and identity, and its numbers of tracks, detections, pairs and ended tracks."""
@@ -157,15 +157,11 @@ def slots_of(arrays: Mapping[str, NDArray[Any]], rig: Rig, nobody: FilterState) 
     sizes = {"V": len(rig), "J": J, "B": B, "S": nobody.tracks.joints.mean.shape[2]}
     found = checked_columns(_COLUMNS, arrays, sizes)
     counts = found["slots"]
-    if (counts < 0).any() or any(
+    if any(
         counts[:, n].sum() != sizes.get(letter, 0)
         for n, letter in zip((4, 5, 6, 7), "ADEG", strict=True)
     ):
         raise ValueError("its rows are not of its frames")
-    if not all(
-        np.isfinite(found[name]).all() for name in ("mean", "covariance", "time_s", "seen.xy")
-    ):
-        raise ValueError("its tracks, times and detections must be finite")
     covariance = found["covariance"]
     small = 1e-6 * np.abs(covariance).max(axis=(-2, -1), initial=0.0)
     asymmetric = np.abs(covariance - covariance.mT).max(axis=(-2, -1), initial=0.0) > small
@@ -173,8 +169,6 @@ def slots_of(arrays: Mapping[str, NDArray[Any]], rig: Rig, nobody: FilterState) 
         raise ValueError("covariances of its tracks must be symmetric, with no negative eigenvalue")
     if (np.linalg.eigvalsh(covariance[..., :3, :3])[..., 0] < _LEAST_VARIANCE).any():
         raise ValueError(f"the variances of its positions must be above {_LEAST_VARIANCE:g} m²")
-    if not all((found[name] >= 0).all() for name in ("peak_s", "length_m", "count")):
-        raise ValueError("bone lengths and the largest evidence of its tracks must not be negative")
     if not (np.abs(found["times"][:, 0] - found["time_s"].mean(axis=1)) < 1e-3).all():
         raise ValueError("the times of its tracks must be those of its frames")
     if (np.diff(found["time_s"].mean(axis=1)) <= LEAST_STEP_S).any():
@@ -214,17 +208,9 @@ def slots_of(arrays: Mapping[str, NDArray[Any]], rig: Rig, nobody: FilterState) 
 
 
 def _check(seen: Detections, candidate: Whole, views: int, joints: int) -> None:
-    """Raise ValueError if detections have no valid camera, joint or value, or if tracks have
-    detections that do not exist or are of another joint or camera.
+    """Raise ValueError if detections have no valid camera or joint, or if tracks have detections
+    that do not exist or are of another joint or camera.
     """
-    if not (np.abs(seen.xy) <= _MOST_PIXELS).all():
-        raise ValueError("its detections must be finite")
-    for each, most in ((seen.confidence, 1), (seen.mirrored, 1), (seen.affinity, _MOST_AFFINITY)):
-        if not ((each >= 0) & (each <= most)).all():
-            raise ValueError(
-                "confidences and probabilities of its detections must be 0 to 1, affinities 0 to "
-                f"{_MOST_AFFINITY}"
-            )
     within = all(
         len(values) == 0 or (values.min() >= 0 and values.max() < most)
         for values, most in ((seen.view, views), (seen.joint, joints), (seen.pairs, len(seen)))
@@ -252,9 +238,10 @@ def state_arrays(state: LiveState) -> dict[str, NDArray[Any]]:
         waiting_s[view] = time_s
     arrays: dict[str, NDArray[Any]] = {
         "counts": np.array([getattr(state, name) for name in _COUNTS]),
-        "cameras": np.array(
-            [state.watch.apart_m, state.watch.heard_s, state.watch.state, state.views.heard_s]
-        ),
+        "apart_m": state.watch.apart_m,
+        "heard_s": state.watch.heard_s,
+        "state": state.watch.state,
+        "last_s": state.views.heard_s,
         "clock": np.array([state.views.done_s, state.views.period_s]),
         "waiting_s": waiting_s,
     }
@@ -316,15 +303,12 @@ def _state_of(arrays: Mapping[str, NDArray[Any]], rig: Rig, following: Filter) -
     """The state from its arrays. Raises ValueError if they do not fit."""
     V, skeleton = len(rig), following.tracker.skeleton
     told = checked_columns(_CAMERAS, arrays, {"V": V})
-    apart_m, heard_s, code, last_s = told["cameras"]
+    heard_s, last_s = told["heard_s"], told["last_s"]
     seen = {}
     for name in ("waiting", "before"):
-        sizes, own = dict[str, int](), {each: arrays[f"{name}.{each}"] for each in _DETECTIONS}
-        own = {
-            each: _COLUMNS[f"seen.{each}"].checked(f"{name}.{each}", own[each], sizes)
-            for each in own
-        }
-        seen[name] = Detections(**own)
+        own = {f"{name}.{each}": _COLUMNS[f"seen.{each}"] for each in _DETECTIONS}
+        found = checked_columns(own, arrays, {}).values()
+        seen[name] = Detections(**dict(zip(_DETECTIONS, found, strict=True)))
         _check(seen[name], np.zeros((0, len(skeleton), V), dtype=np.int64), V, len(skeleton))
     waiting = {
         view: (seen["waiting"].only(seen["waiting"].view == view), float(told["waiting_s"][view]))
@@ -335,19 +319,12 @@ def _state_of(arrays: Mapping[str, NDArray[Any]], rig: Rig, following: Filter) -
     if (
         (np.abs(late[np.isfinite(late)]) > MOST_S).any()
         or np.isposinf(late).any()
-        or np.isnan(last_s).any()
+        or np.isnan(np.append(last_s, heard_s)).any()
     ):
         raise ValueError(f"times must be at most {MOST_S:g} s")
     if np.isnan(done_s) or not SHORTEST_S <= period_s <= 2 * MOST_S:
         raise ValueError(f"clock must hold a time, and a period of {SHORTEST_S:g} s at least")
-    if (
-        not (np.isnan(apart_m) | ((apart_m >= 0) & (apart_m < _MOST_APART_M))).all()
-        or np.isnan(heard_s).any()
-    ):
-        raise ValueError("cameras must hold distances, and times")
-    if not np.isin(code, list(CameraState)).all():
-        raise ValueError("cameras must have states that there are")
-    watch = CameraWatch(apart_m, heard_s, code.astype(np.int64))
+    watch = CameraWatch(told["apart_m"], heard_s, told["state"])
     rig = _carried(arrays, rig)
     views = ViewsInStep(V, waiting, last_s, *told["clock"].tolist())
     state = LiveState(rig, watch, views, CommonClock(V), following.nobody)

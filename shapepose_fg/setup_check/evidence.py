@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.compiled import kernel
 from shapepose_fg.core.detections import DetectionSequence
@@ -163,6 +163,24 @@ def triangulate(
         xy, prior, views.K @ views.cTw, views.focal[0], steps, points, miss_px, depth, weight
     )
     return Structure(points, xy, miss_px, depth, size, weight)
+
+
+def left_out(
+    xy: Array, weight: Array, size: Array, views: Views, used: Mask
+) -> tuple[Array, Array]:
+    """(P, J, V) distances of detections from joints triangulated by the `used` ones (P, J, V) of
+    two or more *other* views only, pixels; and the joints' depths.
+
+    The other arguments are those of `triangulate`.
+    """
+    px, depth = np.full(weight.shape, np.nan), np.full(weight.shape, np.nan)
+    for view in range(len(views)):
+        others = used & (np.arange(len(views)) != view)
+        kept = np.where(others[..., None], xy, np.nan)
+        placed = triangulate(kept, np.where(others, weight, 0.0), size, views)
+        at, depth[..., view] = Pinhole(views.K[view], views.cTw[view]).project(placed.points)
+        px[..., view] = np.linalg.norm(at - xy[..., view, :], axis=-1)
+    return px, depth
 
 
 @kernel("f4 f3 f3 f1 i0 f3 f3 f3 f3")

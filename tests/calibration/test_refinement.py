@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from shapepose_fg.calibration.adjustment import MOVE, TURN, Freedom, adjust, misfit
+from shapepose_fg.calibration import refinement
+from shapepose_fg.calibration.adjustment import Freedom, adjust, misfit
 from shapepose_fg.calibration.people import Footage
 from shapepose_fg.calibration.refinement import dilution, refine
 from shapepose_fg.cli.main import main
@@ -20,6 +21,7 @@ from shapepose_fg.io.calibration import read_rig, write_rig
 from shapepose_fg.io.write_detections import write_openpose
 from shapepose_fg.setup_check.diagnosis import build_of
 from shapepose_fg.setup_check.evidence import Look, gather
+from shapepose_fg.setup_check.fit import MOVE, TURN
 from shapepose_fg.setup_check.small_errors import Problem
 from tests.calibration.conftest import FPS, disturbed, off_by
 from tests.setup_check.spoiled_setups import biased, lasting
@@ -69,7 +71,7 @@ def test_disturbed_cameras_come_back(rig, recording, people):
 
 @pytest.mark.slow
 def test_a_sound_rig_stays_within_its_sigma(rig, recording):
-    found = refine(recording, rig, TIMES, range(250))
+    found = refine(recording, rig, TIMES, range(125))
     turn, move = off_by(found.rig, rig)
     for off, sigma in (
         (turn, np.degrees(found.adjusted.sigma(TURN))),
@@ -135,7 +137,7 @@ def test_a_bumped_camera_does_not_pull_the_others(rig, recording):
 @pytest.mark.slow
 def test_a_camera_that_was_knocked_far_off_is_found_again(rig, recording):
     knocked = replace(rig, cameras=(disturbed(rig, 1, degrees=15).cameras[0], *rig.cameras[1:]))
-    found = refine(recording, knocked, TIMES, range(250))
+    found = refine(recording, knocked, TIMES, range(125))
     assert (
         found.better
         and off_by(found.rig, rig)[0].max() < 0.3
@@ -188,7 +190,7 @@ def test_two_cameras(rig, recording):
     two = replace(rig, cameras=rig.cameras[:2])
     seen = Recording(recording.skeleton, [each.only(each.view < 2) for each in recording.frames])
     wrong = disturbed(two, 0)
-    found = refine(seen, wrong, TIMES, range(250))
+    found = refine(seen, wrong, TIMES, range(125))
     # Of two cameras half of what is wrong shows: here a bias of the detector is no good
     # explanation, but one.
     assert found.after_px < min(3, found.before_px) and found.probability > 0.5
@@ -228,8 +230,11 @@ def test_places_and_names_are_looked_at_first(rig, recording, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_the_command_writes_cameras_and_says_what_changed(rig, recording, tmp_path, capsys):
+def test_the_command_writes_cameras_and_says_what_changed(
+    rig, recording, tmp_path, capsys, monkeypatch, once
+):
     """Of a Pose2Sim project, and of its files one by one."""
+    monkeypatch.setattr(refinement, "refine", once(refine))
     five_seconds, new = replace(recording, frames=recording.frames[:125]), tmp_path / "new.json"
     project = pose2sim_project(disturbed(rig, 4), five_seconds, tmp_path / "walk")
     page = ["--report", tmp_path / "page.html"]

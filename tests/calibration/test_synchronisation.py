@@ -131,8 +131,9 @@ def test_a_camera_that_sees_nobody_is_named(rig, recording):
 
 @pytest.mark.slow
 def test_the_command_writes_what_reconstruct_takes(
-    rig, late, two_people, tmp_path, capsys, monkeypatch
+    rig, late, two_people, tmp_path, capsys, monkeypatch, once
 ):
+    monkeypatch.setattr(synchronisation, "synchronise", once(synchronise))
     monkeypatch.chdir(tmp_path)
     write_rig(rig, tmp_path / "rig.json")
     write_association(late, rig, tmp_path)
@@ -196,10 +197,11 @@ def test_the_command_writes_what_reconstruct_takes(
 
 
 @pytest.fixture
-def as_detected(rig, late, tmp_path, monkeypatch) -> Path:
+def as_detected(rig, late, tmp_path, monkeypatch, once) -> Path:
     """What `detect` leaves of phones that were started and stopped by hand: detections under their
     own numbers, and times that say which frames each has.
     """
+    monkeypatch.setattr(synchronisation, "synchronise", once(synchronise))
     monkeypatch.chdir(tmp_path)
     shown = np.arange(300)[:, None] < [300, 250, 300, 220]
     own = Recording(

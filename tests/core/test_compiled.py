@@ -2,10 +2,12 @@
 compiled.
 """
 
+import json
 import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -36,37 +38,80 @@ print(run(10.0), *x, *(sum(each.loaded.stats.cache_hits.values()) for each in (r
 """Prints three times the result, and how many times it was read and not compiled, of each."""
 
 
+SERVER = """
+import json, os, sys
+import numba
+numba.njit(lambda x: x + 1)(1.0)
+for line in sys.stdin:
+    asked = json.loads(line)
+    if isinstance(asked, int):
+        print(os.waitstatus_to_exitcode(os.waitpid(asked, 0)[1]), flush=True)
+    elif (pid := os.fork()) > 0:
+        print(pid, flush=True)
+    else:
+        os.environ.clear()
+        os.environ.update(asked["environment"])
+        sys.path[:0] = os.environ["PYTHONPATH"].split(os.pathsep)
+        for number in (1, 2):
+            os.dup2(os.open(asked["said"][number - 1], os.O_WRONLY | os.O_CREAT, 0o600), number)
+        exec(asked["program"])
+        break
+"""
+"""Runs programs, each in a process of its own that has Numba loaded: that takes a second and a half
+otherwise."""
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[subprocess.Popen]:
+    with subprocess.Popen(
+        [sys.executable, "-B", "-c", SERVER],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        env={name: each for name, each in os.environ.items() if name != "PYTHONPATH"},
+    ) as process:
+        yield process
+        assert process.stdin is not None
+        process.stdin.close()
+
+
 class Program:
     """Modules in a folder and a cache: a call runs the program and returns the result, what was
     read, stderr.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, server: subprocess.Popen) -> None:
         self.modules, self.cache, self.program = folder / "modules", folder / "cache", PROGRAM
-        self.temporary = folder / "tmp"
+        self.temporary, self.folder, self.server = folder / "tmp", folder, server
+        self.started = 0
         for each in (self.modules, self.temporary):
             each.mkdir()
         for name, text in FILES.items():
             (self.modules / f"{name}.py").write_text(text)
 
-    def start(self, **variables: str) -> subprocess.Popen:
+    def start(self, **variables: str) -> tuple[int, list[Path]]:
         where = {
             "PYTHONPATH": f"{self.modules}{os.pathsep}{ROOT}",
             "NUMBA_CACHE_DIR": str(self.cache),
         }
         where |= {"TMPDIR": str(self.temporary)} | variables
         environment = {name: each for name, each in (os.environ | where).items() if each}
-        command = [sys.executable, "-B", "-c", self.program]
-        return subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
-        )
+        self.started += 1
+        said = [self.folder / f"{self.started}.{each}" for each in ("out", "err")]
+        asked = {"program": self.program, "environment": environment, "said": [*map(str, said)]}
+        return self.ask(asked), said
+
+    def ask(self, what: object) -> int:
+        assert self.server.stdin is not None and self.server.stdout is not None
+        print(json.dumps(what), file=self.server.stdin, flush=True)
+        return int(self.server.stdout.readline())
 
     def __call__(self, **variables: str) -> tuple[float, list[int], str]:
-        return self.end(self.start(**variables))
+        return self.end(*self.start(**variables))
 
-    def end(self, process: subprocess.Popen) -> tuple[float, list[int], str]:
-        said, complaints = process.communicate(timeout=300)
-        assert process.returncode == 0, complaints
+    def end(self, pid: int, files: list[Path]) -> tuple[float, list[int], str]:
+        code, (said, complaints) = self.ask(pid), (file.read_text() for file in files)
+        assert code == 0, complaints
         *results, run, every = said.split()
         assert len(set(results)) == 1
         return float(results[0]), [int(run), int(every)], complaints
@@ -76,8 +121,8 @@ class Program:
 
 
 @pytest.fixture
-def program(tmp_path) -> Program:
-    return Program(tmp_path)
+def program(tmp_path, server) -> Program:
+    return Program(tmp_path, server)
 
 
 @pytest.mark.slow
@@ -168,7 +213,7 @@ def test_no_home(program, tmp_path):
 @pytest.mark.slow
 def test_two_processes_at_the_same_time(program):
     together = [program.start() for _ in range(2)]
-    assert [program.end(each)[0] for each in together] == [21.0, 21.0]
+    assert [program.end(*each)[0] for each in together] == [21.0, 21.0]
     assert program()[:2] == (21.0, [1, 1])
 
 

@@ -23,10 +23,10 @@ def chunk(kind: bytes, data: bytes) -> bytes:
 
 
 def bomb(side: int, exif: bytes = b"") -> bytes:
-    """A PNG of zeros, RGBA; its EXIF before the picture."""
-    packing, row = zlib.compressobj(9), bytes(1 + 4 * side)
+    """A grey PNG of zeros; its EXIF before the picture."""
+    packing, row = zlib.compressobj(1), bytes(1 + side)
     data = b"".join(packing.compress(row) for _ in range(side)) + packing.flush()
-    head = chunk(b"IHDR", struct.pack(">IIBBBBB", side, side, 8, 6, 0, 0, 0))
+    head = chunk(b"IHDR", struct.pack(">IIBBBBB", side, side, 8, 0, 0, 0, 0))
     told = chunk(b"eXIf", exif) if exif else b""
     return b"\x89PNG\r\n\x1a\n" + head + told + chunk(b"IDAT", data) + chunk(b"IEND", b"")
 

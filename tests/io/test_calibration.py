@@ -203,7 +203,7 @@ BAD_OWN = [
     (
         ("cameras", 1, "K"),
         [[1, 0, 0], [0, 1], [0, 0, 1]],
-        'camera "b": K must hold 9 numbers, got 8; write the 3x3',
+        'camera "b": K must have rows of equal length; write the 3x3',
     ),
     (("cameras", 1, "cTw"), "remove", 'camera "b": give exactly one of wTc and cTw'),
     (("cameras", 1, "cTw", 0, 0), 0.5, 'camera "b": the rotation of cTw is not orthonormal'),

@@ -373,7 +373,7 @@ MALFORMED = {
     "Pose2Sim": (
         "matrix = [[",
         "matrix = [[1.0, ",
-        'camera "cam_0": matrix must hold 9 numbers, got 10; write',
+        'camera "cam_0": matrix must have rows of equal length; write',
     ),
     "AniPose": ("rotation = [", "rotation = [[", "cannot be read as TOML"),
     "FreeMoCap": (
@@ -427,7 +427,7 @@ def test_malformed_panoptic(tmp_path):
     content = json.loads(panoptic(tmp_path).read_text())
     content["cameras"][1]["R"][0][0] += 0.5
     path = written(tmp_path / "c.json", json.dumps(content))
-    refuses(path, "cameras[1]: the rotation of R is not orthonormal")
+    refuses(path, 'camera "1": the rotation of R is not orthonormal')
 
 
 def test_malformed_multiview(tmp_path):

@@ -218,9 +218,9 @@ def test_tracks_on_the_command_line(folder, capsys):
         (["drop", 7], "there is no person 7; there are 0 1 2"),
         (["undo"], "there is no correction to undo"),
         (["split", 0, 0], "cannot be split at 0; give a frame from 1 to 9"),
-        (["merge", 0], "Missing argument 'B'"),
-        (["merge", "a", 0], "Invalid value for 'A'"),
-        (["paint"], "No such command 'paint'"),
+        (["merge", 0], "merge: needs person other, got 1"),
+        (["merge", "a", 0], "Invalid value for 'NUMBERS"),
+        (["paint"], "'paint' is not one of 'list', 'merge'"),
     ],
 )
 def test_errors_are_one_sentence(folder, capsys, arguments, sentence):

@@ -404,12 +404,12 @@ BAD_JSON = [
     ),
     (
         person([float("inf"), *FULL[1:]]),
-        "people[0].pose_keypoints_2d holds Infinity; run OpenPose again",
+        "must be a finite number, got Infinity; run OpenPose again",
     ),
     (json.dumps({"people": [{"pose_keypoints": FULL}]}), "people[0].pose_keypoints_2d is missing"),
     (json.dumps({"people": {}}), "people must be a list, got an object"),
     (json.dumps({}), "people is missing"),
-    (json.dumps([]), "the file must be an object, got a list of 0"),
+    (json.dumps([]), "people is missing in a list of 0"),
     (person(FULL)[:100], "line 1 column 101"),
     ("", "the file is empty"),
 ]

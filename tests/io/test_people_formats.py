@@ -566,7 +566,7 @@ BAD_FILES = [
     ),
     (
         '[{"frame_id": 0, "instances": [{"keypoints": [[1]], "keypoint_scores": [1]}]}]',
-        "must hold 2 values, got 1",
+        "keypoints must hold x, y and score of each keypoint, got 2",
     ),
     (
         '[{"frame_id": 0, "instances": [{"keypoints": [], "keypoint_scores": [1]}]}]',

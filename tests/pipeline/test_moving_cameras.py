@@ -13,6 +13,7 @@ from factors import KeySpace, camera_key, diagonal, odometry_factors
 from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.detections import Detections, Recording
 from shapepose_fg.core.frame_times import FrameTimes
+from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.core.storage.kept_arrays import InMemory
 from shapepose_fg.core.trajectory import Trajectory
@@ -133,6 +134,13 @@ def refined(drifted) -> Rig:
     return refine_trajectories(drifted.recording, drifted.rig, times=TIMES)
 
 
+@pytest.fixture(scope="module")
+def as_given(drifted) -> Reconstruction:
+    """People with the odometry taken as it is."""
+    rig = drifted.with_path(drifted.rig.trajectories[0].wTb, refined=True)
+    return reconstruct(drifted.recording, rig, times=TIMES)
+
+
 @pytest.mark.slow
 def test_people_correct_the_odometry_and_say_how_surely(drifted, refined):
     before, after = camera_error(drifted, drifted.rig), camera_error(drifted, refined)
@@ -165,16 +173,13 @@ def test_it_is_continuous_over_windows(drifted, refined):
 
 
 @pytest.mark.slow
-def test_people_are_nearer_to_the_truth_than_with_odometry_taken_as_it_is(drifted, refined):
+def test_people_are_nearer_to_the_truth_than_with_odometry_taken_as_it_is(
+    drifted, refined, as_given
+):
     people = reconstruct(drifted.recording, refined, times=TIMES)
-    taken = reconstruct(
-        drifted.recording,
-        drifted.with_path(drifted.rig.trajectories[0].wTb, refined=True),
-        times=TIMES,
-    )
     assert len(people) == 2 * T
     assert drifted.error_m(by_truth(drifted, people)) < 0.85 * drifted.error_m(
-        by_truth(drifted, taken)
+        by_truth(drifted, as_given)
     )
     error = (
         people.joints
@@ -196,14 +201,13 @@ def _order(made: Scene, people) -> tuple[int, int]:
 
 
 @pytest.mark.slow
-def test_people_join_a_graph_of_somebodys_own(drifted):
+def test_people_join_a_graph_of_somebodys_own(drifted, as_given):
     def key(carrier: str, frame: int) -> int:
         assert carrier == "robot"
         return gtsam.symbol("x", frame)
 
     path, every = drifted.rig.trajectories[0], 5
     taken = drifted.with_path(path.wTb, refined=True)
-    people = reconstruct(drifted.recording, taken, times=TIMES)
     frames, space, graph, values = (
         range(0, T, every),
         KeySpace("p"),
@@ -216,7 +220,7 @@ def test_people_join_a_graph_of_somebodys_own(drifted):
         graph.push_back(factor)
     for one, pose in zip(keys, at, strict=True):
         values.insert(one, gtsam.Pose3(pose))
-    given = people.rows(people.frame % every == 0)
+    given = as_given.rows(as_given.frame % every == 0)
     joined = JoinedPeople(taken, space, key, step_s=every / FPS)
     for frame, new in joined.increments(given):
         assert frame in frames

@@ -31,9 +31,9 @@ def recordings(mocap: Path) -> dict[str, np.ndarray]:
     seeds each.
     """
     found = {}
+    crowd = sequence("crowd", "tune", Mocap.load(mocap), cameras=4, frames=40).part(range(3))
     for seed in (0, 1):
         demo = built_in_scene(seed, people=5, cameras=4, frames=4)
-        crowd = sequence("crowd", "tune", Mocap.load(mocap), cameras=4, frames=40).part(range(3))
         for name, scene in (("demo", demo), ("crowd", crowd)):
             found |= {f"{name} {seed} {part}": value for part, value in parts(scene, seed).items()}
     return found

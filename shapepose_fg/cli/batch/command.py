@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from shapepose_fg.cli.options import REQUIRED, RESULT, RUN, RunOptions, argument, grouped, option
+from shapepose_fg.cli.options import (
+    REQUIRED,
+    RESULT,
+    RUN,
+    RunOptions,
+    Workers,
+    argument,
+    grouped,
+    option,
+)
 from shapepose_fg.cli.stopping import Stopped
 from shapepose_fg.cli.terminal import bars, note, show, warn
 from shapepose_fg.core.errors import InputError
@@ -32,7 +41,7 @@ def batch(
     output: Path = option(
         RESULT, "Folder for batch.json and a folder of results per recording.", REQUIRED
     ),
-    at_once: int | None = option(
+    at_once: Workers | None = option(
         RUN,
         "Number of recordings processed at once; by default as many as keep all processes busy.",
     ),
@@ -46,10 +55,6 @@ def batch(
     from shapepose_fg.cli.batch.table import read_table
 
     running.check()
-    if at_once is not None and not 1 <= at_once <= 64:
-        raise InputError(
-            f"--at-once {at_once}: must be 1 to 64; leave it out to keep all processes busy"
-        )
     entries = read_table(table)
     with only_run_in(output, [BATCH]):
         _run(table, entries, output, running, at_once)

@@ -13,7 +13,6 @@ from shapepose_fg.cli.options import (
     Preset,
     ProjectOptions,
     TimeOptions,
-    check_fps,
     ends,
     frame_range,
     frames_option,
@@ -208,7 +207,6 @@ def prepare(request: Request, output: Path | None, tell: Callable[..., None] = n
     }
     refuse_missing(places)
     calibration, detections, output = (cast(Path, place) for place in places.values())
-    check_fps(request.fps)
     if request.synchronise and request.timestamps is not None:
         raise InputError(
             "--synchronise and --timestamps: times are either estimated or given; give one of them"

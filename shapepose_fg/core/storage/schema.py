@@ -35,6 +35,10 @@ class Column:
     most: float = np.inf
     """Maximum magnitude in a file; real results are smaller, and products of larger numbers could
     overflow."""
+    least: float = -np.inf
+    """Minimum in a file; integers with a maximum are not negative."""
+    finite: bool = False
+    """Whether every value is known: not NaN."""
     missing: Any = None
     """Default value of a column, for example for files of earlier versions; None if the column is
     required."""
@@ -91,13 +95,17 @@ class Column:
         return array
 
     def check_range(self, name: str, array: NDArray[Any]) -> None:
-        """ValueError if a magnitude exceeds the column's bound, or if an integer is negative."""
-        if array.size == 0 or not np.isfinite(self.most):
+        """ValueError if a value is outside the column's bounds, or unknown where it must not be."""
+        if array.size == 0 or array.dtype.kind not in "iuf":
             return
-        if array.dtype.kind == "i" and array.min() < 0:
-            raise ValueError(f"{name} must not be negative, got {array.min()}")
-        largest = max(np.fmax.reduce(array, axis=None), -np.fmin.reduce(array, axis=None))
-        if largest > self.most:
+        if self.finite and not np.isfinite(array).all():
+            raise ValueError(f"{name} must be finite")
+        least = 0 if array.dtype.kind == "i" and np.isfinite(self.most) else self.least
+        low, high = (float(each.reduce(array, axis=None)) for each in (np.fmin, np.fmax))
+        if low < least:
+            words = "not be negative" if least == 0 else f"be at least {least:g}"
+            raise ValueError(f"{name} must {words}, got {low:g}")
+        if (largest := max(high, -low)) > self.most:
             raise ValueError(
                 f"{name} must be at most {self.most:g} or unknown (NaN), got {largest:g}"
             )

@@ -147,40 +147,57 @@ def _trajectory(path: Path, name: str, about: _Trajectory | None) -> Trajectory:
     return replace(found, wTb=wTo @ found.wTb, drift=about.drift, refined=about.refined)
 
 
+def entries(content: Content) -> dict[str, dict[str, Any]]:
+    """The cameras in a JSON file by name, or by number if they are in a list: of the whole file,
+    under `cameras`, or under the only key. Empty if the file has other values.
+    """
+    value = content.value if content.syntax == "JSON" else None
+    if isinstance(value, dict):
+        own = [value["cameras"]] if "cameras" in value else list(value.values())
+        value = own[0] if len(own) == 1 and isinstance(own[0], list) else value
+    if isinstance(value, list):
+        value = {str(index): camera for index, camera in enumerate(value)}
+    if isinstance(value, dict) and all(isinstance(each, dict) for each in value.values()):
+        return value
+    return {}
+
+
+def _nodes(content: Content, cures: Mapping[str, str] = _CURES) -> list[tuple[str, Node]]:
+    """The name and the values of each of the `entries`."""
+    return [
+        (name, Node(values, f'{content.path}: camera "{name}"', cures))
+        for name, values in entries(content).items()
+    ]
+
+
 def _read_association(content: Content) -> WrittenRig | None:
     """4D Association (Zhang et al., CVPR 2020): an object of cameras, metres, z up; keys of other
     tools are ignored.
     """
-    members, known = _members(content).values(), {"K", "RT", "R", "T", "imgSize"}
-    if not all(isinstance(each, dict) for each in members) or not any(
-        known & each.keys() for each in members
-    ):
+    keys = {key for each in entries(content).values() for key in each}
+    if not keys & {"K", "RT", "R", "T", "imgSize"}:
         return None
     cameras = []
-    for name, value in content.value.items():
-        node = Node(value, f'{content.path}: camera "{name}"', _CURES)
+    for name, node in _nodes(content):
         turned = node.named("RT") is None and node.named("R") is not None
         wTc = node.pose("R", "T") if turned else node.pose_of_rows("RT")
-        cameras.append(
-            node.camera(name, "K", wTc, ["imgSize"], "distCoeff dist distortion", most=5)
-        )
+        bend = "distCoeff dist distortion"
+        cameras.append(node.camera(name, "K", wTc, ["imgSize"], bend, most=5))
     return WrittenRig(cameras, "m", "z")
 
 
 def _read_panoptic(content: Content) -> WrittenRig | None:
     """CMU's studio file: a list of cameras, centimetres, y down, camera from world."""
-    listed = _members(content).get("cameras")
-    if not isinstance(listed, list) or not all(isinstance(each, dict) for each in listed):
-        return None
-    if not all({"K", "R", "t"} & each.keys() for each in listed):
+    listed = entries(content).values() if "cameras" in _members(content) else ()
+    if not listed or not all({"K", "R", "t"} & each.keys() for each in listed):
         return None
     cameras = []
-    for index, value in enumerate(listed):
-        node = Node(value, f"{content.path}: cameras[{index}]", _CURES)
-        if not isinstance(value.get("name"), str):
-            raise node.refuse("name", f"must be text, got {describe(value.get('name'))}")
-        wTc = node.pose("R", "t")
-        cameras.append(node.camera(value["name"], "K", wTc, ["resolution"], "distCoef", most=5))
+    for _, node in _nodes(content):
+        if not isinstance(name := node.values.get("name"), str):
+            raise node.refuse("name", f"must be text, got {describe(name)}")
+        cameras.append(
+            node.camera(name, "K", node.pose("R", "t"), ["resolution"], "distCoef", most=5)
+        )
     if "calibDataSource" in content.value or any(
         {"type", "panel", "node"} & each.keys() for each in listed
     ):
@@ -194,26 +211,15 @@ def _read_voxelpose(content: Content) -> WrittenRig | None:
     """VoxelPose: an object or list of cameras, possibly under the name of a sequence; mm, z up, R
     (X - T), distortion in two parts.
     """
-    value = content.value if content.syntax == "JSON" else None
-    if isinstance(value, dict) and len(value) == 1 and isinstance(next(iter(value.values())), list):
-        value = next(iter(value.values()))
-    if isinstance(value, list):
-        value = {str(index): camera for index, camera in enumerate(value)}
-    if not isinstance(value, dict) or not all(isinstance(each, dict) for each in value.values()):
-        return None
-    if not any("fx" in each and "R" in each for each in value.values()):
+    if not any("fx" in each and "R" in each for each in entries(content).values()):
         return None
     cameras = []
-    for name, camera in value.items():
-        node = Node(
-            camera, f'{content.path}: camera "{name}"', {"": "write it in VoxelPose's format"}
-        )
+    for name, node in _nodes(content, {"": "write it in VoxelPose's format"}):
         fx, fy, cx, cy = (float(node.needed(key, 1)[0]) for key in ("fx", "fy", "cx", "cy"))
         (k1, k2, k3), (p1, p2) = node.needed("k", 3).tolist(), node.needed("p", 2).tolist()
         wTc = node.pose("R", "T", centre=True)
-        cameras.append(
-            WrittenCamera(name, intrinsics(fx, fy, cx, cy), wTc, None, [k1, k2, p1, p2, k3])
-        )
+        K, bend = intrinsics(fx, fy, cx, cy), [k1, k2, p1, p2, k3]
+        cameras.append(WrittenCamera(name, K, wTc, None, bend))
     return WrittenRig(cameras, "mm", "z")
 
 

@@ -18,7 +18,7 @@ from shapepose_fg.core.rig_file import write_rig
 from shapepose_fg.core.storage.files import read_text, write_content
 from shapepose_fg.io.calibration.colmap import COLMAP
 from shapepose_fg.io.calibration.content import Content, load
-from shapepose_fg.io.calibration.json_and_toml import wanted_tables
+from shapepose_fg.io.calibration.json_and_toml import entries, wanted_tables
 from shapepose_fg.io.calibration.opencv_and_ros import OPENCV
 from shapepose_fg.io.calibration.reading import FORMATS, recognised
 from shapepose_fg.io.calibration.rewriting import REWRITTEN, numbers_of
@@ -49,7 +49,7 @@ def write_like(source: Path, rig: Rig, target: Path, unit: Unit | None = None) -
         return _own(rig, target)
     metres = METRES[unit or written.unit or "m"]
     if content.syntax == "JSON":
-        for camera, entry in zip(rig.cameras, _entries(content.value), strict=True):
+        for camera, entry in zip(rig.cameras, entries(content).values(), strict=True):
             _fill(entry, camera, metres)
         files = {source: json.dumps(content.value, indent=1)}
     elif content.syntax == "TOML":
@@ -149,20 +149,6 @@ def _same(written: WrittenRig, rig: Rig, metres: float) -> bool:
         if not np.allclose(each.K, camera.K, atol=_DIGITS_PX):
             return False
     return True
-
-
-def _entries(value: Any) -> list[dict[str, Any]]:
-    """The cameras in a JSON value, in the order in which they are read: from a list, an object, or
-    a list in an object.
-    """
-    if isinstance(value, dict):
-        lists = [
-            each
-            for key, each in value.items()
-            if isinstance(each, list) and (key == "cameras" or len(value) == 1)
-        ]
-        value = lists[0] if lists else list(value.values())
-    return value
 
 
 def _fill(entry: dict[str, Any], camera: Camera, metres: float) -> None:

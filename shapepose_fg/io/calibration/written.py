@@ -2,26 +2,26 @@
 values as None.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
 from shapepose_fg.core.arrays import Array
-from shapepose_fg.core.camera import Axis, Camera
+from shapepose_fg.core.bounds import Axis
+from shapepose_fg.core.bounds import Unit as Unit
+from shapepose_fg.core.camera import Camera
 from shapepose_fg.core.decompositions import ROTATION_TOLERANCE, nearest_rotation, rigid
 from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.lens import Lens, padded_distortion
 from shapepose_fg.core.trajectory import Trajectory
 from shapepose_fg.io.calibration.content import Content
-from shapepose_fg.io.validation import describe
+from shapepose_fg.io.validation import describe, numbers
 
-Unit = Literal["m", "cm", "mm"]
-"""The unit of lengths in a calibration file."""
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 """Length of each unit, metres."""
 
@@ -102,8 +102,10 @@ class Node:
 
     def refuse(self, name: str, problem: str) -> InputError:
         """An error about the value `name`."""
-        cure = self.cures.get(name.partition("[")[0], self.cures.get("", "correct it in the file"))
-        return InputError(f"{self.place}: {name} {problem}; {cure}")
+        return InputError(f"{self.place}: {name} {problem}; {self._cure(name)}")
+
+    def _cure(self, name: str) -> str:
+        return self.cures.get(name, self.cures.get("", "correct it in the file"))
 
     def named(self, names: str | Sequence[str]) -> str | None:
         """The first of several names, separated by spaces, that exists in the file."""
@@ -123,13 +125,9 @@ class Node:
         wanted = f"{' or '.join(map(str, counts)) or f'at most {most}'} {noun}"
         if counts != (1,) and not isinstance(value, list | np.ndarray):
             raise self.refuse(name, f"must hold {wanted}, got {describe(value)}")
-        found = np.array(list(self._flat(name, value)))
+        found = numbers(value, f"{self.place}: {name}", self._cure(name)).ravel()
         if len(found) not in counts and not len(found) <= most:
             raise self.refuse(name, f"must hold {wanted}, got {len(found)}")
-        try:
-            np.array(value, dtype=np.float64)
-        except ValueError:
-            raise self.refuse(name, "must have rows of equal length") from None
         return found
 
     def needed(self, names: str | Sequence[str], *counts: int, most: int = -1) -> Array:
@@ -179,20 +177,6 @@ class Node:
         if np.any(wTc[3] != (0, 0, 0, 1)):
             raise self.refuse(name, "must have the last row 0 0 0 1")
         return pose(wTc[:3, :3], wTc[:3, 3], name, self.place, world_from_camera=True)
-
-    def _flat(self, name: str, value: Any) -> Iterator[float]:
-        """All numbers in a value; `name` is used in messages."""
-        if isinstance(value, list | np.ndarray):
-            for index, each in enumerate(
-                value.tolist() if isinstance(value, np.ndarray) else value
-            ):
-                yield from self._flat(f"{name}[{index}]", each)
-        elif isinstance(value, bool) or not isinstance(value, int | float):
-            raise self.refuse(name, f"must be a number, got {describe(value)}")
-        elif not np.isfinite(value):
-            raise self.refuse(name, f"must be a finite number, got {describe(value)}")
-        else:
-            yield float(value)
 
 
 def pose(

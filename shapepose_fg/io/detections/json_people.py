@@ -6,15 +6,14 @@ Pose2Sim (RTMLib's people in OpenPose's format) has no `_keypoints` in the file 
 people that it dropped, and `{}` for people that a camera does not see.
 """
 
+from array import array
 from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
-from itertools import chain, islice, pairwise
-from math import inf
+from itertools import chain, pairwise
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from pydantic import AliasChoices, BaseModel, Field, FiniteFloat, TypeAdapter
 
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.errors import InputError
@@ -36,7 +35,7 @@ from shapepose_fg.io.detections.people import (
     frame_blocks,
 )
 from shapepose_fg.io.json_items import JsonItems
-from shapepose_fg.io.validation import describe, validated, validated_list
+from shapepose_fg.io.validation import describe, numbers
 
 _OPENPOSE, _POSE2SIM, _PICTURES = "OpenPose's JSON", "Pose2Sim's JSON", "MMPose's JSON of pictures"
 _COCO, _ALPHAPOSE, _VIDEO = (
@@ -68,131 +67,67 @@ _LISTS = ("annotations", "instance_info")
 """Keys of the list if the file is an object: COCO's data sets, and MMPose."""
 
 
-class _Person(BaseModel, strict=True, extra="allow"):
-    """A person in OpenPose's format, or in AlphaPose's formats `open` and `cmu`; hands and face are
-    ignored.
+def _keypoints(person: Any, place: str, program: str) -> Array:
+    """(K, 3) x, y and score of the keypoints of a person in the format of any of the programs; K is
+    0 for a person, or another object, without keypoints.
+
+    They are a flat list, pairs with a list of scores (MMPose), or three lists (Ultralytics).
     """
-
-    pose_keypoints_2d: list[float] | None = None
-    joints: list[float] | None = None
-
-    def flat(self, place: str, program: str) -> list[float]:
-        """x, y and score of each keypoint; empty if the person has none."""
-        values = self.joints if self.pose_keypoints_2d is None else self.pose_keypoints_2d
-        if values is None and self.model_extra:
-            raise InputError(f"{place}.pose_keypoints_2d is missing; {_RERUN[program]}")
-        return _checked(values or [], f"{place}.pose_keypoints_2d", program)
-
-
-class _Frame(BaseModel, strict=True):
-    people: list[_Person] = Field(validation_alias=AliasChoices("people", "bodies"))
-
-
-class _Instance(BaseModel, strict=True):
-    """A person in MMPose's format."""
-
-    keypoints: list[Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)]]
-    keypoint_scores: list[FiniteFloat]
-
-    def flat(self, place: str, program: str) -> list[float]:
-        """x, y and score of each keypoint."""
-        if len(self.keypoints) != len(self.keypoint_scores):
-            problem = (
-                f"there are {len(self.keypoints)} keypoints, but {len(self.keypoint_scores)} "
-                "keypoint_scores"
-            )
-            raise InputError(f"{place}: {problem}; {_RERUN[program]}")
-        pairs = zip(self.keypoints, self.keypoint_scores, strict=True)
-        return [number for (x, y), score in pairs for number in (x, y, score)]
+    if not isinstance(person, dict):
+        raise InputError(f"{place} must be an object, got {describe(person)}; {_RERUN[program]}")
+    known = ("pose_keypoints_2d", "joints", "keypoints")
+    key = next((name for name in known if person.get(name) is not None), None)
+    if key is None:
+        if len(person) == 0 or program == _YOLO:
+            return np.zeros((0, 3))
+        wanted = known[0] if program in (_OPENPOSE, _POSE2SIM, _SEPARATE) else known[2]
+        raise InputError(f"{place}.{wanted} is missing; {_RERUN[program]}")
+    given, cure = person[key], _RERUN[program]
+    parts = {key: given, "keypoint_scores": person.get("keypoint_scores")}
+    if isinstance(given, dict):
+        parts = {f"{key}.{name}": given.get(name) for name in ("x", "y", "visible")}
+    parts = {name: each for name, each in parts.items() if each is not None}
+    columns = [numbers(each, f"{place}.{n}", cure, may_lack=True) for n, each in parts.items()]
+    if len({len(each) for each in columns}) > 1:
+        counts = (f"{len(each)} {name}" for name, each in zip(parts, columns, strict=True))
+        raise InputError(f"{place}: there are {', but '.join(counts)}; {cure}")
+    found = np.column_stack(columns) if len(columns) > 1 else columns[0]
+    if found.ndim == 1 and len(found) % 3 == 0:
+        found = found.reshape(-1, 3)
+    if isinstance(given, dict):
+        found = np.column_stack([found, np.ones(len(found))])[:, :3]
+        found[(found[:, :2] == 0).all(axis=1), 2] = 0  # keypoints with a low score are at 0 0
+    if found.shape[1:] != (3,):
+        problem = f"must hold x, y and score of each keypoint, got {found.size} numbers"
+        raise InputError(f"{place}.{key} {problem}; {cure}")
+    return found
 
 
-class _VideoFrame(BaseModel, strict=True):
-    """A frame of a video in MMPose's format."""
-
-    frame_id: Annotated[int, Field(ge=0, lt=MOST_FRAME)]
-    instances: list[_Instance]
-
-
-class _Flat(BaseModel, strict=True):
-    """A person in OpenPifPaf's format."""
-
-    keypoints: Annotated[list[float], Field(min_length=1)]
-
-    def flat(self, place: str, program: str) -> list[float]:
-        """x, y and score of each keypoint."""
-        return _checked(self.keypoints, f"{place}.keypoints", program)
+def _member(record: Any, key: str, place: str, program: str) -> Any:
+    """The value of a key; InputError if it is missing."""
+    if not isinstance(record, dict) or key not in record:
+        told = "" if isinstance(record, dict) else f" in {describe(record)}"
+        raise InputError(f"{place}{key} is missing{told}; {_RERUN[program]}")
+    return record[key]
 
 
-class _Result(_Flat):
-    """A person in COCO's result format."""
-
-    image_id: int | str
-    category_id: int | str | None = None
-
-
-class _PifPafFrame(BaseModel, strict=True):
-    """A frame of a video in OpenPifPaf's format."""
-
-    frame: Annotated[int, Field(ge=0, lt=MOST_FRAME)]
-    predictions: list[_Flat]
+def _people(record: Any, key: str, place: str, program: str) -> list[Array]:
+    """The keypoints of each person of a frame, which are under `key` or, if that is empty, the
+    record itself. People without keypoints are left out.
+    """
+    listed = _member(record, key, place, program) if key else record
+    if not isinstance(listed, list):
+        raise InputError(f"{place}{key} must be a list, got {describe(listed)}; {_RERUN[program]}")
+    every = (_keypoints(each, f"{place}{key}[{n}]", program) for n, each in enumerate(listed))
+    return [each for each in every if len(each) > 0]
 
 
-class _Columns(BaseModel, strict=True):
-    """The keypoints of a person in Ultralytics' format."""
-
-    x: list[FiniteFloat]
-    y: list[FiniteFloat]
-    visible: list[FiniteFloat] | None = None
-
-
-class _Object(BaseModel, strict=True):
-    """A detected person, or other object, in Ultralytics' format."""
-
-    keypoints: _Columns | None = None
-
-    def flat(self, place: str, program: str) -> list[float]:
-        """x, y and score of each keypoint; keypoints with a low score are at 0 0."""
-        own = self.keypoints
-        if own is None:
-            return []
-        scores = [1.0] * len(own.x) if own.visible is None else own.visible
-        if not len(own.x) == len(own.y) == len(scores):
-            raise InputError(
-                f"{place}.keypoints must have the same number of x, y and visible; "
-                f"{_RERUN[program]}"
-            )
-        rows = zip(own.x, own.y, scores, strict=True)
-        return [number for x, y, score in rows for number in (x, y, score if x or y else 0.0)]
-
-
-_LIST_OF = {
-    _PIFPAF: TypeAdapter(list[_Flat]),
-    _YOLO: TypeAdapter(list[_Object]),
-    _PICTURES: TypeAdapter(list[_Instance]),
-}
-"""Validators of a frame's people, for programs that write them as a list; others write an object
-(`_Frame`)."""
-_RESULTS, _FRAMES = TypeAdapter(list[_Result]), TypeAdapter(list[_VideoFrame])
-
-
-def _checked(values: list[float], place: str, program: str) -> list[float]:
-    """Check flat keypoints; a joint that was not detected may be NaN."""
-    if len(values) % 3 != 0:
-        problem = f"must hold x, y and score of each keypoint, got {len(values)} numbers"
-        raise InputError(f"{place} {problem}; {_RERUN[program]}")
-    if inf in values or -inf in values:
-        raise InputError(f"{place} holds Infinity; {_RERUN[program]}")
-    return values
-
-
-def _people(content: Any, place: object, program: str) -> list[list[float]]:
-    """Flat keypoints of the people of a frame; people without keypoints are skipped."""
-    if program in _LIST_OF:
-        key, people = "", validated_list(_LIST_OF[program], content, place, _RERUN[program])
-    else:
-        key, people = "people", validated(_Frame, content, place, _RERUN[program]).people
-    every = (each.flat(f"{place}: {key}[{number}]", program) for number, each in enumerate(people))
-    return [each for each in every if each]
+def _people_of_frame(content: Any, place: object, program: str) -> list[Array]:
+    """The people of a frame, from the content of its file."""
+    if program in (_PIFPAF, _YOLO, _PICTURES):
+        return _people(content, "", f"{place}: ", program)
+    key = "bodies" if isinstance(content, dict) and "bodies" in content else "people"
+    return _people(content, key, f"{place}: ", program)
 
 
 def read_json_people(place: Path) -> CameraPeople:
@@ -286,9 +221,8 @@ def read_frame_files(folder: Path) -> CameraPeople:
     gaps = tuple(
         (one + 1, other - 1) for (one, _), (other, _) in pairwise(found) if other > one + 1
     )
-    blocks = frame_blocks(
-        folder, program, found, partial(_people_of_file, program=program, joints=joints)
-    )
+    read = partial(_people_of_file, program=program, joints=joints)
+    blocks = frame_blocks(folder, program, found, read)
     return CameraPeople(
         folder, program, blocks, first, last, gaps=gaps, rerun=_RERUN[program], joints=joints
     )
@@ -326,10 +260,8 @@ def _program_of_frames(files: list[Path]) -> tuple[str, str | tuple[str, ...] | 
     return program, joints
 
 
-def _people_of_file(
-    file: Path, program: str, joints: str | tuple[str, ...] | None
-) -> list[list[float]]:
-    """Flat keypoints of the people of a frame."""
+def _people_of_file(file: Path, program: str, joints: str | tuple[str, ...] | None) -> list[Array]:
+    """Keypoints of the people of a frame."""
     content = read_json(file, most=MIDDLE)
     if program == _PICTURES and isinstance(content, dict):
         if _joints_of_meta(content.get("meta_info")) != joints:
@@ -338,7 +270,7 @@ def _people_of_file(
                 "of one model"
             )
         content = content.get("instance_info")
-    return _people(content, file, program)
+    return _people_of_frame(content, file, program)
 
 
 # One file with all frames.
@@ -355,12 +287,16 @@ def _known(item: Any) -> bool:
 
 def read_one_file(path: Path) -> CameraPeople:
     """Read a file with all frames of one camera; InputError naming file, key and cure."""
-    if (lines := _pifpaf_video(path)) is not None:
-        return lines
+    with open_regular(path) as stream:
+        begin = stream.read(64).lstrip(b"\xef\xbb\xbf \t\r\n").replace(b" ", b"")
+    if begin.startswith(b'{"frame":'):
+        return _camera(path, _PIFPAF, _lines_of_video(path))
     items = JsonItems(path, _LISTS)
-    is_object = items.key is None and not items.found and isinstance(items.value, dict)
-    if is_object and (named := _by_picture(path)) is not None:
-        return named
+    if items.key is None and not items.found and isinstance(items.value, dict):
+        content = read_json(path, most=BIG)
+        values = (each for each in content.values() if isinstance(each, dict))
+        if any(each.keys() & {"people", "bodies"} for each in values):
+            return _camera(path, _SEPARATE, _frames_by_name(path, content))
     if items.key is not None and not items.found:
         raise InputError(
             f"{path}: the file must be a list, got {describe(items.value)}; {_RERUN[_COCO]}"
@@ -373,135 +309,79 @@ def read_one_file(path: Path) -> CameraPeople:
             f"{path}: recognised as JSON ({found}), but a list of people with image_id (COCO, "
             "AlphaPose) or of frames with instances (MMPose) is expected; give one of these"
         )
-    again = every if first is None else chain([first], every)
+    program = _COCO
     if items.key == "instance_info" or (isinstance(first, dict) and "instances" in first):
-        return _video(_Collected(path, _VIDEO), again, items.others)
-    program = (
-        _ALPHAPOSE if isinstance(first, dict) and isinstance(first.get("image_id"), str) else _COCO
-    )
-    return _results(_Collected(path, program), again, items.others)
+        program = _VIDEO
+    elif isinstance(first, dict) and isinstance(first.get("image_id"), str):
+        program = _ALPHAPOSE
+    again, used = every if first is None else chain([first], every), Categories()
+    return _camera(path, program, _records(again, path, program, used), items.others, used)
 
 
-class _Collected:
-    """Collects the people of one file in arrays while they are read."""
-
-    def __init__(self, path: Path, program: str) -> None:
-        self.path, self.program = path, program
-        self._keypoints, self._counts = list[Array](), set[int]()
-
-    def valid(
-        self, kind: TypeAdapter[list[Any]], items: Iterable[Any]
-    ) -> Iterator[tuple[int, list[Any]]]:
-        """The validated items in batches, with the index of each batch's first item."""
-        items, start = iter(items), 0
-        # Number of items that are validated together: as Python objects they need
-        # several times the memory of arrays.
-        while len(some := list(islice(items, 1024))) > 0:
-            yield start, validated_list(kind, some, self.path, _RERUN[self.program], start)
-            start += len(some)
-
-    def add(self, rows: list[list[float]]) -> None:
-        """Add people with flat keypoints."""
-        check_one_model(self._counts, rows, self.path, self.program)
-        if len(rows) > 0:
-            self._keypoints.append(
-                np.array(rows, dtype=np.float64).reshape(len(rows), len(rows[0]) // 3, 3)
-            )
-
-    def camera(
-        self, frames: list[int], listed: tuple[int, int], joints: str | tuple[str, ...] | None
-    ) -> CameraPeople:
-        """All people, with their `frames` (N); `listed` are the first and last frame number in the
-        file.
-        """
-        blocks, rerun = self._in_order(np.array(frames, dtype=np.intp)), _RERUN[self.program]
-        how = {
-            "every_frame": False,
-            "lists_people": self.program != _VIDEO,
-            "rerun": rerun,
-            "joints": joints,
-        }
-        return CameraPeople(self.path, self.program, blocks, *listed, **how)
-
-    def _in_order(self, frames: Index) -> Iterator[PeopleBlock]:
-        """People sorted by frame, with `frames` (N,), in blocks of frames."""
-        if len(frames) == 0:
-            return
-        order, parts = np.argsort(frames, kind="stable"), self._keypoints
-        cuts = np.flatnonzero(np.diff(frames[order] // BLOCK_FRAMES)) + 1
-        starts = np.cumsum([0, *map(len, parts)])
-        for index in np.split(order, cuts):
-            part = np.searchsorted(starts, index, side="right") - 1
-            keypoints = np.empty((len(index), *parts[0].shape[1:]))
-            for n in np.unique(part).tolist():
-                keypoints[part == n] = parts[n][index[part == n] - starts[n]]
-            yield PeopleBlock(frames[index], keypoints)
+Record = tuple[str, int | str, list[Array]]
+"""A place for messages, the number of a frame or the name of a picture, and people in it."""
+Categories = set[int | str | None]
 
 
-def _pifpaf_video(path: Path) -> CameraPeople | None:
-    """Read OpenPifPaf's file of a video, a line of JSON per frame; None for other files."""
-    with open_regular(path) as stream:
-        begin = stream.read(64).lstrip(b"\xef\xbb\xbf \t\r\n").replace(b" ", b"")
-    if not begin.startswith(b'{"frame":'):
-        return None
-    people, frames, last = _Collected(path, _PIFPAF), list[int](), -1
-    lines = read_text(path, most=LARGE).splitlines()
-    for number, line in enumerate(lines, start=1):
-        if not line.strip():
-            continue
-        one = validated(_PifPafFrame, parse_json(line, path), path, _RERUN[_PIFPAF])
-        if one.frame <= last:
-            raise InputError(
-                f"{path}: line {number}: frame numbers must increase; {_RERUN[_PIFPAF]}"
-            )
-        last = one.frame
-        place = f"{path}: line {number}"
-        people.add([each.flat(place, _PIFPAF) for each in one.predictions])
-        frames += [one.frame] * len(one.predictions)
-    return people.camera(frames, (min(frames, default=0), last), None)
-
-
-def _by_picture(path: Path) -> CameraPeople | None:
-    """Read AlphaPose's file of --format open and cmu: people by name of the picture; None for other
-    files.
-    """
-    content = read_json(path, most=BIG)
-    kinds = {key for each in content.values() for key in (each if isinstance(each, dict) else ())}
-    if len(content) == 0 or not kinds & {"people", "bodies"}:
-        return None
-    people, numbers, frames = _Collected(path, _SEPARATE), list[int](), list[int]()
+def _frames_by_name(path: Path, content: dict[str, Any]) -> Iterator[Record]:
+    """AlphaPose's records of --format open and cmu: people by name of the picture."""
     for name, frame in content.items():
         place = f"{path}: {name[:40]!r}"
-        numbers.append(_number(name, None, place, _SEPARATE))
-        people.add(flat := _people(frame, place, _SEPARATE))
-        frames += [numbers[-1]] * len(flat)
-    return people.camera(frames, (min(numbers), max(numbers)), "openpose coco")
+        yield place, name, _people_of_frame(frame, place, _SEPARATE)
 
 
-def _results(people: _Collected, items: Iterable[Any], others: Mapping[str, Any]) -> CameraPeople:
-    """Read a list of people, each with the picture to which it belongs. Pictures without people are
-    not listed.
+def _lines_of_video(path: Path) -> Iterator[Record]:
+    """OpenPifPaf's records of a video, a line of JSON per frame."""
+    for number, line in enumerate(read_text(path, most=LARGE).splitlines(), start=1):
+        if line.strip():
+            place, record = f"{path}: line {number}", parse_json(line, path)
+            people = _people(record, "predictions", f"{place}:", _PIFPAF)
+            yield place, _member(record, "frame", f"{place}:", _PIFPAF), people
 
-    `others` has the names of the pictures after all items have been read.
+
+def _records(items: Iterable[Any], path: Path, program: str, used: Categories) -> Iterator[Record]:
+    """Records of a list: of frames with people (MMPose), or of people, each with its picture, whose
+    categories are added to `used`.
     """
-    path, program, images = people.path, people.program, list[int | str]()
-    categories = set[int | str | None]()
-    for start, results in people.valid(_RESULTS, items):
-        images += [person.image_id for person in results]
-        categories |= {person.category_id for person in results}
-        people.add(
-            [
-                person.flat(f"{path}: [{index}]", program)
-                for index, person in enumerate(results, start)
-            ]
-        )
+    label = "frame_id" if program == _VIDEO else "image_id"
+    for n, item in enumerate(items):
+        place = f"{path}: [{n}]"
+        number = _member(item, label, f"{place}.", program)
+        if program == _VIDEO:
+            people = _people(item, "instances", f"{place}.", program)
+        else:
+            people = [_keypoints(item, place, program)]
+            category = item.get("category_id")
+            used.add(category if isinstance(category, int | str) else None)
+        yield f"{place}.{label}", number, people
+
+
+def _camera(
+    path: Path,
+    program: str,
+    records: Iterable[Record],
+    others: Mapping[str, Any] | None = None,
+    used: Categories | None = None,
+) -> CameraPeople:
+    """All people of a file with its `records`, collected in one array.
+
+    After all records have been read, `others` has the names of pictures, joints and categories, of
+    which those in `used` count. Pictures without people may be in these names only.
+    """
+    values, labels, counts, places = array("d"), list[int | str](), set[int](), dict[Any, str]()
+    for place, label, people in records:
+        if label in places and program not in (_COCO, _ALPHAPOSE):
+            raise InputError(f"{place}: frame {label} occurs twice; {_RERUN[program]}")
+        places.setdefault(label, place)
+        check_one_model(counts, people, path, program)
+        for person in people:
+            values.frombytes(person.tobytes())
+            labels.append(label)
+    others = {} if others is None else others
     names = _names(others, path, program)
-    frames: dict[int | str, int] = {}
-    known = [(image, f"[{index}].image_id") for index, image in enumerate(images)]
-    known += [(image, f"images[{index}]") for index, image in enumerate(names)]
-    for image, place in known:
-        if image not in frames:
-            frames[image] = _number(image, names.get(image), f"{path}: {place}", program)
+    for index, image in enumerate(names):
+        places.setdefault(image, f"{path}: images[{index}]")
+    frames = {each: _number(each, names.get(each), at, program) for each, at in places.items()}
     first: dict[int, int | str] = {}
     for image, frame in frames.items():
         if first.setdefault(frame, image) != image:
@@ -513,9 +393,32 @@ def _results(people: _Collected, items: Iterable[Any], others: Mapping[str, Any]
                 f"{path}: {problem}; {_RERUN[program]}, of one camera with a number for each "
                 "picture"
             )
-    listed = (min(first), max(first)) if first else (0, -1)
-    joints = _joints_of_categories(others.get("categories"), categories)
-    return people.camera([frames[image] for image in images], listed, joints)
+    joints = _joints_of_meta(others.get("meta_info"))
+    joints = joints or _joints_of_categories(others.get("categories"), used or set())
+    return CameraPeople(
+        path,
+        program,
+        _in_order(np.array([frames[label] for label in labels], dtype=np.intp), values),
+        min(first, default=0),
+        max(first, default=-1),
+        every_frame=False,
+        lists_people=program != _VIDEO,
+        rerun=_RERUN[program],
+        joints="openpose coco" if program == _SEPARATE else joints,
+    )
+
+
+def _in_order(frames: Index, values: "array[float]") -> Iterator[PeopleBlock]:
+    """People with `frames` (N,) and the numbers of their keypoints, sorted by frame, in blocks of
+    frames.
+    """
+    if len(frames) > 0:
+        keypoints, order = (
+            np.frombuffer(values).reshape(len(frames), -1, 3),
+            np.argsort(frames, kind="stable"),
+        )
+        for index in np.split(order, np.flatnonzero(np.diff(frames[order] // BLOCK_FRAMES)) + 1):
+            yield PeopleBlock(frames[index], keypoints[index])
 
 
 def _names(others: Mapping[str, Any], path: Path, program: str) -> dict[int | str, str | None]:
@@ -531,10 +434,14 @@ def _names(others: Mapping[str, Any], path: Path, program: str) -> dict[int | st
     return names
 
 
-def _number(image: int | str, name: str | None, place: str, program: str) -> int:
+def _number(image: Any, name: str | None, place: str, program: str) -> int:
     """Frame number of a picture: the last number in its name; without a name, its id, if that is a
     number.
     """
+    if type(image) not in (int, str):
+        raise InputError(
+            f"{place} must be a whole number or text, got {describe(image)}; {_RERUN[program]}"
+        )
     if name is None and isinstance(image, int):
         if 0 <= image < MOST_FRAME:
             return image
@@ -547,21 +454,3 @@ def _number(image: int | str, name: str | None, place: str, program: str) -> int
             f"{place} {name[:40]!r} has no frame number; {_RERUN[program]}, of numbered pictures"
         )
     return number
-
-
-def _video(people: _Collected, items: Iterable[Any], others: Mapping[str, Any]) -> CameraPeople:
-    """Read a list of frames, each with its people; `others` has `meta_info` after all items have
-    been read.
-    """
-    frames, first, last = list[int](), MOST_FRAME, -1
-    for start, found in people.valid(_FRAMES, items):
-        rows = list[list[float]]()
-        for index, frame in enumerate(found, start):
-            first, last = min(first, frame.frame_id), max(last, frame.frame_id)
-            frames += [frame.frame_id] * len(frame.instances)
-            rows += [
-                each.flat(f"{people.path}: [{index}].instances", _VIDEO) for each in frame.instances
-            ]
-        people.add(rows)
-    joints = _joints_of_meta(others.get("meta_info"))
-    return people.camera(frames, (first, last) if last >= 0 else (0, -1), joints)

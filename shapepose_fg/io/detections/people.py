@@ -33,13 +33,6 @@ class PeopleBlock:
     detected."""
 
     @classmethod
-    def of(cls, frames: list[int], people: list[list[float]]) -> "PeopleBlock":
-        """Make a block from flat lists of keypoints, of equal length for each person."""
-        count = len(people[0]) // 3 if len(people) > 0 else 0
-        keypoints = np.array(people, dtype=np.float64).reshape(len(people), count, 3)
-        return cls(np.array(frames, dtype=np.intp), keypoints)
-
-    @classmethod
     def dense(cls, frame: Index, points: Array) -> "PeopleBlock":
         """Make a block from `points` (F, P, K, 3) of P people in the frames `frame` (F,),
         increasing; NaN means not detected.
@@ -55,11 +48,9 @@ class PeopleBlock:
         return every[np.isfinite(every) & (every > 0)]
 
 
-def check_one_model(
-    known: set[int], people: Sequence[list[float]], source: Path, program: str
-) -> None:
+def check_one_model(known: set[int], people: Sequence[Array], source: Path, program: str) -> None:
     """Add the numbers of keypoints per person to `known`; InputError if there are several."""
-    known |= {len(person) // 3 for person in people}
+    known |= {len(person) for person in people}
     if len(known) > 1:
         counts = " and ".join(map(str, sorted(known)))
         what = f"recognised as {program}, but people have {counts} keypoints"
@@ -70,20 +61,21 @@ def frame_blocks(
     folder: Path,
     program: str,
     files: Sequence[tuple[int, Path]],
-    read: Callable[[Path], list[list[float]]],
+    read: Callable[[Path], list[Array]],
 ) -> Iterator[PeopleBlock]:
-    """The people of numbered files of frames, block by block; `read` returns flat keypoints of the
-    people in a file.
+    """The people of numbered files of frames, block by block; `read` returns the keypoints (K, 3)
+    of each person in a file.
     """
     counts = set[int]()
     for start in range(0, len(files), BLOCK_FRAMES):
-        frames, people = list[int](), list[list[float]]()
+        frames, people = list[int](), list[Array]()
         for number, file in files[start : start + BLOCK_FRAMES]:
             found = read(file)
             people += found
             frames += [number] * len(found)
         check_one_model(counts, people, folder, program)
-        yield PeopleBlock.of(frames, people)
+        keypoints = np.stack(people) if people else np.zeros((0, 0, 3))
+        yield PeopleBlock(np.array(frames, dtype=np.intp), keypoints)
 
 
 @dataclass(frozen=True)

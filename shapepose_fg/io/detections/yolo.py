@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import MIDDLE, read_text
 from shapepose_fg.io.camera_names import in_order, numbered
@@ -30,7 +31,7 @@ def read_yolo(folder: Path, image_size: tuple[int, int]) -> CameraPeople:
     """
     found = in_order(label_files(folder))
 
-    def read(file: Path) -> list[list[float]]:
+    def read(file: Path) -> list[Array]:
         lines = enumerate(read_text(file, may_be_empty=True, most=MIDDLE).splitlines(), start=1)
         return [
             _person(file, line, text.split(), image_size) for line, text in lines if text.strip()
@@ -42,9 +43,9 @@ def read_yolo(folder: Path, image_size: tuple[int, int]) -> CameraPeople:
     )
 
 
-def _person(file: Path, line: int, words: list[str], image_size: tuple[int, int]) -> list[float]:
-    """x, y and score of each keypoint; the box's confidence and a track number may follow in the
-    line.
+def _person(file: Path, line: int, words: list[str], image_size: tuple[int, int]) -> Array:
+    """(K, 3) x, y and score of each keypoint; the box's confidence and a track number may follow in
+    the line.
     """
     if not all(is_number(word) for word in words):
         raise InputError(f"{file}: line {line} must hold numbers; {_RERUN}")
@@ -66,4 +67,4 @@ def _person(file: Path, line: int, words: list[str], image_size: tuple[int, int]
         )
     points[(points[:, :2] == 0).all(axis=1), 2] = 0  # keypoints with a low score are at 0 0
     points[:, :2] *= image_size
-    return points.ravel().tolist()
+    return points

@@ -199,8 +199,8 @@ _ROWS = {
 }
 """Columns of a row that is not solved yet; the rest comes from the cameras."""
 _FOLLOWED = {"at": _NUMBERS("2"), "state.numbers": _NUMBERS("2"), "state.rows": _NUMBERS("D")}
-_FOLLOWED |= {"state.ids": _NUMBERS("A"), "state.mean": Column("A J S", most=1e6)}
-_FOLLOWED |= {"state.covariance": Column("A J S S", most=1e12)}
+_FOLLOWED |= {"state.ids": _NUMBERS("A"), "state.mean": Column("A J S", most=1e6, finite=True)}
+_FOLLOWED |= {"state.covariance": Column("A J S S", most=1e12, finite=True)}
 _FOLLOWED |= {f"rows.{name}": column for name, column in _ROWS.items()}
 _FOLLOWED |= {f"border.{name}": column for name, column in columns_of(Border).items()}
 """Columns of `checkpoint_arrays`."""
@@ -250,8 +250,6 @@ def checkpoint_of(
     )
     if len(ids) > 0:
         _check_tracks(ids, next_track)
-        if not all(np.isfinite(each).all() for each in joints):
-            raise ValueError("its tracks must be finite")
         last = given[decided.stop - 1] if len(decided) > 0 else read(decided.stop - 1)
         people = people_at(last, ids, JointStates(*joints))
     follow = FollowState(

@@ -61,7 +61,7 @@ def test_options(copied, tmp_path, capsys):
             ["fbx"],
             "format fbx: must be one of amass trc c3d bvh glb angles opensim csv parquet mcap rrd",
         ),
-        (["trc", "--markers", "skin"], "--markers skin: must be one of opensim joints body"),
+        (["trc", "--markers", "skin"], "'skin' is not one of 'opensim', 'joints', 'body'"),
         (["trc", "--frames", "9:3"], "--frames 9:3: must be A:B"),
         (
             ["trc", "--frames", "500:600"],
@@ -72,8 +72,8 @@ def test_options(copied, tmp_path, capsys):
             "no people in these frames; people are in frames 100 to 123",
         ),
         (["trc", "--person", "4"], "has no such person; it has 3 7"),
-        (["trc", "--fps", "0"], "--fps 0: must be 0.01 to 100000 Hz"),
-        (["bvh", "--fill-gaps", "-1"], "--fill-gaps -1: must be 0 to 3600 seconds"),
+        (["trc", "--fps", "0"], "--fps 0: must be at least 0.01"),
+        (["bvh", "--fill-gaps", "-1"], "--fill-gaps -1: must not be negative"),
         (["glb", "--body", "gone.npz"], "gone.npz"),
     ],
 )
