@@ -1,6 +1,5 @@
 """The command `calibrate`: estimates camera poses from walking people."""
 
-import json
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -32,7 +31,7 @@ from shapepose_fg.cli.options import (
     option,
     picture_size,
 )
-from shapepose_fg.cli.terminal import note, progress, show, table
+from shapepose_fg.cli.terminal import note, progress, show, show_json, table
 from shapepose_fg.core.errors import InputError, naming
 
 if TYPE_CHECKING:
@@ -241,7 +240,7 @@ def calibrate(
             {} if clocks is None else {"clocks": clocks.as_dict(rig)["cameras"]}
         )
         told |= {"moving": {name: each.as_dict() for name, each in starts.items()}}
-        print(json.dumps(told, indent=2, allow_nan=False))
+        show_json(told)
     else:
         show(table(("camera", *heads), [(name, *each) for name, each in rows], caption=_CAPTION))
         print("\n".join(lines[1:]))
