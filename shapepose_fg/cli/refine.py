@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 from annotated_types import Interval
 
-from shapepose_fg.cli.found_cameras import report_option
+from shapepose_fg.cli.found_cameras import report_option, write_page
 from shapepose_fg.cli.options import (
     REQUIRED,
     RESULT,
@@ -112,24 +112,20 @@ def refine_calibration(
     form, output = write_like(source, new, output, seen.unit)
     heads, rows = _figures(found, may)
     lines = _words(found, may)
-    if report is not None:
-        from shapepose_fg.viz.report.cameras import CameraPage
-
-        page = CameraPage(
-            rig=new,
-            before=found.given if found.better else None,
-            points=found.adjusted.people.points,
-            frame=found.adjusted.people.frame,
-            time_s=times.frame_s,
-            skeleton=recording.skeleton,
-            heads=heads,
-            rows=rows,
-            missed_px=dict(zip(("before, px", "after, px"), found.missed_px, strict=True)),
-            lines=lines,
-            remarks=found.notes,
-        )
-        page.write(report)
-        note(f"{report}: cameras and people in 3D, to open in a browser")
+    write_page(
+        report,
+        rig=new,
+        before=found.given if found.better else None,
+        points=found.adjusted.people.points,
+        frame=found.adjusted.people.frame,
+        time_s=times.frame_s,
+        skeleton=recording.skeleton,
+        heads=heads,
+        rows=rows,
+        missed_px=dict(zip(("before, px", "after, px"), found.missed_px, strict=True)),
+        lines=lines,
+        remarks=found.notes,
+    )
     if as_json:
         show_json(found.as_dict())
     else:
