@@ -135,10 +135,6 @@ class Placed:
         spread = _moved_by(people, found)
         return cls.of(moments[people.frame], people.frame, people.points, spread)
 
-    def changed(self) -> list["Placed"]:
-        """The people, moved by each of the independent errors of the fixed cameras."""
-        return [replace(self, points=self.points + each) for each in self.spread]
-
     def grid(self, track: int, length: int) -> Array:
         """(length, J, 3) positions of a track by moment; NaN where unknown."""
         rows = np.flatnonzero(self.track == track)
@@ -539,7 +535,8 @@ class _Fit:
         missed = data(now, self.placed)
         # A constant error of the fixed cameras changes all joints, and so the parameters.
         into = covariance @ fit.jac[:joints].T * weight / count / self.sigma_m
-        changed = [into @ (data(now, each) - missed) for each in self.placed.changed()]
+        others = [replace(self.placed, points=self.placed.points + e) for e in self.placed.spread]
+        changed = [into @ (data(now, each) - missed) for each in others]
         errors = [covariance, *(np.outer(each, each) for each in changed)]
         turn, move = self._spread(x, np.sum(errors, axis=0), level)
         sigmas = {"sigma_turn_deg": np.degrees(turn), "sigma_move_m": move}

@@ -1,6 +1,5 @@
 """The command `calibrate`: estimates camera poses from walking people."""
 
-import json
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,6 +15,7 @@ from shapepose_fg.cli.found_cameras import (
     from_zero,
     report_option,
     show_clocks,
+    write_page,
 )
 from shapepose_fg.cli.options import (
     INPUT,
@@ -31,7 +31,7 @@ from shapepose_fg.cli.options import (
     option,
     picture_size,
 )
-from shapepose_fg.cli.terminal import note, progress, show, table
+from shapepose_fg.cli.terminal import note, progress, show, show_json, table
 from shapepose_fg.core.errors import InputError, naming
 
 if TYPE_CHECKING:
@@ -225,33 +225,29 @@ def calibrate(
         raise typer.Exit(1)
     heads, rows = _figures(found, focal)
     lines = [_CAPTION, *_world(found, stature, distance or [])]
-    if report is not None:
-        from shapepose_fg.viz.report.cameras import CameraPage
-
-        people = found.adjusted.people
-        page = CameraPage(
-            rig=found.rig,
-            points=people.points,
-            frame=people.frame,
-            # Frame sets of an estimated clock start at time 0.
-            time_s=known.frame_s
-            if clocks is None
-            else np.arange(people.frame.max(initial=0) + 1) / fps,
-            skeleton=recording.skeleton,
-            heads=heads,
-            rows=rows,
-            missed_px={"joint, px": found.missed_px},
-            lines=lines,
-            remarks=found.notes,
-        )
-        page.write(report)
-        note(f"{report}: cameras and people in 3D, to open in a browser")
+    people = found.adjusted.people
+    write_page(
+        report,
+        rig=found.rig,
+        points=people.points,
+        frame=people.frame,
+        # Frame sets of an estimated clock start at time 0.
+        time_s=known.frame_s
+        if clocks is None
+        else np.arange(people.frame.max(initial=0) + 1) / fps,
+        skeleton=recording.skeleton,
+        heads=heads,
+        rows=rows,
+        missed_px={"joint, px": found.missed_px},
+        lines=lines,
+        remarks=found.notes,
+    )
     if as_json:
         told = found.as_dict() | (
             {} if clocks is None else {"clocks": clocks.as_dict(rig)["cameras"]}
         )
         told |= {"moving": {name: each.as_dict() for name, each in starts.items()}}
-        print(json.dumps(told, indent=2, allow_nan=False))
+        show_json(told)
     else:
         show(table(("camera", *heads), [(name, *each) for name, each in rows], caption=_CAPTION))
         print("\n".join(lines[1:]))

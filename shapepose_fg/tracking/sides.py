@@ -130,8 +130,9 @@ class _Compared:
                 of, (turned, doubt) = part[found.joint[group]], own.get(who, (right, right))
                 if who in own:
                     mirrored[group] = np.append(0.0, doubt)[of]
-                if not _doubtful(doubt, skeleton):
-                    wrong[group] = np.append(False, exchanged != turned)[of]
+                change = exchanged != turned
+                if change.any() and not _doubtful(doubt, skeleton):
+                    wrong[group] = np.append(False, change)[of]
         if not wrong.any() and (mirrored == found.mirrored).all():
             return given
         first, second = found.pairs.T
