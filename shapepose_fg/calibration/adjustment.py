@@ -73,9 +73,6 @@ class Adjusted:
     the gauge of the given rig."""
     people: People
     """The people, with joints at their adjusted positions."""
-    scale: float
-    """Ratio of the detector's errors to those measured for detectors: robust, from the
-    residuals."""
 
     def sigma(self, part: list[int]) -> Array:
         """(V,) standard deviation of some of the parameters together: root of their summed
@@ -157,16 +154,14 @@ def adjust(
     )
     prior = np.stack([each.sigmas for each in freedoms])
     covariance = _covariance(information, rig, prior, reference, scaled)
-    return Adjusted(rig, covariance, placed, scale * misfit(placed, rig, scale))
+    return Adjusted(rig, covariance, placed)
 
 
-def misfit(people: People, rig: Rig, scale: float = 1.0) -> float:
-    """Ratio of the median residual to its expectation under the standard deviations (times
-    `scale`): ideally 1.
-    """
+def misfit(people: People, rig: Rig) -> float:
+    """Ratio of the median residual to its expectation under the standard deviations: ideally 1."""
     views = people.seen.sum(axis=-1, keepdims=True)
     seen, _ = rig.project(people.points)
-    away = np.linalg.norm(np.moveaxis(seen, 0, 2) - people.xy, axis=-1) / (scale * people.sigma_px)
+    away = np.linalg.norm(np.moveaxis(seen, 0, 2) - people.xy, axis=-1) / people.sigma_px
     # A joint seen by n views uses up 3 of its 2 n residuals.
     left = np.sqrt(np.maximum(1 - 1.5 / np.maximum(views, 2), 0.25))
     return float(np.median((away / left)[people.seen]) / np.sqrt(2 * np.log(2)))

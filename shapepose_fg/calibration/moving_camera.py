@@ -135,10 +135,6 @@ class Placed:
         spread = _moved_by(people, found)
         return cls.of(moments[people.frame], people.frame, people.points, spread)
 
-    def changed(self) -> list["Placed"]:
-        """The people, moved by each of the independent errors of the fixed cameras."""
-        return [replace(self, points=self.points + each) for each in self.spread]
-
     def grid(self, track: int, length: int) -> Array:
         """(length, J, 3) positions of a track by moment; NaN where unknown."""
         rows = np.flatnonzero(self.track == track)
@@ -165,7 +161,7 @@ def _moved_by(people: People, found: Adjusted) -> Array:
     weight = np.where(people.seen, 1 / people.sigma_px, 0.0)[..., None, None]
     by_point, by_camera = weight * (by_place @ views.cTw[:, :, :3]), weight * by_camera
     inverse = np.linalg.pinv(np.einsum("pjvri,pjvrk->pjik", by_point, by_point), hermitian=True)
-    errors = errors.reshape(len(errors), len(rig), -1)[..., :Q]
+    errors = errors.reshape(len(errors), *found.covariance.shape[:2])[..., :Q]
     missed = np.einsum("pjvrq,mvq->mpjvr", by_camera, errors)
     return -np.einsum("pjik,pjvrk,mpjvr->mpji", inverse, by_point, missed, optimize=True)
 
@@ -232,11 +228,17 @@ class Start:
             "sigma_move_mm": round(1e3 * self.sigma_move_m, 1),
         }
 
-    def tolerated(self) -> str:
-        """Degrees and mm, rounded up, that two standard deviations of the poses do not exceed."""
-        sigmas = (20 * self.sigma_turn_deg, 200 * self.sigma_move_m)
-        degrees, cm = np.ceil(sigmas)
-        return f"{degrees / 10:g},{10 * cm:g}"
+    def refusal(self, name: str, most_deg: float, most_m: float) -> str | None:
+        """A sentence on camera `name`, with the cure, if two standard deviations of its poses
+        exceed `most_deg` degrees or `most_m` metres; else None.
+        """
+        if 2 * self.sigma_turn_deg <= most_deg and 2 * self.sigma_move_m <= most_m:
+            return None
+        return (
+            f"camera {name}: its poses are known to {self.within()} only (two sigma), but "
+            f"{most_deg:g} degrees and {1e3 * most_m:g} mm are asked; calibrate the lenses, film "
+            "two people, or accept the cameras as they are"
+        )
 
     def within(self) -> str:
         """Two standard deviations of the poses, in words."""
@@ -278,16 +280,13 @@ class Filmed:
         placed: Placed,
         most_s: float,
         focal: bool,
-        most_deg: float,
-        most_m: float,
         sigma_scale: float = 0.0,
     ) -> Start:
         """The start on which most people agree, up to `most_s` from the fixed cameras' clock;
         `focal`: whether the focal length and the principal point are unknown, too; `sigma_scale`:
         standard deviation of the world's scale, as a share.
 
-        Raises Undetermined, with a sentence, if it is ambiguous, or if two standard deviations of
-        the poses exceed `most_deg` degrees or `most_m` metres.
+        Raises Undetermined, with a sentence, if it is ambiguous.
         """
         cure = (
             "film the people whom the other cameras see for half a minute while they walk about, "
@@ -314,13 +313,6 @@ class Filmed:
         others = [each.agreeing for each in best[1:] if self._differ(each, first)]
         if first.agreeing < _LEAST_LEAD * max(others, default=0.0):
             raise refuse("two starts of its trajectory agree with the people about equally well")
-        if 2 * first.sigma_turn_deg > most_deg or 2 * first.sigma_move_m > most_m:
-            problem = (
-                f"camera {self.camera.name}: its poses are known to {first.within()} only (two "
-                f"sigma), but {most_deg:g} degrees and {1e3 * most_m:g} mm are asked; calibrate "
-                f"the lenses, film two people, or accept this with --tolerance {first.tolerated()}"
-            )
-            raise Undetermined((problem,))
         return first
 
     def _differ(self, one: Start, other: Start) -> bool:
@@ -543,7 +535,8 @@ class _Fit:
         missed = data(now, self.placed)
         # A constant error of the fixed cameras changes all joints, and so the parameters.
         into = covariance @ fit.jac[:joints].T * weight / count / self.sigma_m
-        changed = [into @ (data(now, each) - missed) for each in self.placed.changed()]
+        others = [replace(self.placed, points=self.placed.points + e) for e in self.placed.spread]
+        changed = [into @ (data(now, each) - missed) for each in others]
         errors = [covariance, *(np.outer(each, each) for each in changed)]
         turn, move = self._spread(x, np.sum(errors, axis=0), level)
         sigmas = {"sigma_turn_deg": np.degrees(turn), "sigma_move_m": move}

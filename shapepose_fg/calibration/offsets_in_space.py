@@ -23,7 +23,6 @@ from shapepose_fg.setup_check.matching import (
 
 _MOST_PLACED = 20_000
 """Maximum number of rows of tracks that are triangulated, over all cameras."""
-_REWEIGHED = 10
 _NUDGE = 0.25
 """Shift of a clock for numerical derivatives, frames: more than the errors to be found."""
 _LEAST_OTHERS = 0.2
@@ -215,7 +214,7 @@ class InSpace:
         (when, _), each = np.unique(np.stack([when, whom]), axis=1, return_inverse=True)
         score, gains = np.bincount(each.reshape(-1), score), np.bincount(each.reshape(-1), gains)
         late, trust = score.sum() / gain, np.ones(len(score))
-        for _ in range(_REWEIGHED):
+        for _ in range(10):  # reweighted mean
             away = np.abs(score - late * gains) / np.sqrt(np.maximum(gains, 1e-12))
             trust = 1 / (1 + (away / (2.0 * max(1.5 * float(np.median(away)), 1e-12))) ** 2)
             late = (trust * score).sum() / (trust * gains).sum()

@@ -46,7 +46,8 @@ class Pairwise:
         """Rows of camera a's tracks (N,), and the tracks of camera b (N,) that are the same
         person.
         """
-        one, pairs = self.tracks[a], self.same(a, b).tolist()
+        one = self.tracks[a]
+        pairs: list[tuple[int, int]] = self.same(a, b).tolist()
         stop = np.append(one.first[1:], len(one.frame))
         rows = [np.arange(one.first[who], stop[who]) for who, _ in pairs]
         whom = [np.full(len(each), pair[1]) for each, pair in zip(rows, pairs, strict=True)]

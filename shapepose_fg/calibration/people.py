@@ -1,12 +1,13 @@
 """People used for adjusting cameras: seen by several cameras, in frames separated in time."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from shapepose_fg.calibration.tracks import OneClock, seen_at
 from shapepose_fg.core.arrays import Array, Index, Mask
-from shapepose_fg.core.camera import Rig, Views
+from shapepose_fg.core.camera import Camera, Rig, Views
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.rows import Rows
@@ -78,13 +79,8 @@ class Footage:
     @classmethod
     def taken(cls, sightings: Sightings, rig: Rig, skeleton: Skeleton) -> "Footage":
         """Sightings that were undistorted by the lenses of `rig`."""
-        xy = sightings.xy.copy()
-        for view, camera in enumerate(rig.cameras):
-            here = sightings.view == view
-            xy[here] = camera.distort(xy[here].reshape(-1, 2)).reshape(xy[here].shape)
-        return cls(
-            replace(sightings, xy=xy), tuple(skeleton.joints[joint] for joint in skeleton.core)
-        )
+        names = tuple(skeleton.joints[joint] for joint in skeleton.core)
+        return cls(_through_lenses(sightings, rig, Camera.distort), names)
 
     def at(self, frames: Index) -> "Footage":
         """The sightings in some of the frames."""
@@ -92,11 +88,7 @@ class Footage:
 
     def undistorted(self, rig: Rig) -> Sightings:
         """The sightings undistorted by the lenses of `rig`."""
-        xy = self.sightings.xy.copy()
-        for view, camera in enumerate(rig.cameras):
-            here = self.sightings.view == view
-            xy[here] = camera.undistort(xy[here].reshape(-1, 2)).reshape(xy[here].shape)
-        return replace(self.sightings, xy=xy)
+        return _through_lenses(self.sightings, rig, Camera.undistort)
 
     def people(self, rig: Rig) -> People:
         """Associate people between the cameras `rig`, and triangulate them."""
@@ -113,6 +105,17 @@ class Footage:
         placeable = _well_placed(placed.points, sigma * at / rig.focal_px, rig)
         points = np.where(placeable[..., None], placed.points, np.nan)
         return People(groups.frame, xy, np.where(placeable[..., None], sigma, np.nan), points)
+
+
+def _through_lenses(
+    sightings: Sightings, rig: Rig, change: Callable[[Camera, Array], Array]
+) -> Sightings:
+    """The sightings with their pixels distorted, or undistorted."""
+    xy = sightings.xy.copy()
+    for view, camera in enumerate(rig.cameras):
+        here = sightings.view == view
+        xy[here] = change(camera, xy[here].reshape(-1, 2)).reshape(xy[here].shape)
+    return replace(sightings, xy=xy)
 
 
 def _well_placed(points: Array, sigma_m: Array, rig: Rig) -> Mask:

@@ -22,12 +22,14 @@ mm, a quarter of `MODEL_SIGMA_M`), and maximum change of their weights."""
 
 @dataclass(frozen=True)
 class BodyStep:
-    """The Theta step of one round, for R rows."""
+    """Fits bodies to the measurements of the views: the Theta step of the paper's alternation, in
+    one round, for R rows (a row is a person in a frame).
+    """
 
     fitter: BodyFitter
     """Fits bodies."""
     people: Sequence[WindowGraph]
-    """The people with these rows, one after the other."""
+    """Graphs of the people, whose rows follow one another."""
     config: EstimatorConfig
     """Settings of stage II."""
 
@@ -40,14 +42,14 @@ class BodyStep:
         return JointTargets(np.nan_to_num(evidence.points), information)
 
     def fit_changed(
-        self, targets: JointTargets, last: BodyFit, told: JointTargets
+        self, targets: JointTargets, last: BodyFit, before: JointTargets
     ) -> tuple[BodyFit, Index]:
-        """Fit bodies (R) again where targets differ from `told`, those of the `last` fit; also
+        """Fit bodies (R) again where targets differ from `before`, those of the `last` fit; also
         returns these rows.
         """
         near_m, rows = _SAME * self.config.refine.settled_m, np.arange(len(targets))
         if near_m > 0:
-            changed = changed_targets(told, targets, near_m, _AS_MUCH)
+            changed = changed_targets(before, targets, near_m, _AS_MUCH)
             rows = np.union1d(changed, np.flatnonzero(~last.ok))
         return last.with_rows(rows, self.fit(targets, last, rows)) if len(rows) > 0 else last, rows
 

@@ -47,8 +47,8 @@ class State:
     """(N,) rows with enough joints determined by the views."""
     fit: BodyFit
     """Theta: the bodies, N rows."""
-    told: JointTargets
-    """Targets of the body fits."""
+    targets: JointTargets
+    """Targets to which the bodies were fitted."""
 
     @classmethod
     def start(

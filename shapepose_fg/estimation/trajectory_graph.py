@@ -75,7 +75,7 @@ def dilution(step_s: float, over_s: float = _AVERAGED_S) -> float:
     return float(correlated(0.0) + 2 * correlated(lags).sum())
 
 
-def correlated(apart_s: Array | float) -> Array:
+def correlated(apart_s: NDArray[np.floating] | float) -> Array:
     """(...) correlation of a detector's errors in frames `apart_s` (...), seconds, apart, times the
     number of joints of a person in a view that count as one.
     """

@@ -18,7 +18,7 @@ from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.asynchronous_views import carried_to_frames, velocities_of, widened
 from shapepose_fg.estimation.body_solution import solve_bodies
 from shapepose_fg.estimation.body_step import BodyStep, disagreement
-from shapepose_fg.estimation.draft import Draft, redraft
+from shapepose_fg.estimation.draft import Draft, draft
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.joint_step import solve_between, solve_joints
 from shapepose_fg.estimation.linearisation import linearise, mean_confidence
@@ -87,7 +87,7 @@ def solve_window(
     drafted: Draft | None = None
     for n in range(assigning.rounds if assigning is not None and len(observations) > 0 else 0):
         assert assigning is not None
-        drafted = redraft(drafted, observations, views, fitter, config)
+        drafted = draft(observations, views, fitter, config, drafted)
         places, covariance = drafted.places, drafted.covariance
         if assigning.over_time:
             times_s = observations.time_s.mean(axis=1)
@@ -131,7 +131,7 @@ def solve_window(
         # Bodies: the Theta step.
         step = BodyStep(fitter, moving, config)
         targets = step.targets(evidence, state.enough[rows])
-        body, anew = step.fit_changed(targets, state.fit.rows(rows), state.told.rows(rows))
+        body, anew = step.fit_changed(targets, state.fit.rows(rows), state.targets.rows(rows))
         fitted = evidence.target
         wrong = disagreement(evidence, body) > config.refine.contradiction
         if wrong.any():
@@ -145,7 +145,7 @@ def solve_window(
                 body.with_rows(again, step.fit(targets, body, again)),
                 np.union1d(anew, again),
             )
-        state.told.put(rows[anew], targets.rows(anew))
+        state.targets.put(rows[anew], targets.rows(anew))
         # delta of Eq. 4; joints that their views do not determine need the body despite a confident
         # single view.
         pulled = mean_confidence(observed, evidence.inlier) <= config.graph.rho_3d

@@ -57,7 +57,7 @@ def _person(
     names = tuple(model.keypoint_names)
     observations = Observations(
         xy, confidence, truth, track=np.zeros(T, dtype=np.intp), frame=np.arange(T),
-        time_s=np.tile(np.arange(T)[:, None] * step_s, (1, CAMERAS)),
+        time_s=np.tile(step_s * np.arange(T, dtype=np.float64)[:, None], (1, CAMERAS)),
     )  # fmt: skip
     config = ObservationConfig()
     sigmas = observation_sigmas(observations, truth, views, config, names)
