@@ -18,9 +18,9 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) --dist loadfile -
 demo: $(VENV)/installed
 	$(BIN)/shapepose-fg demo --output demo
 
-## Run the linter and the fast tests.
+## Run the linter and the fast tests (of some folders only: `make test TESTS=tests/io`).
 test: lint
-	$(PYTEST) -m "not slow"
+	$(PYTEST) -m "not slow" $(TESTS)
 
 ## Run what CI runs: linter, type checker and all tests, with all extras installed (torch among them).
 test-all: check

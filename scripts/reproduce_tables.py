@@ -154,7 +154,7 @@ def who_is_there(mocap: Mocap | None, split: Split, seeds: Sequence[int]) -> Ite
 
 
 def measure(case: Case) -> dict[str, Any]:
-    """`TrackingScore.as_dict` of a case, and `cpu_ms` a frame."""
+    """The figures of `score_tracks` for a case, and `cpu_ms` a frame."""
     scene = case.make().part(case.span)
     detections = simulate(scene, seed=case.seed)
     began = time.process_time()
@@ -162,7 +162,7 @@ def measure(case: Case) -> dict[str, Any]:
     people = reconstruct(detections, scene.rig, case.config, times=times, cuts=scene.cuts)
     cpu_ms = 1e3 * (time.process_time() - began) / len(scene)
     score = score_tracks(people, truth(scene), scene.fps, identities=case.config.temporal)
-    return score.as_dict() | {"cpu_ms": cpu_ms}
+    return score | {"cpu_ms": cpu_ms}
 
 
 def truth(scene: Scene) -> Reconstruction:

@@ -71,10 +71,15 @@ DEFINITIONS = (
 """The angles; docs/joint_angles.md describes them."""
 _BONES_ALONG = {"hip": "knee", "knee": "ankle", "shoulder": "elbow", "elbow": "wrist"}
 """Bones with a long axis: the joint at its proximal end, and the one at its distal end."""
-_LIMBS = np.array([NUM_BETAS + 3 * SMPL_24.index(f"{side}_{joint}") + axis
-                   for joint in ("hip", "knee", "ankle", "foot", "shoulder", "elbow", "wrist")
-                   for side in ("left", "right") for axis in range(3)])  # fmt: skip
-"""Columns of the Jacobian of the body's keypoints that belong to arms and legs."""
+_MOVED = np.delete(
+    np.arange(NUM_BETAS + 3 * len(SMPL_24) + 3),
+    [NUM_BETAS + 3 * SMPL_24.index(name) for name in ("pelvis", "spine1", "spine2", "spine3")],
+)
+"""Columns of the Jacobian of the body's keypoints for which the joints of a single frame have
+information: all but the flexion of pelvis and trunk."""
+_SHARED = 2.0
+"""Number of a person's joints whose errors count as one, since they are marginals of one graph with
+one body (coverage of `scripts/measure_angles.py`)."""
 _LEAST_INFORMATION = 1e-6
 """Added to the diagonal of the information, so that a row with few joints has an inverse."""
 _STEP = 1e-4
@@ -174,8 +179,8 @@ def joint_angles(
         rows = there[start : start + _BLOCK]
         part = people.rows(rows)
         posed = BodyParameters(*(getattr(part, name) for name in BODY))
-        local, rotations = _rotations(part, model, posed)
-        axes = segment_axes(model, posed.betas)
+        betas, local, rotations = _rotations(part, model, posed)
+        axes = segment_axes(model, betas)
         degrees[rows], slope = angles_and_slopes(local, axes, world, definitions)
         covariance[rows] = slope @ rotations @ slope.swapaxes(1, 2)
     return JointAngles(people, names, degrees, covariance)
@@ -277,21 +282,22 @@ def angles_and_slopes(
 
 def _rotations(
     people: Reconstruction, model: BodyModel, posed: BodyParameters
-) -> tuple[Array, Array]:
-    """Rotations (B, 24, 3, 3) of the bodies, and the covariance (B, 72, 72) of their right
-    tangents, rad².
+) -> tuple[Array, Array, Array]:
+    """Shapes (B, 10) and rotations (B, 24, 3, 3) of the bodies, and the covariance (B, 72, 72) of
+    the right tangents of the rotations, rad².
 
     The joints x that a view saw, with covariances C, measure the keypoints of the body, which have
     the Jacobian J. With the precision P of the prior of shape and pose, the covariance is
-    (J^T C^-1 J + P)^-1. Arms and legs are moved by a Gauss-Newton step to these joints; pelvis and
-    trunk stay as they were fitted, because few joints determine them.
+    (J^T C^-1 J / `_SHARED` + P)^-1. The bodies are moved by a Gauss-Newton step to these joints;
+    the flexion of pelvis and trunk stays as it was fitted over time, because the joints of a single
+    frame hardly determine it.
     """
     points, jacobian = model.keypoints_with_jacobian(posed)
     count, columns = len(points), jacobian.shape[-1]
     volume = np.linalg.det(np.nan_to_num(people.covariance))  # 0 if it is unknown or singular
     seen = Known.observed(people.known) & (volume > 0)
     known = seen[..., None, None]
-    weight = np.where(known, np.linalg.inv(np.where(known, people.covariance, np.eye(3))), 0)
+    weight = np.linalg.inv(np.where(known, people.covariance, np.eye(3))) * known / _SHARED
     flat = jacobian.reshape(count, -1, columns)
     weighted = (weight @ jacobian).reshape(flat.shape)
     information = flat.swapaxes(1, 2) @ weighted
@@ -308,6 +314,11 @@ def _rotations(
     residual = np.where(seen[..., None], people.joints - points, 0).reshape(count, -1, 1)
     pull = weighted.swapaxes(1, 2) @ residual
     step = np.zeros((count, columns, 1))
-    step[:, _LIMBS] = np.linalg.solve(information[:, _LIMBS[:, None], _LIMBS], pull[:, _LIMBS])
-    local = posed.local @ exp_so3(step[:, 10:82, 0].reshape(-1, 24, 3))
-    return local, np.where(seen.any(axis=1).reshape(-1, 1, 1), covariance, np.nan)
+    step[:, _MOVED] = np.linalg.solve(information[:, _MOVED[:, None], _MOVED], pull[:, _MOVED])
+    step = step[..., 0]
+    local = posed.local @ exp_so3(step[:, 10:82].reshape(-1, 24, 3))
+    return (
+        posed.betas + step[:, :10],
+        local,
+        np.where(seen.any(axis=1).reshape(-1, 1, 1), covariance, np.nan),
+    )

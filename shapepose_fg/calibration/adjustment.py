@@ -16,24 +16,21 @@ import numpy as np
 from gtsam.symbol_shorthand import B, C, L, X
 
 from factors.noise import diagonal, gaussian, isotropic_models, robust_kernel
-from shapepose_fg.body.model.rotation import exp_so3
 from shapepose_fg.calibration.people import People
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.decompositions import nearest_rotation
+from shapepose_fg.estimation.trajectory_graph import ANYWHERE_M, optimised
+from shapepose_fg.setup_check import fit
 
-TURN, MOVE, FOCAL, CENTRE, LENS = slice(0, 3), slice(3, 6), slice(6, 7), slice(7, 9), slice(9, 13)
-"""Slices of a camera's parameters: rotation, rad, and translation, m, along its own axes; log of
-the focal length; principal point, px; k1 k2 p1 p2."""
-Q = 13
+LENS = [9, 10, 11, 12]
+"""Parameters of a camera beside `fit.PARAMETERS`: k1 k2 p1 p2."""
+Q = fit.Q + len(LENS)
 _HELD = 1e-6
 """Standard deviation of fixed parameters, rad or m."""
 _HELD_PX = 0.1
 """Standard deviation added to those of intrinsics and distortion, pixels; tighter constraints on
 single parameters would slow the convergence of shared ones."""
-_ANYWHERE_M = 10.0
-_STEPS = 6
-_ENOUGH = 1e-4
 _PRIOR_WIDTH = 4.0
 """Width of the robust kernel of a camera's prior, in standard deviations of six parameters; a
 bumped camera must not pull the rig."""
@@ -61,7 +58,7 @@ class Freedom:
         """(Q,) prior standard deviation of each parameter of a camera."""
         turn, move = np.radians(self.turn_deg) / np.sqrt(3), self.move_m / np.sqrt(3)
         return np.array(
-            [turn] * 3 + [move] * 3 + [self.focal] + [self.centre_px] * 2 + [self.lens] * 4
+            [turn] * 3 + [move] * 3 + [self.centre_px] * 2 + [self.focal] + [self.lens] * 4
         )
 
 
@@ -76,11 +73,8 @@ class Adjusted:
     the gauge of the given rig."""
     people: People
     """The people, with joints at their adjusted positions."""
-    scale: float
-    """Ratio of the detector's errors to those measured for detectors: robust, from the
-    residuals."""
 
-    def sigma(self, part: slice) -> Array:
+    def sigma(self, part: list[int]) -> Array:
         """(V,) standard deviation of some of the parameters together: root of their summed
         variances.
         """
@@ -108,7 +102,6 @@ def adjust(
     detections' standard deviations.
     """
     freedoms = [freedom] * len(start) if isinstance(freedom, Freedom) else list(freedom)
-    free = any(each.lens > 0 for each in freedoms)
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     person, joint, view = np.nonzero(people.seen)
     points = people.points[person, joint]
@@ -117,11 +110,7 @@ def adjust(
     models = isotropic_models(
         2, scale * people.sigma_px[person, joint, view], robust_kernel("cauchy")
     )
-    seen = (
-        gtsam_unstable.ProjectionFactorPPPCCal3DS2
-        if free
-        else gtsam_unstable.ProjectionFactorPPPCCal3_S2
-    )
+    seen = gtsam_unstable.ProjectionFactorPPPCCal3DS2
     joints = [L(each) for each in key.tolist()]
     poses, lenses = ([letter(each) for each in view.tolist()] for letter in (X, C))
     for each in zip(xy, models, poses, joints, lenses, strict=True):
@@ -134,31 +123,23 @@ def adjust(
     priors, kernel = gtsam.NonlinearFactorGraph(), robust_kernel("cauchy", _PRIOR_WIDTH * weight)
     for each, (camera, before) in enumerate(zip(start.cameras, given.cameras, strict=True)):
         values.insert(X(each), gtsam.Pose3(camera.wTc))
-        values.insert(C(each), _lens(camera, free))
+        values.insert(C(each), _lens(camera, camera))
         sigmas = freedoms[each].sigmas / weight
         pose = diagonal(
             np.full(6, _HELD) if each == reference else np.maximum(sigmas[:6], _HELD), kernel
         )
         priors.addPriorPose3(X(each), gtsam.Pose3(before.wTc), pose)
-        noise = gaussian(_lens_covariance(before, sigmas, free))
-        factor = gtsam.PriorFactorCal3DS2 if free else gtsam.PriorFactorCal3_S2
-        priors.add(factor(C(each), _lens(before, free), noise))  # type: ignore[arg-type]
+        noise = gaussian(_lens_covariance(before, sigmas))
+        priors.add(gtsam.PriorFactorCal3DS2(C(each), _lens(before, camera), noise))
     priors.addPriorPose3(B(0), gtsam.Pose3(), diagonal(np.full(6, _HELD)))
     last = [B(0), *(letter(each) for letter in (X, C) for each in range(len(start)))]
-    order = gtsam.Ordering()
-    for each in [*dict.fromkeys(joints), *last]:
-        order.push_back(each)
-    # Ceres' damping uses each parameter's own information, since pixels and metres are mixed.
-    params = gtsam.LevenbergMarquardtParams.CeresDefaults()
-    params.setMaxIterations(_STEPS)
-    params.setRelativeErrorTol(_ENOUGH)
-    params.setOrdering(order)
     both = gtsam.NonlinearFactorGraph(graph)
     both.push_back(priors)
-    found = gtsam.LevenbergMarquardtOptimizer(both, values, params).optimize()
-    rig = replace(
-        start, cameras=tuple(_camera(start.cameras[v], found, v, free) for v in range(len(start)))
-    )
+    found = optimised(both, values, [*dict.fromkeys(joints), *last])
+    cameras = [
+        _camera(camera, found, view, freedoms[view]) for view, camera in enumerate(start.cameras)
+    ]
+    rig = replace(start, cameras=tuple(cameras))
     moved = np.full_like(people.points, np.nan)
     moved[person[first], joint[first]] = [found.atPoint3(joints[place]) for place in first.tolist()]
     placed = replace(people, points=moved)
@@ -166,76 +147,55 @@ def adjust(
     depth = np.moveaxis(rig.project(moved)[1], 0, 2)[person, joint, view]
     for each in dict.fromkeys(joints[place] for place in np.flatnonzero(depth <= 0).tolist()):
         graph.addPriorPoint3(
-            each, found.atPoint3(each), gtsam.noiseModel.Isotropic.Sigma(3, _ANYWHERE_M)
+            each, found.atPoint3(each), gtsam.noiseModel.Isotropic.Sigma(3, ANYWHERE_M)
         )
     information = (
-        _information(graph, found, list(dict.fromkeys(joints)), view.tolist(), rig, free) / dilution
+        _information(graph, found, list(dict.fromkeys(joints)), view.tolist(), rig) / dilution
     )
     prior = np.stack([each.sigmas for each in freedoms])
     covariance = _covariance(information, rig, prior, reference, scaled)
-    return Adjusted(rig, covariance, placed, scale * misfit(placed, rig, scale))
+    return Adjusted(rig, covariance, placed)
 
 
-def misfit(people: People, rig: Rig, scale: float = 1.0) -> float:
-    """Ratio of the median residual to its expectation under the standard deviations (times
-    `scale`): ideally 1.
-    """
+def misfit(people: People, rig: Rig) -> float:
+    """Ratio of the median residual to its expectation under the standard deviations: ideally 1."""
     views = people.seen.sum(axis=-1, keepdims=True)
     seen, _ = rig.project(people.points)
-    away = np.linalg.norm(np.moveaxis(seen, 0, 2) - people.xy, axis=-1) / (scale * people.sigma_px)
+    away = np.linalg.norm(np.moveaxis(seen, 0, 2) - people.xy, axis=-1) / people.sigma_px
     # A joint seen by n views uses up 3 of its 2 n residuals.
     left = np.sqrt(np.maximum(1 - 1.5 / np.maximum(views, 2), 0.25))
     return float(np.median((away / left)[people.seen]) / np.sqrt(2 * np.log(2)))
 
 
-def _lens(camera: Camera, free: bool) -> gtsam.Cal3DS2 | gtsam.Cal3_S2:
-    K, d = camera.K, camera.distortion
-    five = (K[0, 0], K[1, 1], K[0, 1], K[0, 2], K[1, 2])
-    return gtsam.Cal3DS2(*five, *d[:4]) if free else gtsam.Cal3_S2(*five)
+def _lens(camera: Camera, relative_to: Camera) -> gtsam.Cal3DS2:
+    """The lens, for pixels that were undistorted with the distortion `relative_to`."""
+    K, d = camera.K, (camera.distortion - relative_to.distortion)[:4]
+    return gtsam.Cal3DS2(K[0, 0], K[1, 1], K[0, 1], K[0, 2], K[1, 2], *d)
 
 
-def _lens_columns(camera: Camera, free: bool) -> Array:
-    """(5 or 9, Q - 6) derivatives of fx fy s u v k1 k2 p1 p2 by the parameters."""
-    columns = np.zeros((9 if free else 5, Q - 6))
-    columns[0, 0], columns[1, 0] = camera.K[0, 0], camera.K[1, 1]
-    columns[3, 1] = columns[4, 2] = 1.0
-    if free:
-        columns[5:, 3:] = np.eye(4)
+def _lens_columns(camera: Camera) -> Array:
+    """(9, Q - 6) derivatives of fx fy s u v k1 k2 p1 p2 by the parameters."""
+    columns = np.zeros((9, Q - 6))
+    columns[3, 0] = columns[4, 1] = 1.0
+    columns[0, 2], columns[1, 2] = camera.K[0, 0], camera.K[1, 1]
+    columns[5:, 3:] = np.eye(4)
     return columns
 
 
-def _lens_covariance(camera: Camera, sigmas: Array, free: bool) -> Array:
-    columns = _lens_columns(camera, free)
-    held = (
-        np.diag(
-            np.r_[_HELD_PX * np.ones(5), _HELD_PX / camera.K[0, 0] * np.ones(4)][: len(columns)]
-        )
-        ** 2
-    )
-    return columns @ np.diag(sigmas[6:] ** 2) @ columns.T + held
+def _lens_covariance(camera: Camera, sigmas: Array) -> Array:
+    columns, held = _lens_columns(camera), np.repeat(_HELD_PX, 9)
+    held[5:] /= camera.K[0, 0]
+    return columns @ np.diag(sigmas[6:] ** 2) @ columns.T + np.diag(held**2)
 
 
-def changed(camera: Camera, by: Array) -> Camera:
-    """The camera with pose and lens changed by small amounts (Q,) of its parameters."""
-    K, wTc = camera.K.copy(), camera.wTc.copy()
-    K[[0, 1], [0, 1]] *= np.exp(by[FOCAL])
-    K[:2, 2] += by[CENTRE]
-    wTc[:3, 3] += wTc[:3, :3] @ by[MOVE]
-    wTc[:3, :3] = wTc[:3, :3] @ exp_so3(by[TURN])
-    return replace(camera, K=K, wTc=wTc)
-
-
-def _camera(camera: Camera, values: gtsam.Values, view: int, free: bool) -> Camera:
+def _camera(camera: Camera, values: gtsam.Values, view: int, freedom: Freedom) -> Camera:
     """The adjusted camera."""
-    wTc, lens = (
-        values.atPose3(X(view)).matrix(),
-        values.atCal3DS2(C(view)) if free else values.atCal3_S2(C(view)),
-    )
-    K, distortion = lens.K(), camera.distortion.copy()
-    if free:
-        distortion[:4] = lens.vector()[5:]
+    wTc, lens = values.atPose3(X(view)).matrix(), values.atCal3DS2(C(view))
+    distortion = camera.distortion.copy()
+    if freedom.lens > 0:
+        distortion[:4] += lens.vector()[5:]
     wTc[:3, :3] = nearest_rotation(wTc[:3, :3])
-    return replace(camera, K=K, wTc=wTc, distortion=distortion)
+    return replace(camera, K=lens.K(), wTc=wTc, distortion=distortion)
 
 
 def _information(
@@ -244,22 +204,18 @@ def _information(
     joints: Sequence[int],
     views: Sequence[int],
     rig: Rig,
-    free: bool,
 ) -> Array:
     """(V Q, V Q) information about the cameras' parameters, joints eliminated."""
-    first, last = gtsam.Ordering(), gtsam.Ordering()
-    for each in joints:
-        first.push_back(each)
-    lens = 9 if free else 5
+    first, last = gtsam.Ordering(joints), gtsam.Ordering()
     # Map GTSAM's parameters to ours; a camera without sightings is in no factor.
     seen, count = sorted(set(views)), len(rig)
-    to = np.zeros((len(seen) * (6 + lens), count * Q))
+    to = np.zeros((len(seen) * 15, count * Q))
     for n, view in enumerate(seen):
         last.push_back(X(view))
         last.push_back(C(view))
-        at, ours = n * (6 + lens), view * Q
+        at, ours = n * 15, view * Q
         to[at : at + 6, ours : ours + 6] = np.eye(6)
-        to[at + 6 : at + 6 + lens, ours + 6 : ours + Q] = _lens_columns(rig.cameras[view], free)
+        to[at + 6 : at + 15, ours + 6 : ours + Q] = _lens_columns(rig.cameras[view])
     last.push_back(B(0))
     _, rest = graph.linearize(values).eliminatePartialMultifrontal(first)
     information = rest.hessian(last)[0][: len(to), : len(to)]  # the lens is fixed to the body

@@ -1,20 +1,15 @@
-"""Poses of all cameras from relative poses of pairs: best spanning tree by agreement, then a pose
-graph.
+"""Approximate poses of all cameras from relative poses of pairs: the spanning tree that most pairs
+agree with.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import X
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from factors.noise import gaussian, robust_kernel
-from shapepose_fg.calibration.relative import Relative
 from shapepose_fg.core.arrays import Array
-from shapepose_fg.core.decompositions import rigid
 from shapepose_fg.setup_check.fit import difference
 
 _TREES = 100
@@ -23,9 +18,6 @@ pairs."""
 _AGREE_DEG = 8.0
 """Deviation within which a pair agrees, degrees: right pairs are off by 0.3 to 4 in simulated
 recordings and on Shelf."""
-_LEAST, _LENGTH = np.radians(0.3), 0.1
-"""Minimum standard deviation of a pair's rotation and direction, rad, and of its length, as a
-share."""
 
 
 @dataclass(frozen=True)
@@ -36,21 +28,6 @@ class Edge:
     """(4, 4) the second camera's frame from the first's."""
     score: float
     """Score of the pair (`Relative.score`)."""
-    covariance: Array
-    """(6, 6) covariance of bTa in GTSAM's tangent, in the first camera's frame: rotation, rad, then
-    translation, m."""
-
-    @classmethod
-    def of(cls, pair: Relative, metres: float) -> "Edge":
-        """Edge of a pair whose cameras are `metres` apart."""
-        bTa = rigid(pair.R, metres * pair.t)
-        way = pair.t / np.linalg.norm(pair.t)
-        covariance = pair.covariance + _LEAST**2 * np.diag(np.r_[1.0, 1, 1, 0, 0, 0])
-        covariance[3:, 3:] += _LEAST**2 * (np.eye(3) - np.outer(way, way)) + _LENGTH**2 * np.outer(
-            way, way
-        )
-        to = np.kron(np.diag([1.0, metres]), pair.R.T)
-        return cls(bTa, pair.score, to @ covariance @ to.T)
 
 
 def arranged(edges: Mapping[tuple[int, int], Edge], views: int) -> Array:
@@ -65,7 +42,7 @@ def arranged(edges: Mapping[tuple[int, int], Edge], views: int) -> Array:
         poses = _tree([pair for pair, _ in order], edges, views)
         if (agree := agreement(poses, edges)) > most:
             best, most = poses, agree
-    return _together(best, edges)
+    return best
 
 
 def agreement(poses: Array, edges: Mapping[tuple[int, int], Edge]) -> float:
@@ -93,19 +70,6 @@ def _tree(order: list[tuple[int, int]], edges: Mapping[tuple[int, int], Edge], v
             poses[a] = poses[b] @ edges[a, b].bTa
         found |= {a, b}
     return poses
-
-
-def _together(poses: Array, edges: Mapping[tuple[int, int], Edge]) -> Array:
-    """Poses refined by a pose graph of all pairs, with a robust kernel (Cauchy)."""
-    graph, values, kernel = gtsam.NonlinearFactorGraph(), gtsam.Values(), robust_kernel("cauchy")
-    for view, pose in enumerate(poses):
-        values.insert(X(view), gtsam.Pose3(pose))
-    for (a, b), edge in edges.items():
-        noise = gaussian((edge.covariance + edge.covariance.T) / 2, kernel)
-        graph.add(gtsam.BetweenFactorPose3(X(b), X(a), gtsam.Pose3(edge.bTa), noise))
-    graph.addPriorPose3(X(0), gtsam.Pose3(poses[0]), gtsam.noiseModel.Isotropic.Sigma(6, 1e-4))
-    found = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
-    return np.stack([found.atPose3(X(view)).matrix() for view in range(len(poses))])
 
 
 def parts(pairs: Mapping[tuple[int, int], object], views: int) -> list[list[int]]:

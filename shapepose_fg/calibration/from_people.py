@@ -7,33 +7,36 @@ undetermined result is rejected.
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import combinations
 from typing import Any
 
 import numpy as np
 
-from shapepose_fg.calibration.adjustment import FOCAL, MOVE, TURN, Adjusted, Freedom, adjust, misfit
+from shapepose_fg.calibration.adjustment import Adjusted, Freedom
 from shapepose_fg.calibration.arrangement import Edge, arranged, parts
 from shapepose_fg.calibration.levelling import (
     ADULT_M,
+    CONTRADICTS,
     Measured,
     World,
+    apart,
     at_once,
+    grown,
     levelled,
     scale_of,
-    scaled,
     sigma_of_scale,
 )
-from shapepose_fg.calibration.people import LEAST_PEOPLE, Footage, People, missed_px
-from shapepose_fg.calibration.refinement import dilution
+from shapepose_fg.calibration.people import LEAST_PEOPLE, Footage, missed_px
+from shapepose_fg.calibration.refinement import FILM, Steps, Undetermined, halves, settle
 from shapepose_fg.calibration.relative import Relative, relative
 from shapepose_fg.calibration.tracks import OneClock, Tracks, seen_at
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig, Views
-from shapepose_fg.core.decompositions import nearest_rotation
+from shapepose_fg.core.decompositions import rigid
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.frame_times import FrameTimes
-from shapepose_fg.core.skeleton import Skeleton
+from shapepose_fg.setup_check.fit import FOCAL, MOVE, TURN
 from shapepose_fg.setup_check.matching import Sightings
 
 _BURST_S, _BURSTS = 10.0, 6
@@ -42,31 +45,13 @@ recording."""
 _FEW, _ROUGH, _ROUNDS, _HALF_ROUNDS = 30, 6, 6, 2
 """Number of frames in the first rounds, number of these rounds, of rounds with all frames, and of
 rounds with each half of them."""
-_STILL_DEG = 0.03
-"""Rotation per round below which cameras have converged, degrees."""
 _LEAST_SCORE, _LEAST_S = 0.15, 3.0
 """Minimum score of a pair of cameras, and minimum common person-seconds."""
 _MOST_SIGMA_DEG, _MOST_APART_DEG = 1.0, 2.0
 """Maximum standard deviation of a rotation, and maximum difference between halves of the recording,
 degrees."""
-_UNUSUAL = 3.0
-"""Maximum deviation of stature, in standard deviations, for people assumed to be adults."""
 KNOWN_LENS = Freedom()
 """Lenses that are not adjusted."""
-_FILM = (
-    "film people for a minute who walk through all views, near and far, not on one line, and move "
-    "their arms"
-)
-
-
-class Undetermined(ValueError):
-    """The people do not determine the cameras; `problems` has a sentence each with
-    cause and cure.
-    """
-
-    def __init__(self, problems: tuple[str, ...], found: "Calibrated | None" = None):
-        super().__init__("; ".join(problems))
-        self.problems, self.found = problems, found
 
 
 @dataclass(frozen=True)
@@ -159,39 +144,27 @@ def calibrate(
     not determine them; InputError if measured distances contradict each other.
     """
     measured = measured or Measured()
-    views, total = len(rig), len(rig) * (len(rig) - 1) // 2 + _ROUGH + _ROUNDS + 2 * _HALF_ROUNDS
-    done = 0
-
-    def told(more: int = 1) -> None:
-        nonlocal done
-        done += more
-        progress(done, total)
-
+    views = len(rig)
+    told = Steps(progress, views * (views - 1) // 2 + _ROUGH + _ROUNDS + 2 * _HALF_ROUNDS)
     footage = Footage.of(detections, rig, times, frames)
     lenses = [lens] * views if isinstance(lens, Freedom) else lens
     freedom = tuple(replace(each, turn_deg=20.0, move_m=1.0) for each in lenses)
     taken = np.unique(footage.sightings.frame)
-    how = _How(rig, times, freedom, detections.skeleton, measured.stature_m, told)
+    scale = partial(scale_of, skeleton=detections.skeleton, stature_m=measured.stature_m)
+    fit = partial(settle, given=rig, times=times, freedom=freedom, told=told, scale=scale)
     if start is None:
         pairs = _pairs(detections, rig, times, frames, told)
         if len(connected := parts(pairs, views)) > 1:
             raise Undetermined(tuple(_apart(rig, connected)))
-        edges = {
-            pair: _edge(each, detections.skeleton, measured.stature_m)
-            for pair, each in pairs.items()
-        }
+        edges = {pair: _edge(each, scale) for pair, each in pairs.items()}
         few = footage.at(taken[np.unique(np.linspace(0, len(taken) - 1, _FEW).astype(np.intp))])
-        start = how.settled(few, rig.at_poses(arranged(edges, views)), _ROUGH).rig
-    adjusted = how.settled(footage, start, _ROUNDS)
-    halves, missed = list[Rig](), list[Array]()
-    for used, left in (both := np.array_split(taken, 2)), both[::-1]:
-        half = how.settled(footage.at(used), adjusted.rig, _HALF_ROUNDS).rig
-        away = missed_px(footage.at(left).people(half), half)
-        halves.append(half)
-        missed.append(away.reshape(-1, len(rig)))
+        start = fit(few, rig.at_poses(arranged(edges, views)), _ROUGH).rig
+    adjusted = fit(footage, start, _ROUNDS)
+    both = halves(footage, partial(fit, now=adjusted.rig, rounds=_HALF_ROUNDS))
+    missed = np.concatenate([missed_px(people, rig).reshape(-1, views) for rig, people in both])
     if measured.distances:
         factor, sigma = measured.size_of(adjusted)
-        adjusted = _grown(adjusted, factor)
+        adjusted = grown(adjusted, factor)
     else:
         sigma = sigma_of_scale(at_once(adjusted.people), measured.stature_m is not None)
     new, world = levelled(adjusted.rig, adjusted.people, detections.skeleton, sigma)
@@ -200,12 +173,12 @@ def calibrate(
         adjusted.people, points=adjusted.people.points @ moved[:3, :3].T + moved[:3, 3]
     )
     found = _judged(
-        replace(adjusted, rig=new, people=people), world, halves, np.concatenate(missed), footage
+        replace(adjusted, rig=new, people=people), world, [rig for rig, _ in both], missed, footage
     )
     if not measured.distances:
         return found
     notes, tall = measured.better(adjusted, sigma), np.log(world.stature_m / ADULT_M)
-    if abs(tall) >= _UNUSUAL * sigma_of_scale(world.persons, False):
+    if abs(tall) >= CONTRADICTS * sigma_of_scale(world.persons, False):
         what = f"the median stature of people is {world.stature_m:.2f} m"
         notes += (f"{what}; if they are adults, measure the distance of the cameras again",)
     return replace(found, notes=notes)
@@ -242,7 +215,7 @@ def own_tracks(sightings: Sightings, rig: Rig, fps: float) -> list[Tracks]:
     if len(few := np.flatnonzero(seen_s < _LEAST_S)) > 0:
         figures = ", ".join(f"{each:.1f}" for each in seen_s[few])
         least = f"at least {_LEAST_S:g} s of a person are needed, but only {figures} s are seen"
-        raise Undetermined((f"{_named(rig, few)}: {least}; {_FILM}",))
+        raise Undetermined((f"{_named(rig, few)}: {least}; {FILM}",))
     still = Views(rig.K, np.tile(np.eye(3, 4), (len(rig), 1, 1)))
     return [Tracks.of(sightings, still, view, fps) for view in range(len(rig))]
 
@@ -252,7 +225,7 @@ def _apart(rig: Rig, connected: list[list[int]]) -> list[str]:
     most = " ".join(rig.names[view] for view in connected[0])
     return [
         f"{_named(rig, part)}: too few people are seen there and by {most} at the same times, or "
-        f"cameras are not synchronised; {_FILM}, where views overlap"
+        f"cameras are not synchronised; {FILM}, where views overlap"
         for part in connected[1:]
     ]
 
@@ -263,81 +236,17 @@ def _named(rig: Rig, views: Iterable[int]) -> str:
     return f"camera{'s' if len(names) > 1 else ''} {' '.join(names)}"
 
 
-def _edge(pair: Relative, skeleton: Skeleton, stature_m: float | None) -> Edge:
-    people = People(
-        np.zeros(len(pair.points), np.intp),
-        pair.points[..., None, :2],
-        pair.points[..., :1],
-        pair.points,
-    )
-    metres = scale_of(people, skeleton, stature_m)
-    return Edge.of(pair, metres if np.isfinite(metres) else 3.0)
-
-
-@dataclass(frozen=True)
-class _How:
-    """Arguments that all rounds of adjustment share."""
-
-    given: Rig
-    times: FrameTimes
-    freedom: tuple[Freedom, ...]
-    skeleton: Skeleton
-    stature_m: float | None
-    told: Callable[[int], None]
-
-    def settled(self, footage: Footage, now: Rig, rounds: int) -> Adjusted:
-        """Cameras after several rounds of association and adjustment, starting at `now`, in
-        metres.
-        """
-        adjusted: Adjusted | None = None
-        for step in range(rounds):
-            people = footage.people(now)
-            if len(people) < LEAST_PEOPLE or not people.seen.any():
-                raise Undetermined(
-                    (
-                        f"only {len(people)} people are seen by two cameras at once, but at "
-                        f"least 10 are needed; {_FILM}",
-                    )
-                )
-            given = self.given.at_poses(now.wTc)
-            spread = dilution(self.times.frame_s[np.unique(people.frame)])
-            adjusted = adjust(
-                given, now, people, self.freedom, spread, misfit(people, now), scaled=True
-            )
-            factor = scale_of(adjusted.people, self.skeleton, self.stature_m)
-            if not np.isfinite(factor):
-                raise Undetermined(
-                    (f"no arms and legs are seen by two cameras, so the scale is unknown; {_FILM}",)
-                )
-            adjusted = _grown(adjusted, factor)
-            before, now = now, adjusted.rig
-            still = _apart_by(before, now)[0].max() < _STILL_DEG
-            self.told(rounds - step if still else 1)
-            if still:
-                break
-        assert adjusted is not None
-        return adjusted
-
-
-def _grown(adjusted: Adjusted, factor: float) -> Adjusted:
-    """Cameras, people and covariances scaled to another unit."""
-    unit = np.ones(adjusted.covariance.shape[1])
-    unit[MOVE] = factor
-    covariance = adjusted.covariance * unit[:, None, None] * unit
-    return replace(
-        adjusted,
-        rig=scaled(adjusted.rig, factor),
-        covariance=covariance,
-        people=replace(adjusted.people, points=factor * adjusted.people.points),
-    )
+def _edge(pair: Relative, scale: Callable[[Array], float]) -> Edge:
+    metres = scale(pair.points)
+    return Edge(rigid(pair.R, (metres if np.isfinite(metres) else 3.0) * pair.t), pair.score)
 
 
 def _judged(
-    adjusted: Adjusted, world: World, halves: list[Rig], missed: Array, footage: Footage
+    adjusted: Adjusted, world: World, rigs: list[Rig], missed: Array, footage: Footage
 ) -> Calibrated:
     """The validated result; raises Undetermined with the problems."""
     rig, people = adjusted.rig, adjusted.people
-    apart_deg, apart_m = _apart_by(*halves)
+    apart_deg, apart_m = apart(*rigs)
     counts = people.seen.any(axis=1).sum(axis=0)
     seen = np.bincount(footage.sightings.view, minlength=len(rig))
     held = float(np.nanmedian(missed)) if np.isfinite(missed).any() else np.nan
@@ -368,22 +277,10 @@ def _judged(
         ),
     )
     problems = [
-        f"{_named(rig, views)}: {words.format(', '.join(map(str, amounts[views])))}; {_FILM}"
+        f"{_named(rig, views)}: {words.format(', '.join(map(str, amounts[views])))}; {FILM}"
         for wrong, amounts, words in kinds
         if len(views := np.flatnonzero(wrong)) > 0
     ]
     if problems:
         raise Undetermined(tuple(problems), found)
     return found
-
-
-def _apart_by(one: Rig, other: Rig) -> tuple[Array, Array]:
-    """(V,) degrees and metres between the cameras of two rigs, after alignment by a similarity."""
-    near, far = (np.stack([camera.wTc[:3, :3] for camera in each.cameras]) for each in (one, other))
-    a, b = (each.centres - each.centres.mean(axis=0) for each in (one, other))
-    size = max(float(np.linalg.norm(a) * np.linalg.norm(b)) / len(one), 1e-9)
-    R = nearest_rotation(b.T @ a / size + np.einsum("vij,vkj->ik", far, near))
-    grown = float(np.linalg.norm(b) / max(np.linalg.norm(a), 1e-9))
-    turned = np.einsum("ij,vjk,vik->v", R, near, far)  # the traces of far' R near
-    turns = np.degrees(np.arccos(np.clip((turned - 1) / 2, -1.0, 1.0)))
-    return turns, np.linalg.norm(grown * a @ R.T - b, axis=1)

@@ -2,19 +2,21 @@
 0.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from shapepose_fg.calibration.adjustment import MOVE, Adjusted
+from shapepose_fg.calibration.adjustment import Adjusted
 from shapepose_fg.calibration.people import People
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.decompositions import nearest_rotation
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.floor import Floor, find_floor
 from shapepose_fg.setup_check.diagnosis import build_of
 from shapepose_fg.setup_check.findings import ADULT_M as ADULT_M
+from shapepose_fg.setup_check.fit import MOVE
 
 _PERSON, _KNOWN_PERSON, _COMMON = 0.07, 0.02, 0.025
 """Standard deviations of the scale from `build_of`, as shares: of bones among adults, and among
@@ -23,7 +25,7 @@ _TAPE_M = 0.02
 """Standard deviation of a distance between lenses that was measured with a tape, m."""
 _CLEARLY = 1.3
 """Ratio of standard deviations from which another measurement is recommended."""
-_CONTRADICTS = 4.0
+CONTRADICTS = 3.0
 """Number of standard deviations above which measurements contradict each other."""
 _LEAN_RAD = np.radians(3.0)
 """Maximum lean of people's mean trunk for the search of the floor, rad."""
@@ -79,7 +81,7 @@ class Measured:
         weight, said = 1 / sigma**2, np.log(metres / length)
         log = float(np.average(said, weights=weight))
         worst = int(np.abs((said - log) / sigma).argmax())
-        if abs(said[worst] - log) > _CONTRADICTS * sigma[worst]:
+        if abs(said[worst] - log) > CONTRADICTS * sigma[worst]:
             a, b, given = self.distances[worst]
             raise InputError(
                 f"distance of {rig.names[a]} and {rig.names[b]}: people and the other distances "
@@ -106,11 +108,11 @@ class World:
     most."""
 
 
-def scale_of(people: People, skeleton: Skeleton, stature_m: float | None) -> float:
-    """Metres per unit of the people's positions, for a median stature `stature_m`, or an adult's;
-    NaN without bones.
+def scale_of(points: Array, skeleton: Skeleton, stature_m: float | None) -> float:
+    """Metres per unit of people's joints (P, J, 3), for a median stature `stature_m`, or an
+    adult's; NaN without bones.
     """
-    return (stature_m or ADULT_M) / build_of(people.points, skeleton).stature
+    return (stature_m or ADULT_M) / build_of(points, skeleton).stature
 
 
 def scaled(rig: Rig, factor: float, fixed: Array | float = 0.0) -> Rig:
@@ -118,6 +120,30 @@ def scaled(rig: Rig, factor: float, fixed: Array | float = 0.0) -> Rig:
     wTc = rig.wTc
     wTc[:, :3, 3] = fixed + factor * (wTc[:, :3, 3] - fixed)
     return rig.at_poses(wTc)
+
+
+def grown(adjusted: Adjusted, factor: float) -> Adjusted:
+    """Cameras, people and covariances scaled by `factor` about the origin."""
+    unit = np.ones(adjusted.covariance.shape[1])
+    unit[MOVE] = factor
+    return replace(
+        adjusted,
+        rig=scaled(adjusted.rig, factor),
+        covariance=adjusted.covariance * unit[:, None, None] * unit,
+        people=replace(adjusted.people, points=factor * adjusted.people.points),
+    )
+
+
+def apart(one: Rig, other: Rig) -> tuple[Array, Array]:
+    """(V,) degrees and metres between the cameras of two rigs, after alignment by a similarity."""
+    near, far = (np.stack([camera.wTc[:3, :3] for camera in each.cameras]) for each in (one, other))
+    a, b = (each.centres - each.centres.mean(axis=0) for each in (one, other))
+    size = max(float(np.linalg.norm(a) * np.linalg.norm(b)) / len(one), 1e-9)
+    R = nearest_rotation(b.T @ a / size + np.einsum("vij,vkj->ik", far, near))
+    grown = float(np.linalg.norm(b) / max(np.linalg.norm(a), 1e-9))
+    turned = np.einsum("ij,vjk,vik->v", R, near, far)  # the traces of far' R near
+    turns = np.degrees(np.arccos(np.clip((turned - 1) / 2, -1.0, 1.0)))
+    return turns, np.linalg.norm(grown * a @ R.T - b, axis=1)
 
 
 def at_once(people: People) -> int:

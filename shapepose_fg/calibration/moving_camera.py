@@ -13,20 +13,19 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
-from shapepose_fg.calibration.adjustment import Adjusted, changed
+from shapepose_fg.calibration.adjustment import Adjusted
 from shapepose_fg.calibration.from_people import Undetermined
-from shapepose_fg.calibration.people import Footage, People
+from shapepose_fg.calibration.people import MIN_DEPTH_M, Footage, People
 from shapepose_fg.calibration.refinement import dilution
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Camera, Rig, Views
 from shapepose_fg.core.decompositions import nearest_rotation, rigid
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.trajectory import Trajectory
-from shapepose_fg.setup_check.matching import Sightings, median_of
+from shapepose_fg.setup_check.fit import POSE, Q, by_parameters, seen_by
+from shapepose_fg.setup_check.matching import Sightings, follow, median_of
 
 _STEP_S, _LONGEST_S = 0.2, 180.0
 """Time between the moments at which people are placed, and duration used of a longer recording,
@@ -67,9 +66,9 @@ _WIDTH = 2.385
 _RIGID, _LONG_M, _FEWEST = 0.1, 0.25, 3
 """Maximum relative variation of the distance of two joints of a bone, its minimum, m, and minimum
 number of bones that give the distance of a person."""
-_LEAST_DEPTH_M, _SIGMA_M, _MOUNT_RAD = 0.3, 0.03, np.radians(0.5)
-"""Minimum depth, and standard deviation of a detected joint from its position by other cameras, m;
-and that of the principal point of a lens without calibration, as an angle."""
+_SIGMA_M, _MOUNT_RAD = 0.03, np.radians(0.5)
+"""Standard deviation of a detected joint from its position by other cameras, m, and of the
+principal point of a lens without calibration, as an angle."""
 _QUARTERS = rigid(
     Rotation.from_euler("z", [[90 * n] for n in range(4)], degrees=True).as_matrix(),
     np.zeros((4, 3)),
@@ -100,26 +99,19 @@ class Placed:
         cls, time_s: Array, moment: Index, points: Array, spread: Array | None = None
     ) -> "Placed":
         """People at times (P,), linked between consecutive moments."""
-        one, other = list[int](), list[int]()
-        for now in np.unique(moment).tolist():
-            here, there = np.flatnonzero(moment == now), np.flatnonzero(moment == now + 1)
-            if len(there) == 0:
-                continue
-            away = median_of(
-                np.linalg.norm(points[here][:, None] - points[there], axis=-1), _FEWEST
-            )
-            near = away.argmin(axis=1)
-            mutual = away.argmin(axis=0)[near] == np.arange(len(here))
-            mutual &= away.min(axis=1) < _SAME_M
-            one += here[mutual].tolist()
-            other += there[near[mutual]].tolist()
-        links = coo_array((np.ones(len(one)), (one, other)), shape=(len(moment),) * 2)
+
+        def away(one: Index, other: Index) -> Array:
+            far = np.linalg.norm(points[one][:, None] - points[other], axis=-1)
+            return median_of(far, _FEWEST)
+
+        track = follow(moment, away, _SAME_M, 1)
+        order = np.lexsort((moment, track))
+        one, other = (pair[np.diff(track[order]) == 0] for pair in (order[:-1], order[1:]))
         before, after = np.arange(len(moment)), np.arange(len(moment))
         before[other], after[one] = one, other
         lasts = np.maximum(time_s[after] - time_s[before], _STEP_S / 2)[:, None, None]
         velocity = np.nan_to_num((points[after] - points[before]) / lasts)
         spread = np.zeros((0, *points.shape)) if spread is None else spread
-        track = connected_components(links, False)[1]
         return cls(time_s, moment, points, velocity, track, spread)
 
     @classmethod
@@ -143,10 +135,6 @@ class Placed:
         spread = _moved_by(people, found)
         return cls.of(moments[people.frame], people.frame, people.points, spread)
 
-    def changed(self) -> list["Placed"]:
-        """The people, moved by each of the independent errors of the fixed cameras."""
-        return [replace(self, points=self.points + each) for each in self.spread]
-
     def grid(self, track: int, length: int) -> Array:
         """(length, J, 3) positions of a track by moment; NaN where unknown."""
         rows = np.flatnonzero(self.track == track)
@@ -166,18 +154,16 @@ def _moved_by(people: People, found: Adjusted) -> Array:
     values, vectors = np.linalg.eigh(square / scale / scale[:, None])
     kept = values > _LEAST_VARIANCE
     errors = (sigma[:, None] * vectors[:, kept] * np.sqrt(values[kept])).T
-    points = np.nan_to_num(people.points)
-    xy, _, by_point = Views.of(rig).project(points)
-    weight = np.where(people.seen, 1 / people.sigma_px, 0.0)[..., None]
-    by_point = np.nan_to_num(by_point) * weight[..., None]
+    views, points = Views.of(rig), np.nan_to_num(people.points)
+    xy, at, by_place = seen_by(points, views)
+    by_camera = by_parameters(xy, at, by_place, views)
+    by_camera[..., POSE] *= -1  # poses are those of the cameras in the world
+    weight = np.where(people.seen, 1 / people.sigma_px, 0.0)[..., None, None]
+    by_point, by_camera = weight * (by_place @ views.cTw[:, :, :3]), weight * by_camera
     inverse = np.linalg.pinv(np.einsum("pjvri,pjvrk->pjik", by_point, by_point), hermitian=True)
-    moved = list[Array]()
-    for error in errors.reshape(len(errors), *found.covariance.shape[:2]):
-        cameras = tuple(map(changed, rig.cameras, _TINY * error))
-        other, *_ = Views.of(replace(rig, cameras=cameras)).project(points)
-        missed = np.nan_to_num(weight * (other - xy) / _TINY)
-        moved.append(-np.einsum("pjik,pjvrk,pjvr->pji", inverse, by_point, missed))
-    return np.reshape(moved, (len(moved), *points.shape))
+    errors = errors.reshape(len(errors), *found.covariance.shape[:2])[..., :Q]
+    missed = np.einsum("pjvrq,mvq->mpjvr", by_camera, errors)
+    return -np.einsum("pjik,pjvrk,mpjvr->mpji", inverse, by_point, missed, optimize=True)
 
 
 @dataclass(frozen=True)
@@ -242,11 +228,17 @@ class Start:
             "sigma_move_mm": round(1e3 * self.sigma_move_m, 1),
         }
 
-    def tolerated(self) -> str:
-        """Degrees and mm, rounded up, that two standard deviations of the poses do not exceed."""
-        sigmas = (20 * self.sigma_turn_deg, 200 * self.sigma_move_m)
-        degrees, cm = np.ceil(sigmas)
-        return f"{degrees / 10:g},{10 * cm:g}"
+    def refusal(self, name: str, most_deg: float, most_m: float) -> str | None:
+        """A sentence on camera `name`, with the cure, if two standard deviations of its poses
+        exceed `most_deg` degrees or `most_m` metres; else None.
+        """
+        if 2 * self.sigma_turn_deg <= most_deg and 2 * self.sigma_move_m <= most_m:
+            return None
+        return (
+            f"camera {name}: its poses are known to {self.within()} only (two sigma), but "
+            f"{most_deg:g} degrees and {1e3 * most_m:g} mm are asked; calibrate the lenses, film "
+            "two people, or accept the cameras as they are"
+        )
 
     def within(self) -> str:
         """Two standard deviations of the poses, in words."""
@@ -288,16 +280,13 @@ class Filmed:
         placed: Placed,
         most_s: float,
         focal: bool,
-        most_deg: float,
-        most_m: float,
         sigma_scale: float = 0.0,
     ) -> Start:
         """The start on which most people agree, up to `most_s` from the fixed cameras' clock;
         `focal`: whether the focal length and the principal point are unknown, too; `sigma_scale`:
         standard deviation of the world's scale, as a share.
 
-        Raises Undetermined, with a sentence, if it is ambiguous, or if two standard deviations of
-        the poses exceed `most_deg` degrees or `most_m` metres.
+        Raises Undetermined, with a sentence, if it is ambiguous.
         """
         cure = (
             "film the people whom the other cameras see for half a minute while they walk about, "
@@ -324,13 +313,6 @@ class Filmed:
         others = [each.agreeing for each in best[1:] if self._differ(each, first)]
         if first.agreeing < _LEAST_LEAD * max(others, default=0.0):
             raise refuse("two starts of its trajectory agree with the people about equally well")
-        if 2 * first.sigma_turn_deg > most_deg or 2 * first.sigma_move_m > most_m:
-            problem = (
-                f"camera {self.camera.name}: its poses are known to {first.within()} only (two "
-                f"sigma), but {most_deg:g} degrees and {1e3 * most_m:g} mm are asked; calibrate "
-                f"the lenses, film two people, or accept this with --tolerance {first.tolerated()}"
-            )
-            raise Undetermined((problem,))
         return first
 
     def _differ(self, one: Start, other: Start) -> bool:
@@ -407,8 +389,8 @@ class Filmed:
         person = away.argmin(axis=1)
         away = away[np.arange(len(rows)), person]
         inside = (middle > 0).all(axis=1) & (middle < self.camera.image_size).all(axis=1)
-        inside &= depth > _LEAST_DEPTH_M
-        return rows, frame, person, np.where(depth > _LEAST_DEPTH_M, away, np.inf), inside
+        inside &= depth > MIN_DEPTH_M
+        return rows, frame, person, np.where(depth > MIN_DEPTH_M, away, np.inf), inside
 
     def _seen(self, start: Start, placed: Placed, rows: Index, frame: Index) -> Array:
         """(N, J, 3) joints of placed people in the camera, at the times of the frames (N,)."""
@@ -523,7 +505,7 @@ class _Fit:
 
         def data(now: Start, placed: Placed) -> Array:
             at = filmed._seen(now, placed, self.rows, self.frame)
-            depth = np.maximum(at[known][:, 2:], _LEAST_DEPTH_M)
+            depth = np.maximum(at[known][:, 2:], MIN_DEPTH_M)
             return np.ravel(rays[known][:, :2] / now.focal * depth - at[known][:, :2])
 
         def residuals(x: Array) -> Array:
@@ -553,7 +535,8 @@ class _Fit:
         missed = data(now, self.placed)
         # A constant error of the fixed cameras changes all joints, and so the parameters.
         into = covariance @ fit.jac[:joints].T * weight / count / self.sigma_m
-        changed = [into @ (data(now, each) - missed) for each in self.placed.changed()]
+        others = [replace(self.placed, points=self.placed.points + e) for e in self.placed.spread]
+        changed = [into @ (data(now, each) - missed) for each in others]
         errors = [covariance, *(np.outer(each, each) for each in changed)]
         turn, move = self._spread(x, np.sum(errors, axis=0), level)
         sigmas = {"sigma_turn_deg": np.degrees(turn), "sigma_move_m": move}

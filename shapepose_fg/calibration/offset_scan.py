@@ -4,81 +4,38 @@ Two rays to a joint at the same time are coplanar with both cameras. For each pe
 the best fitting person of the other is used, so that no association is needed.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from shapepose_fg.calibration.tracks import LEAST_MISS
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.compiled import kernel
 from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS, Sightings, centres_of, rays_of
 
-_LEAST_SPREAD = 0.004
-"""Minimum spread of the residuals over offsets, as a share of people's size, for a detector's
-noise."""
 _ANCHORS = 150
 """Number of frames of one camera that are compared with those of another, at every offset."""
 
 
-@dataclass(frozen=True)
-class Scan:
-    """People of one camera in some frames, and of another in all frames."""
-
-    normal: Array
-    """(A, J, 3) normals of the planes through both cameras and a joint."""
-    frame: Index
-    """(A,) frame of each person of the first camera."""
-    rays: Array
-    """(S, J, 3) rays of the other camera, in the order of its frames."""
-    size: Array
-    """(S,) size of each person of the other camera, rad."""
-    first: Index
-    """(T + 1,) index of the first person of each of the other camera's frames, from frame `begin`
-    on."""
-    begin: int
-    """First frame of the other camera."""
-
-    @classmethod
-    def of(cls, sightings: Sightings, views: Views, a: int, b: int) -> "Scan":
-        """Scan of cameras `a` and `b`."""
-        one, other = (sightings.rows(sightings.view == view) for view in (a, b))
-        taken = np.unique(one.frame)
-        wanted = taken[np.unique(np.linspace(0, len(taken) - 1, _ANCHORS).astype(np.intp))]
-        one = one.rows(np.isin(one.frame, wanted))
-        other = other.rows(np.argsort(other.frame, kind="stable"))
-        begin = int(other.frame[0])
-        first = np.searchsorted(other.frame, np.arange(begin, other.frame[-1] + 2))
-        size = other.size_px / views.focal_px[b]
-        normal = normals(rays_of(one, views), views, a, b)
-        return cls(normal, one.frame, rays_of(other, views), size, first, begin)
-
-    def over(self, lags: Index, common: float) -> Array:
-        """(L,) mean residual of possible matches, as a share of people's size; NaN with too few
-        common frames.
-        """
-        cost, count = np.zeros(len(lags)), np.zeros(len(lags))
-        normal, rays = np.ascontiguousarray(self.normal), np.ascontiguousarray(self.rays)
-        _scan(
-            normal,
-            rays,
-            self.frame,
-            self.size,
-            self.first,
-            self.begin,
-            lags,
-            GATE,
-            MIN_JOINTS,
-            cost,
-            count,
-        )
-        last = self.begin + len(self.first) - 2
-        both = np.minimum(self.frame.max() + lags, last) - np.maximum(
-            self.frame.min() + lags, self.begin
-        )
-        enough = (both >= common) & (
-            count >= 0.2 * len(self.frame) * np.minimum(common / np.ptp(self.frame), 1)
-        )
-        return np.where(enough & (count > 0), cost / np.maximum(count, 1), np.nan)
+def scan(sightings: Sightings, views: Views, a: int, b: int, lags: Index, common: float) -> Array:
+    """(L,) mean residual of possible matches of two cameras, as a share of people's size, for the
+    offsets `lags` (L,), frames; NaN with fewer than `common` frames in common.
+    """
+    one, other = (sightings.rows(sightings.view == view) for view in (a, b))
+    taken = np.unique(one.frame)
+    wanted = taken[np.unique(np.linspace(0, len(taken) - 1, _ANCHORS).astype(np.intp))]
+    one = one.rows(np.isin(one.frame, wanted))
+    other = other.rows(np.argsort(other.frame, kind="stable"))
+    begin, last = int(other.frame[0]), int(other.frame[-1])
+    first = np.searchsorted(other.frame, np.arange(begin, last + 2))
+    normal = np.ascontiguousarray(normals(rays_of(one, views), views, a, b))
+    rays, size = np.ascontiguousarray(rays_of(other, views)), other.size_px / views.focal_px[b]
+    cost, count = np.zeros(len(lags)), np.zeros(len(lags))
+    _scan(normal, rays, one.frame, size, first, begin, lags, GATE, MIN_JOINTS, cost, count)
+    frame = one.frame
+    both = np.minimum(frame.max() + lags, last) - np.maximum(frame.min() + lags, begin)
+    share = 0.2 * np.minimum(common / np.ptp(frame), 1)
+    enough = (both >= common) & (count >= share * len(frame)) & (count > 0)
+    return np.where(enough, cost / np.maximum(count, 1), np.nan)
 
 
 @kernel("f3 f3 i1 f1 i1 i0 i1 f0 i0 f1 f1")
@@ -147,7 +104,7 @@ def chosen(
         if known.sum() < 3:
             return np.zeros(len(apart))
         middle = np.median(curve[known])
-        spread = max(1.5 * float(np.median(np.abs(curve[known] - middle))), _LEAST_SPREAD)
+        spread = max(1.5 * float(np.median(np.abs(curve[known] - middle))), LEAST_MISS)
         place = np.clip(apart + half, 0, len(lags) - 1)
         inside = (np.abs(apart) <= half) & known[place]
         return np.where(inside, (middle - curve[place]) / spread, 0.0)

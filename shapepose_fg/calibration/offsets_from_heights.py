@@ -10,20 +10,17 @@ pose of the cameras.
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import combinations, product
-from typing import NamedTuple
 
 import numpy as np
 from scipy.signal import fftconvolve
 
 from shapepose_fg.calibration.pairwise import fast_part
 from shapepose_fg.calibration.relative import relative
-from shapepose_fg.calibration.tracks import Tracks
-from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.calibration.tracks import FASTEST, Tracks
+from shapepose_fg.core.arrays import Array
 
 _STEP_S = 0.04
 """Interval between compared frames, s."""
-_FASTEST = 2.0
-"""Maximum vertical speed of a joint, statures per second; faster ones are identity switches."""
 _BRISK_S = 0.5
 """Time scale of the high-pass filter, s: a person who walks towards one camera sinks in its picture
 and rises in another's."""
@@ -127,36 +124,31 @@ def _peaks(
     return found
 
 
-class _Rises(NamedTuple):
-    """Vertical speeds of the joints of one camera's tracks."""
-
-    values: list[Array]
-    """Speeds (N, J) of each track, as shares of the person's size per frame; 0 if unknown."""
-    begins: Index
-    """(K,) index of each track's first sample."""
-
-
-def _rises(tracks: Tracks, step: int, fps: float) -> _Rises:
-    """Vertical speeds of joints, one sample every `step` frames."""
+def _rises(tracks: Tracks, step: int, fps: float) -> list[tuple[int, Array]]:
+    """For each track, the index of its first sample, and vertical speeds (N, J) of its joints, as
+    shares of the person's size per frame, one sample every `step` frames; 0 if unknown.
+    """
     values = tracks.speed[:, :, 1] / tracks.size[:, None]
-    known = np.abs(values) < _FASTEST / fps  # false for NaN
+    known = np.abs(values) < FASTEST / fps  # false for NaN
     (values,) = fast_part(
         (np.where(known, values, 0.0),), known, tracks.track, tracks.track, _BRISK_S * fps
     )
     kept = np.flatnonzero(tracks.frame % step == 0)
     _, first = np.unique(tracks.track[kept], return_index=True)
     begins = (tracks.frame[kept] // step)[first]
-    return _Rises(np.split(values[kept], first)[1:], begins)
+    return list(zip(begins.tolist(), np.split(values[kept], first)[1:], strict=True))
 
 
-def _add_likeness(worth: Array, a: _Rises, b: _Rises, least: int) -> None:
+def _add_likeness(
+    worth: Array, a: list[tuple[int, Array]], b: list[tuple[int, Array]], least: int
+) -> None:
     """Add to `worth` (2 L + 1,), at offsets -L to L of b against a, the significance of the
     similarity of tracks.
 
     Tracks are compared if they have at least `least` common samples.
     """
-    for one, begin_one in zip(a.values, a.begins, strict=True):
-        for other, begin_other in zip(b.values, b.begins, strict=True):
+    for begin_one, one in a:
+        for begin_other, other in b:
             apart = np.arange(1 - len(one), len(other))
             dots = fftconvolve(other, one[::-1], axes=0).sum(axis=1)
             start, stop = np.maximum(0, -apart), np.minimum(len(one), len(other) - apart)

@@ -7,24 +7,26 @@ from itertools import combinations
 
 import numpy as np
 
-from shapepose_fg.calibration.pairwise import Pairwise, without_means
-from shapepose_fg.calibration.tracks import FAST_S, Tracks, block_frames
+from shapepose_fg.calibration.pairwise import Pairwise, fast_part
+from shapepose_fg.calibration.tracks import FAST_S, FASTEST, LEAST_MISS, Tracks, block_frames
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Views
 from shapepose_fg.setup_check.evidence import triangulate
-from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS, Pairs, Sightings, centres_of
+from shapepose_fg.setup_check.matching import (
+    GATE,
+    MIN_JOINTS,
+    Pairs,
+    Sightings,
+    centres_of,
+    median_of,
+)
 
 _MOST_PLACED = 20_000
 """Maximum number of rows of tracks that are triangulated, over all cameras."""
-_LEAST_MISS = 0.004
-"""Minimum error of a detector as a share of a person's size: 7 mm."""
-_REWEIGHED = 10
 _NUDGE = 0.25
 """Shift of a clock for numerical derivatives, frames: more than the errors to be found."""
 _LEAST_OTHERS = 0.2
 """Minimum total weight of all other blocks, in the correction for one block."""
-_FASTEST = 2.5
-"""Maximum speed of a joint, statures per second; faster ones are identity switches."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +90,7 @@ class InSpace:
         agree = np.zeros(member.shape)
         for a, b in combinations(range(len(tracks)), 2):
             same = np.zeros((len(tracks[a].first) + 1, len(tracks[b].first) + 1))
-            same[tuple(np.array(pairwise.same(a, b), dtype=np.intp).reshape(-1, 2).T)] = 1.0
+            same[tuple(pairwise.same(a, b).T)] = 1.0
             both = same[member[:, a], member[:, b]]
             agree[:, a] += both
             agree[:, b] += both
@@ -187,50 +189,21 @@ class InSpace:
         moving = self._moving(placed.points, np.where(seen[..., None], speed, np.nan))
         theirs = _across(placed.points, moving, centres_of(self.views)[view])
         order = np.lexsort((self.time, self.member[:, view]))
-        order = order[self.member[order, view] >= 0]
-        starts = np.flatnonzero(np.diff(self.member[order, view])) + 1
-        off, change, own, now, weights, whom = [], [], [], [], [], []
-        for rows in np.split(order, starts):
-            at = (self.time[rows] - self.time[rows[0]]) // self.step if len(rows) > 0 else rows
-            if len(rows) < 6:
-                continue
-            grid = np.full((4, at[-1] + 1, *there.shape[1:]), np.nan)
-            grid[0, at], grid[1, at] = (
-                there[rows],
-                rays[rows] / np.linalg.norm(rays[rows], axis=-1, keepdims=True),
-            )
-            grid[1] -= grid[0]
-            grid[2, at], grid[3, at] = theirs[rows], speed[rows, :, view]
-            whose = float(np.median(size[rows, view]))
-            length = np.linalg.norm(grid, axis=-1) / whose
-            fastest = _FASTEST / self.fps
-            fine = (length[1] < GATE / 2) & (length[2] < fastest) & (length[3] < fastest)
-            grid[:, ~fine] = np.nan
-            miss, calm, fast = (
-                without_means(each, np.isfinite(each[..., :1]), FAST_S * self.fps / self.step)[at]
-                / whose
-                for each in grid[1:]
-            )
-            length = np.linalg.norm(miss, axis=-1)
-            usual = np.array(
-                [
-                    np.median(each[np.isfinite(each)]) if np.isfinite(each).any() else 1.0
-                    for each in length.T
-                ]
-            )
-            width = 3.0 * np.maximum(usual, _LEAST_MISS)
-            weights.append(
-                np.where(np.isfinite(length), 1 / (1 + (length / width) ** 2) ** 2 / width**2, 0.0)
-            )
-            off.append(np.nan_to_num(miss))
-            change.append(np.nan_to_num(calm))
-            own.append(np.nan_to_num(fast))
-            now.append(self.time[rows])
-            whom.append(self.member[rows, view])
-        if not off:
+        rows = order[self.member[order, view] >= 0]
+        whom, time, mine = self.member[rows, view], self.time[rows], rays[rows]
+        mine = mine / np.linalg.norm(mine, axis=-1, keepdims=True)
+        each = np.stack([mine - there[rows], theirs[rows], speed[rows, :, view]])
+        each /= size[rows, view][:, None, None]
+        length = np.linalg.norm(each, axis=-1)
+        known = (length[0] < GATE / 2) & (length[1:] < FASTEST / self.fps).all(axis=0)
+        miss, calm, fast = fast_part(
+            tuple(each), known[..., None], whom, whom, FAST_S * self.fps / self.step
+        )
+        if not known.any():
             return 0.0, np.full(blocks, np.inf)
-        miss, calm, fast, time = (np.concatenate(each) for each in (off, change, own, now))
-        weight = np.concatenate(weights)
+        length = np.linalg.norm(miss, axis=-1)
+        width = 3.0 * np.maximum(median_of(np.where(known, length, np.nan).T), LEAST_MISS)
+        weight = np.where(known, 1 / (1 + (length / width) ** 2) ** 2 / width**2, 0.0)
         # Velocities from the others are independent of this camera's errors; its own give the
         # change per frame.
         gains = (weight * (calm * fast).sum(axis=-1)).sum(axis=1)
@@ -238,12 +211,10 @@ class InSpace:
             return 0.0, np.full(blocks, np.inf)
         score = (weight * (calm * miss).sum(axis=-1)).sum(axis=1)
         when = ((time - self.time.min()) // block).astype(np.intp)
-        (when, _), each = np.unique(
-            np.stack([when, np.concatenate(whom)]), axis=1, return_inverse=True
-        )
+        (when, _), each = np.unique(np.stack([when, whom]), axis=1, return_inverse=True)
         score, gains = np.bincount(each.reshape(-1), score), np.bincount(each.reshape(-1), gains)
         late, trust = score.sum() / gain, np.ones(len(score))
-        for _ in range(_REWEIGHED):
+        for _ in range(10):  # reweighted mean
             away = np.abs(score - late * gains) / np.sqrt(np.maximum(gains, 1e-12))
             trust = 1 / (1 + (away / (2.0 * max(1.5 * float(np.median(away)), 1e-12))) ** 2)
             late = (trust * score).sum() / (trust * gains).sum()

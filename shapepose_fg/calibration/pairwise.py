@@ -2,21 +2,20 @@
 intersection of rays.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
+from shapepose_fg.body.model.rotation import hat
 from shapepose_fg.calibration.offset_scan import normals
+from shapepose_fg.calibration.relative import Together
 from shapepose_fg.calibration.tracks import FAST_S, Tracks, block_frames
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Views
-from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS
+from shapepose_fg.setup_check.matching import centres_of
 
-_GATE = 0.06
-"""Largest distance between the rays of two tracks of one person, as a share of the person's
-size."""
 _MOST_SAMPLES = 3000
 """Maximum number of frames of tracks that are compared for a pair of cameras."""
 
@@ -34,46 +33,21 @@ class Pairwise:
     fps: float
     """Frame rate, Hz."""
 
-    def same(self, a: int, b: int, gate: float = _GATE) -> list[tuple[int, int]]:
-        """Pairs of tracks of cameras a and b that are one person over their whole common time."""
-        one, other, apart = self.tracks[a], self.tracks[b], self.shift[b] - self.shift[a]
-        stride = max(1, round(0.1 * self.fps))
-        rows = np.arange(0, len(one.frame), stride)
-        found: dict[tuple[int, int], list[float]] = {}
-        begins, lasts = other.frame[other.first], other.lasts
-        at = one.frame[rows] + apart
-        row, track = np.nonzero((at[:, None] >= begins) & (at[:, None] <= lasts - 1))
-        miss, _ = self.miss(a, b, rows[row], track, apart)
-        seen = np.isfinite(miss)
-        mean = np.where(seen, np.minimum(np.abs(miss), GATE), 0).sum(axis=1) / np.maximum(
-            seen.sum(axis=1), 1
-        )
-        mean[seen.sum(axis=1) < MIN_JOINTS] = GATE
-        for who, whom, each in zip(
-            one.track[rows[row]].tolist(), track.tolist(), mean.tolist(), strict=True
-        ):
-            found.setdefault((who, whom), []).append(each)
-        error = {pair: float(np.mean(each)) for pair, each in found.items() if len(each) >= 3}
-        kept = {pair for pair, each in error.items() if each < gate}
-        spans = [(each.frame[each.first], each.lasts) for each in (one, other)]
-
-        def rival(pair: tuple[int, int], side: int) -> bool:
-            """Whether another simultaneous track fits the same one better."""
-            for each in kept:
-                same, differs = each[1 - side] == pair[1 - side], each[side] != pair[side]
-                if same and differs and error[each] < error[pair]:
-                    (first, last), both = spans[side], [each[side], pair[side]]
-                    if last[both].min() > first[both].max():
-                        return True
-            return False
-
-        return [pair for pair in sorted(kept) if not rival(pair, 0) and not rival(pair, 1)]
+    def same(self, a: int, b: int) -> Index:
+        """(K, 2) pairs of tracks of cameras a and b that are one person over their common time."""
+        one, other = self.tracks[a], self.tracks[b]
+        other = replace(other, frame=other.frame - round(self.shift[b] - self.shift[a]))
+        looks = np.unique(one.frame)[:: max(1, round(0.1 * self.fps))]
+        both, centres = Together(one, other, looks), centres_of(self.views)
+        kept, _ = both.chosen(both.misses(hat(centres[b] - centres[a])[None])[0])
+        return both.tracks[kept]
 
     def matched(self, a: int, b: int) -> tuple[Index, Index]:
         """Rows of camera a's tracks (N,), and the tracks of camera b (N,) that are the same
         person.
         """
-        one, pairs = self.tracks[a], self.same(a, b)
+        one = self.tracks[a]
+        pairs: list[tuple[int, int]] = self.same(a, b).tolist()
         stop = np.append(one.first[1:], len(one.frame))
         rows = [np.arange(one.first[who], stop[who]) for who, _ in pairs]
         whom = [np.full(len(each), pair[1]) for each, pair in zip(rows, pairs, strict=True)]

@@ -1,18 +1,20 @@
 """People used for adjusting cameras: seen by several cameras, in frames separated in time."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from shapepose_fg.calibration.tracks import OneClock, seen_at
 from shapepose_fg.core.arrays import Array, Index, Mask
-from shapepose_fg.core.camera import Rig, Views
+from shapepose_fg.core.camera import Camera, Rig, Views
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.linearisation import ObservationConfig
-from shapepose_fg.setup_check.evidence import observed, triangulate
+from shapepose_fg.estimation.trajectory_graph import WEAKEST_M
+from shapepose_fg.setup_check.evidence import left_out, observed, triangulate
 from shapepose_fg.setup_check.matching import GATE, Pairs, Sightings, size_of
 
 LEAST_PEOPLE = 10
@@ -23,9 +25,8 @@ _MOST_FRAMES = 100
 _MOST_SIGHTINGS = 5_000
 """Maximum number of sightings; more of them, or of frames, cost time and add little information,
 because errors within a second are correlated."""
-_MIN_DEPTH_M = 0.3
-_WEAKEST_M = 0.15
-"""Maximum standard deviation, m, of a used joint in its worst direction."""
+MIN_DEPTH_M = 0.3
+"""Minimum depth of a used joint, m."""
 _NOISE = ObservationConfig()
 
 
@@ -78,13 +79,8 @@ class Footage:
     @classmethod
     def taken(cls, sightings: Sightings, rig: Rig, skeleton: Skeleton) -> "Footage":
         """Sightings that were undistorted by the lenses of `rig`."""
-        xy = sightings.xy.copy()
-        for view, camera in enumerate(rig.cameras):
-            here = sightings.view == view
-            xy[here] = camera.distort(xy[here].reshape(-1, 2)).reshape(xy[here].shape)
-        return cls(
-            replace(sightings, xy=xy), tuple(skeleton.joints[joint] for joint in skeleton.core)
-        )
+        names = tuple(skeleton.joints[joint] for joint in skeleton.core)
+        return cls(_through_lenses(sightings, rig, Camera.distort), names)
 
     def at(self, frames: Index) -> "Footage":
         """The sightings in some of the frames."""
@@ -92,11 +88,7 @@ class Footage:
 
     def undistorted(self, rig: Rig) -> Sightings:
         """The sightings undistorted by the lenses of `rig`."""
-        xy = self.sightings.xy.copy()
-        for view, camera in enumerate(rig.cameras):
-            here = self.sightings.view == view
-            xy[here] = camera.undistort(xy[here].reshape(-1, 2)).reshape(xy[here].shape)
-        return replace(self.sightings, xy=xy)
+        return _through_lenses(self.sightings, rig, Camera.undistort)
 
     def people(self, rig: Rig) -> People:
         """Associate people between the cameras `rig`, and triangulate them."""
@@ -104,7 +96,7 @@ class Footage:
         groups = Pairs.of(sightings, views).groups(len(sightings), tuple(range(len(rig))))
         xy, confidence, size = observed(groups, sightings)
         placed = triangulate(xy, confidence, size, views)
-        near = (placed.depth > _MIN_DEPTH_M) & (placed.miss_px < GATE * size[:, None])
+        near = (placed.depth > MIN_DEPTH_M) & (placed.miss_px < GATE * size[:, None])
         weight = _NOISE.weight(confidence) / _NOISE.scatter(self.joints)[:, None] ** 2
         at = np.where(near, placed.depth, np.nan)
         sigma = np.hypot(
@@ -115,6 +107,17 @@ class Footage:
         return People(groups.frame, xy, np.where(placeable[..., None], sigma, np.nan), points)
 
 
+def _through_lenses(
+    sightings: Sightings, rig: Rig, change: Callable[[Camera, Array], Array]
+) -> Sightings:
+    """The sightings with their pixels distorted, or undistorted."""
+    xy = sightings.xy.copy()
+    for view, camera in enumerate(rig.cameras):
+        here = sightings.view == view
+        xy[here] = change(camera, xy[here].reshape(-1, 2)).reshape(xy[here].shape)
+    return replace(sightings, xy=xy)
+
+
 def _well_placed(points: Array, sigma_m: Array, rig: Rig) -> Mask:
     """(P, J) mask of points that are well determined in all directions, given standard deviations
     `sigma_m` across the views' rays.
@@ -123,7 +126,7 @@ def _well_placed(points: Array, sigma_m: Array, rig: Rig) -> Mask:
     rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
     across = np.eye(3) - rays[..., :, None] * rays[..., None, :]
     information = np.nansum(across / sigma_m[..., None, None] ** 2, axis=2)
-    return np.asarray(np.linalg.eigvalsh(information)[..., 0] > 1 / _WEAKEST_M**2)
+    return np.asarray(np.linalg.eigvalsh(information)[..., 0] > 1 / WEAKEST_M**2)
 
 
 def missed_px(people: People, rig: Rig) -> Array:
@@ -132,17 +135,7 @@ def missed_px(people: People, rig: Rig) -> Array:
 
     NaN if fewer than two others see it. With only two cameras, from the prediction by both.
     """
-    missed = np.full(people.sigma_px.shape, np.nan)
-    weight = np.where(np.isfinite(people.sigma_px), 1.0, 0.0)
-    size = size_of(np.moveaxis(people.xy, 2, 1))
-    if len(rig) == 2:
-        return np.where(
-            weight > 0, triangulate(people.xy, weight, size, Views.of(rig)).miss_px, np.nan
-        )
-    for view, camera in enumerate(rig.cameras):
-        others, xy = weight.copy(), people.xy.copy()
-        others[:, :, view], xy[:, :, view] = 0.0, np.nan
-        placed = triangulate(xy, others, size, Views.of(rig))
-        seen, _ = camera.project(placed.points)
-        missed[:, :, view] = np.linalg.norm(seen - people.xy[:, :, view], axis=-1)
-    return np.where(weight > 0, missed, np.nan)
+    seen, size = np.isfinite(people.sigma_px), size_of(np.moveaxis(people.xy, 2, 1))
+    given = people.xy, seen.astype(float), size, Views.of(rig)
+    missed = triangulate(*given).miss_px if len(rig) == 2 else left_out(*given, seen)[0]
+    return np.where(seen, missed, np.nan)

@@ -2,45 +2,38 @@
 validation.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from shapepose_fg.body.model.rotation import exp_so3
-from shapepose_fg.calibration.adjustment import (
-    CENTRE,
-    FOCAL,
-    LENS,
-    MOVE,
-    TURN,
-    Adjusted,
-    Freedom,
-    adjust,
-    misfit,
-)
-from shapepose_fg.calibration.levelling import scaled
-from shapepose_fg.calibration.people import LEAST_PEOPLE, Footage, missed_px
+from shapepose_fg.calibration.adjustment import LENS, Adjusted, Freedom, adjust, misfit
+from shapepose_fg.calibration.levelling import apart, grown, scaled
+from shapepose_fg.calibration.people import LEAST_PEOPLE, Footage, People, missed_px
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Camera, Rig, Views
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import FrameTimes
+from shapepose_fg.estimation.trajectory_graph import correlated
 from shapepose_fg.setup_check.diagnosis import build_of, put_right
 from shapepose_fg.setup_check.evidence import gather
 from shapepose_fg.setup_check.findings import SURE, Finding, Kind
-from shapepose_fg.setup_check.fit import difference
+from shapepose_fg.setup_check.fit import CENTRE, FOCAL, MOVE, TURN, Q, difference
 from shapepose_fg.setup_check.small_errors import Problem
 
 _ROUNDS = 4
-"""Number of rounds, each with people associated by the cameras of the round before."""
-_SAME_PERSON = 2.5
-"""Number of joints of one person in one view whose correlated errors count as one independent
-error."""
-_ERRORS = ((0.45, 3.5), (0.25, 0.25), (0.30, 0.0))
-"""Shares of a detector's errors, and their time constants, s: measured on simulated recordings,
-whose detector has Shelf's statistics (0.8 after a frame, 0.35 after a second, 0.1 after four)."""
+"""Maximum number of rounds, each with people associated by the cameras of the round before."""
+_STILL_DEG = 0.03
+"""Rotation per round below which cameras have converged, degrees."""
+FILM = (
+    "film people for a minute who walk through all views, near and far, not on one line, and move "
+    "their arms"
+)
+"""Cure for motion that does not determine the cameras."""
 _UNKNOWN = 0.8
 """Ratio of posterior to prior standard deviation above which a parameter is undetermined."""
 
@@ -52,6 +45,27 @@ PARTS = {"turn": TURN, "move": MOVE, "focal": FOCAL, "centre": CENTRE, "lens": L
 """Parameters of a camera that may change."""
 _UNITS = {"turn": float(np.degrees(1)), "move": 1e3, "focal": 100.0, "centre": 1.0}
 """Factors to degrees, millimetres, percent and pixels."""
+
+
+class Undetermined(InputError):
+    """The people do not determine the cameras; `problems` has a sentence each with
+    cause and cure.
+    """
+
+    def __init__(self, problems: tuple[str, ...], found: Any = None):
+        super().__init__("; ".join(problems))
+        self.problems, self.found = problems, found
+
+
+class Steps:
+    """Counts steps: each call adds some to those done, and reports these, and the total."""
+
+    def __init__(self, progress: Callable[[int, int], None], total: int):
+        self._progress, self._total, self._done = progress, total, 0
+
+    def __call__(self, more: int = 1) -> None:
+        self._done += more
+        self._progress(self._done, self._total)
 
 
 @dataclass(frozen=True)
@@ -115,8 +129,7 @@ class Refinement:
 
     def sigma(self) -> dict[str, Array]:
         """(V,) standard deviations of what `change` gives, in the same units."""
-        each = {name: self.adjusted.sigma(PARTS[name]) * unit for name, unit in _UNITS.items()}
-        return each
+        return {name: self.adjusted.sigma(PARTS[name]) * unit for name, unit in _UNITS.items()}
 
     def as_dict(self) -> dict[str, Any]:
         """All figures as plain values."""
@@ -152,7 +165,7 @@ def refine(
     """Refine the cameras of `rig`, with prior standard deviations `freedom`, from the people in
     `detections`.
 
-    The scale is that of the given cameras. Raises InputError if too few people are seen by two
+    The scale is that of the given cameras. Raises Undetermined if too few people are seen by two
     cameras.
     """
     freedom = Freedom() if freedom is None else freedom
@@ -161,38 +174,37 @@ def refine(
         Footage.of(detections, rig, times, frames),
         _found_again(findings, right.views, rig),
     )
-    taken = np.unique(footage.sightings.frame)
-    halves = np.array_split(taken, 2)
-    spans = [(taken, taken), (halves[0], halves[1]), (halves[1], halves[0])]
-    found, before, after = list[Adjusted](), list[Array](), list[Array]()
-    for number, (used, left) in enumerate(spans):
-        part = footage.at(used)
-
-        def told(step: int, number: int = number) -> None:
-            progress(number * _ROUNDS + step + 1, len(spans) * _ROUNDS)
-
-        found.append(_fitted(part, start, times, freedom, reference, told))
-        if number > 0:
-            people = footage.at(left).people(found[-1].rig)
-            both = [missed_px(people, each) for each in (rig, found[-1].rig)]
-            known = np.isfinite(both[0]) & np.isfinite(both[1])
-            for kept, each in zip((before, after), both, strict=True):
-                kept.append(np.where(known, each, np.nan).reshape(-1, len(rig)))
-    missed = (np.concatenate(before), np.concatenate(after))
-    if not np.isfinite(missed[0]).any():
+    fit = partial(
+        settle,
+        now=start,
+        rounds=_ROUNDS,
+        given=start,
+        times=times,
+        freedom=freedom,
+        told=Steps(progress, 3 * _ROUNDS),
+        reference=reference,
+    )
+    found = fit(footage)
+    both = [
+        [missed_px(people, each).reshape(-1, len(rig)) for each in (rig, half)]
+        for half, people in halves(footage, fit)
+    ]
+    was_px, now_px = (np.concatenate(each) for each in zip(*both, strict=True))
+    known = np.isfinite(was_px) & np.isfinite(now_px)
+    missed = (np.where(known, was_px, np.nan), np.where(known, now_px, np.nan))
+    if not known.any():
         raise InputError(
             "no joint is seen by three cameras in the frames for validation, so a refinement "
             "cannot be validated; give more frames"
         )
     was, now = (float(np.nanmedian(each)) for each in missed)
-    counts = found[0].people.seen.any(axis=1).sum(axis=0)
-    stature = build_of(found[0].people.points, detections.skeleton).stature
-    notes = tuple(_undetermined(found[0], freedom, counts))
+    counts = found.people.seen.any(axis=1).sum(axis=0)
+    stature = build_of(found.people.points, detections.skeleton).stature
+    notes = tuple(_undetermined(found, freedom, counts))
     sure = 1.0
     if all(new is old for new, old in zip(start.cameras, rig.cameras, strict=True)):
-        order = [*range(6), 7, 8, 6]  # order of parameters in the check
-        sure = Problem.of(given).off(freedom.sigmas[order], reference)
-    return Refinement(rig, found[0], freedom, was, now, counts, notes, missed, stature, sure)
+        sure = Problem.of(given).off(freedom.sigmas[:Q], reference)
+    return Refinement(rig, found, freedom, was, now, counts, notes, missed, stature, sure)
 
 
 def _found_again(findings: list[Finding], found: Views, rig: Rig) -> Rig:
@@ -218,41 +230,68 @@ def _found_again(findings: list[Finding], found: Views, rig: Rig) -> Rig:
     return replace(rig, cameras=tuple(cameras))
 
 
-def _fitted(
+def settle(
     footage: Footage,
-    rig: Rig,
+    now: Rig,
+    rounds: int,
+    given: Rig,
     times: FrameTimes,
-    freedom: Freedom,
-    reference: int | None,
+    freedom: Freedom | Sequence[Freedom],
     told: Callable[[int], None],
+    reference: int | None = None,
+    scale: Callable[[Array], float] | None = None,
 ) -> Adjusted:
-    """The cameras adjusted to the people of some frames."""
-    rig_now, adjusted = rig, None
-    for step in range(_ROUNDS):
-        people = footage.people(rig_now)
+    """Associate people and adjust cameras alternately, starting at `now`, until the cameras stand
+    still.
+
+    The prior has the `freedom` about the cameras `given`. With `scale`, the metres per unit of the
+    people's joints (P, J, 3), it has only their lenses, and the rig is scaled. `told` gets the
+    number of rounds that are done. Raises Undetermined if too few people are seen.
+    """
+    adjusted: Adjusted | None = None
+    for step in range(rounds):
+        people = footage.people(now)
         if len(people) < LEAST_PEOPLE or not people.seen.any():
-            raise InputError(
-                f"only {len(people)} people are seen by two cameras at once in the checked "
-                "frames, but at least 10 are needed; film people where views overlap, or run "
-                "shapepose-fg check-calibration"
+            raise Undetermined(
+                (
+                    f"only {len(people)} people are seen by two cameras at once, but at least "
+                    f"{LEAST_PEOPLE} are needed; {FILM}",
+                )
             )
-        spread = dilution(times.frame_s[np.unique(people.frame)])
-        adjusted = adjust(rig, rig_now, people, freedom, spread, misfit(people, rig_now), reference)
-        rig_now = adjusted.rig
-        told(step)
+        prior = given if scale is None else given.at_poses(now.wTc)
+        spread, off = dilution(times.frame_s[np.unique(people.frame)]), misfit(people, now)
+        adjusted = adjust(prior, now, people, freedom, spread, off, reference, scale is not None)
+        if scale is not None:
+            if not np.isfinite(factor := scale(adjusted.people.points)):
+                raise Undetermined(
+                    (f"no arms and legs are seen by two cameras, so the scale is unknown; {FILM}",)
+                )
+            adjusted = grown(adjusted, factor)
+        before, now = now, adjusted.rig
+        still = apart(before, now)[0].max() < _STILL_DEG
+        told(rounds - step if still else 1)
+        if still:
+            break
     assert adjusted is not None
     return adjusted
+
+
+def halves(footage: Footage, fit: Callable[[Footage], Adjusted]) -> list[tuple[Rig, People]]:
+    """Cameras that `fit` adjusts to the first and to the second half of the frames, each with the
+    people of the other half.
+    """
+    both, found = np.array_split(np.unique(footage.sightings.frame), 2), []
+    for used, left in (both, both[::-1]):
+        rig = fit(footage.at(used)).rig
+        found.append((rig, footage.at(left).people(rig)))
+    return found
 
 
 def dilution(time_s: Array) -> float:
     """Number of correlated errors of a detection, over time and joints, that count as one, for
     frames at `time_s` (T,).
     """
-    apart = np.abs(time_s[:, None] - time_s)
-    alike = sum(
-        share * (np.exp(-apart / lasts) if lasts > 0 else apart == 0) for share, lasts in _ERRORS
-    )
-    return float(_SAME_PERSON * np.sum(alike) / len(time_s))
+    return float(correlated(time_s[:, None] - time_s).sum() / len(time_s))
 
 
 def _undetermined(adjusted: Adjusted, freedom: Freedom, counts: Index) -> list[str]:

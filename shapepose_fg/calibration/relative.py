@@ -10,13 +10,15 @@ from itertools import product
 
 import cv2
 import numpy as np
+from scipy.optimize import least_squares
 
 from shapepose_fg.body.model.rotation import exp_so3, hat
 from shapepose_fg.calibration.tracks import Tracks
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.compiled import kernel
 from shapepose_fg.core.decompositions import basis_across
-from shapepose_fg.setup_check.matching import MIN_JOINTS
+from shapepose_fg.setup_check.evidence import KERNEL
+from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS, depths_of_meeting
 
 _LOOK_S = 0.2
 """Interval between compared frames, s: people's joints move by more than a detector's error."""
@@ -27,21 +29,15 @@ _MOST_TRIED = 30
 _JOINTS_A_TRY = 240
 _LEAST_TRY = 60
 """Maximum and minimum number of joints of a pair of tracks for a hypothesis."""
-_RANSAC = 0.02
-"""Maximum residual of an inlier, as a share of a person's size: a detector errs by 3 cm of 170."""
-_GATE = 0.06
+_GATE = 3 * KERNEL
 """Maximum mean residual of tracks of one person, as a share of the person's size."""
-_CLIP = 0.15
-"""Limit of a joint's residual in the mean; larger ones are of other people."""
 _SAMPLES = 60
 """Number of samples of five joints per pair of tracks; two thirds of a person's joints are inliers
 in simulated recordings."""
 _FINALISTS = 6
 """Number of hypotheses that are refined."""
-_STEPS = 8
-_DILUTION = 25.0
-"""Number of correlated errors of joints that count as one independent error: of a person in one
-frame, and in frames close in time."""
+_STEPS = 12
+"""Maximum number of evaluations for a hypothesis."""
 
 
 @dataclass(frozen=True)
@@ -57,14 +53,11 @@ class Relative:
     match with zero residual, and 0 if none match."""
     seconds: float
     """Person-seconds that are matched."""
-    covariance: Array
-    """(6, 6) covariance of a small rotation w before R, rad, and of a change of t, which is 0 along
-    t."""
     points: Array
     """(N, J, 3) matched people in camera a's frame, in lengths of t; NaN unless seen by both."""
 
 
-class _Together:
+class Together:
     """Sightings of two cameras in the same frames: N pairs of rows, K pairs of tracks."""
 
     def __init__(self, one: Tracks, other: Tracks, looks: Index) -> None:
@@ -89,7 +82,7 @@ class _Together:
         total, count = (np.zeros((len(E), len(self.tracks))) for _ in range(2))
         _misses(*self.rays, *self.size, self.rows, self.pair, np.ascontiguousarray(E), total, count)
         enough = count >= 0.5 * self.count
-        return np.where(enough & (count > 0), total / np.maximum(count, 1), _CLIP)
+        return np.where(enough & (count > 0), total / np.maximum(count, 1), GATE)
 
     def chosen(self, miss: Array) -> tuple[Mask, float]:
         """Which pairs of tracks (K,) are one person each, greedily by residual, and their total
@@ -122,7 +115,7 @@ def relative(one: Tracks, other: Tracks, fps: float) -> Relative | None:
         return None
     looks = np.unique((frames // max(1, round(_LOOK_S * fps))) * max(1, round(_LOOK_S * fps)))
     looks = looks[np.unique(np.linspace(0, len(looks) - 1, _MOST_LOOKS).astype(np.intp))]
-    seen = _Together(one, other, looks)
+    seen = Together(one, other, looks)
     guesses = _guesses(one, other, seen)
     if len(guesses) == 0:
         return None
@@ -135,7 +128,7 @@ def relative(one: Tracks, other: Tracks, fps: float) -> Relative | None:
     return found
 
 
-def _guesses(one: Tracks, other: Tracks, seen: _Together) -> Array:
+def _guesses(one: Tracks, other: Tracks, seen: Together) -> Array:
     """(H, 3, 3) essential matrices, each from a pair of tracks."""
     found = list[Array]()
     for pair in np.argsort(-seen.count, kind="stable")[:_MOST_TRIED].tolist():
@@ -158,7 +151,7 @@ def _guesses(one: Tracks, other: Tracks, seen: _Together) -> Array:
         flat_x, flat_y = (
             np.ascontiguousarray(each[both][:, :2] / each[both][:, 2:]) for each in (x, y)
         )
-        agree = _RANSAC * size
+        agree = KERNEL * size
         E, _ = cv2.findEssentialMat(
             flat_x,
             flat_y,
@@ -173,7 +166,7 @@ def _guesses(one: Tracks, other: Tracks, seen: _Together) -> Array:
     return np.stack(found) if found else np.zeros((0, 3, 3))
 
 
-def _settled(E: Array, seen: _Together, fps: float, looks: Index) -> Relative | None:
+def _settled(E: Array, seen: Together, fps: float, looks: Index) -> Relative | None:
     """Pose of a hypothesis, refined alternately with the set of agreeing tracks."""
     kept, score = seen.chosen(seen.misses(E[None])[0])
     best: Relative | None = None
@@ -182,7 +175,7 @@ def _settled(E: Array, seen: _Together, fps: float, looks: Index) -> Relative | 
             return best
         a, b, size = seen.joints(kept)
         pose = _in_front(E, a, b) if best is None else (best.R, best.t)
-        R, t, covariance = refined_pose(*pose, a, b, size)
+        R, t = refined_pose(*pose, a, b, size)
         E = hat(t) @ R
         new, score = seen.chosen(seen.misses(E[None])[0])
         if best is not None and score <= best.score:
@@ -192,7 +185,7 @@ def _settled(E: Array, seen: _Together, fps: float, looks: Index) -> Relative | 
             float(ahead[np.isfinite(points[..., 0])].mean()) if np.isfinite(points).any() else 0.0
         )
         step = float(np.median(np.diff(looks))) / fps if len(looks) > 1 else _LOOK_S
-        best = Relative(R, t, score * max(0.0, 2 * share - 1), len(a) * step, covariance, points)
+        best = Relative(R, t, score * max(0.0, 2 * share - 1), len(a) * step, points)
         kept = new
     return best
 
@@ -211,51 +204,33 @@ def _meeting(R: Array, t: Array, a: Array, b: Array) -> tuple[Array, Mask]:
     front of both.
     """
     back, centre = b @ R, -R.T @ t
-    cosine, along_a, along_b = (a * back).sum(axis=-1), a @ centre, back @ centre
-    sine2 = np.maximum(1 - cosine**2, 1e-6)
-    s, u = (along_a - cosine * along_b) / sine2, (cosine * along_a - along_b) / sine2
+    s, u, _ = depths_of_meeting(a, back, centre)
     return (s[..., None] * a + centre + u[..., None] * back) / 2, (s > 0) & (u > 0)
 
 
-def refined_pose(R: Array, t: Array, a: Array, b: Array, size: Array) -> tuple[Array, Array, Array]:
+def refined_pose(R: Array, t: Array, a: Array, b: Array, size: Array) -> tuple[Array, Array]:
     """The pose with minimum Sampson residuals (Cauchy) of rays a, b (N, J, 3) of people with `size`
-    (N,) rad, and its covariance as in `Relative`.
+    (N,) rad.
     """
     known = np.isfinite(a[..., 0]) & np.isfinite(b[..., 0])
     size, a, b = np.broadcast_to(size[:, None], known.shape)[known], a[known], b[known]
-    to, H, usual = np.zeros((5, 6)), np.eye(5), 1.0
-    for _ in range(_STEPS):
-        E, turned = hat(t) @ R, a @ R.T
+    across = basis_across(t)
+
+    def moved(x: Array) -> tuple[Array, Array]:
+        way = t + x[3:] @ across
+        return exp_so3(x[None, :3])[0] @ R, way / np.linalg.norm(way)
+
+    def residuals(x: Array) -> Array:
+        """Sampson's distances, of an angle on both sides, as shares of people's size."""
+        turn, way = moved(x)
+        E = hat(way) @ turn
         Ea, Eb = a @ E.T, b @ E
-        # Sampson's distance, of an angle on both sides, as a part of people's size.
         scale = size * np.sqrt((Ea**2).sum(axis=1) + (Eb**2).sum(axis=1))
-        r = (b * Ea).sum(axis=1) / scale
-        # b . [t] (w x R a) = (b x t) . (w x R a) = w . (R a x (b x t)); b . (dt x R a) = dt . (R a
-        # x b)
-        J = (
-            np.concatenate([_crossed(turned, b @ hat(t)), _crossed(turned, b)], axis=1)
-            / scale[:, None]
-        )
-        to = np.zeros((5, 6))
-        to[:3, :3], to[3:, 3:] = np.eye(3), basis_across(t)
-        J, usual = J @ to.T, max(_RANSAC / 2, float(np.median(np.abs(r))))
-        weight = 1 / (1 + (r / usual) ** 2)
-        H = J.T @ (weight[:, None] * J)
-        H += 1e-9 * np.trace(H) * np.eye(5)
-        step = -np.linalg.solve(H, J.T @ (weight * r))
-        step = to.T @ step * min(1.0, 0.3 / max(float(np.linalg.norm(step)), 1e-12))
-        R, t = exp_so3(step[None, :3])[0] @ R, t + step[3:]
-        t = t / np.linalg.norm(t)
-        if np.linalg.norm(step) < 1e-6:
-            break
-    return R, t, to.T @ np.linalg.inv(H) @ to * _DILUTION * usual**2
+        return (b * Ea).sum(axis=1) / scale
 
-
-def _crossed(a: Array, b: Array) -> Array:
-    """(N, 3) cross products; ten times as fast as np.cross."""
-    return np.stack(
-        [a[:, i] * b[:, k] - a[:, k] * b[:, i] for i, k in ((1, 2), (2, 0), (0, 1))], axis=1
-    )
+    usual = max(KERNEL / 2, float(np.median(np.abs(residuals(np.zeros(5))))))
+    found = least_squares(residuals, np.zeros(5), loss="cauchy", f_scale=usual, max_nfev=_STEPS)
+    return moved(found.x)
 
 
 def _rows(tracks: Tracks, looks: Index) -> Index:
@@ -307,7 +282,7 @@ def _misses(
                     abs(dot) / (np.sqrt(square) * size_b[other] + 1e-12),
                     abs(dot) / (np.sqrt(other_square) * size_a[one] + 1e-12),
                 )
-                miss += min(away, _CLIP)
+                miss += min(away, GATE)
                 seen += 1
             if seen >= MIN_JOINTS:
                 total[h, pair[n]] += miss / seen

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from shapepose_fg.calibration.offset_scan import Scan, chosen
+from shapepose_fg.calibration.offset_scan import chosen, scan
 from shapepose_fg.calibration.offsets_in_space import InSpace
 from shapepose_fg.calibration.pairwise import Pairwise
 from shapepose_fg.calibration.tracks import Tracks, at_regular_times
@@ -156,7 +156,7 @@ def offsets(
     lags = np.arange(-most, most + 1, step)
     curves = {}
     for number, (a, b) in enumerate(pairs):
-        curves[a, b] = Scan.of(sightings, views, a, b).over(lags, common)
+        curves[a, b] = scan(sightings, views, a, b, lags, common)
         progress(number + 1, len(pairs))
     coarse, sure = chosen(curves, lags, len(rig), round(_AROUND_S * fps))
     tracks = [Tracks.of(sightings, views, view, fps) for view in range(len(rig))]

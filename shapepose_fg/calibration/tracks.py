@@ -5,13 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import correlate1d
-from scipy.optimize import linear_sum_assignment
 
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.setup_check.matching import MIN_JOINTS, Sightings, median_of, rays_of
+from shapepose_fg.setup_check.matching import MIN_JOINTS, Sightings, follow, median_of, rays_of
 
 _SAME = 0.08
 """Maximum median motion of a person's joints between frames of a track, as a share of the person's
@@ -21,10 +20,12 @@ _SHORTEST_S = 0.4
 _SMOOTH_S = 0.05
 """Standard deviation of the smoothing kernel of tracks, s."""
 FAST_S = 1.0
-"""Time scale above which changes are removed from residuals, s: errors of detectors and cameras are
-correlated."""
-_BLOCK_S = 1.0
-"""Duration within which errors count as one correlated error, s."""
+"""Time scale above which changes are removed from residuals, s, and duration within which errors
+count as one: errors of detectors and cameras are correlated."""
+FASTEST = 2.0
+"""Maximum speed of a joint, statures per second; faster ones are identity switches."""
+LEAST_MISS = 0.004
+"""Minimum error of a detector as a share of a person's size: 7 mm."""
 
 _SAME_TIME = 1e-3
 """Difference of times that is ignored, frames."""
@@ -183,26 +184,14 @@ def seen_at(detections: "DetectionSequence | OneClock", frames: Iterable[int]) -
 
 def _followed(seen: Sightings) -> list[Index]:
     """Rows of each track, ordered by frame; single missing frames are bridged."""
-    open_, done = list[list[int]](), list[list[int]]()
-    order = np.argsort(seen.frame, kind="stable")
-    frames, starts = np.unique(seen.frame[order], return_index=True)
-    for frame, rows in zip(frames.tolist(), np.split(order, starts[1:]), strict=True):
-        done += [each for each in open_ if frame - seen.frame[each[-1]] > 2]
-        open_ = [each for each in open_ if frame - seen.frame[each[-1]] <= 2]
-        free = set(rows.tolist())
-        if open_:
-            last = np.array([each[-1] for each in open_])
-            away = (
-                np.linalg.norm(seen.xy[last][:, None] - seen.xy[rows], axis=-1)
-                / seen.size_px[rows][:, None]
-            )
-            cost = np.minimum(median_of(away, MIN_JOINTS), 1.0)
-            for one, other in zip(*linear_sum_assignment(cost), strict=True):
-                if cost[one, other] < _SAME:
-                    open_[one].append(int(rows[other]))
-                    free.discard(int(rows[other]))
-        open_ += [[row] for row in sorted(free)]
-    return [np.array(each, dtype=np.intp) for each in done + open_]
+
+    def away(one: Index, other: Index) -> Array:
+        apart_px = np.linalg.norm(seen.xy[one][:, None] - seen.xy[other], axis=-1)
+        return median_of(apart_px / seen.size_px[other][:, None], MIN_JOINTS)
+
+    who = follow(seen.frame, away, _SAME, 2)
+    order = np.lexsort((seen.frame, who))
+    return np.split(order, np.flatnonzero(np.diff(who[order])) + 1)
 
 
 def _smoothed(rays: Array, frame: Index, width: float) -> tuple[Array, Array]:
@@ -244,4 +233,4 @@ def block_frames(fps: float, lasts: float) -> float:
     """Number of frames that count as one correlated error; fewer in short recordings of `lasts`
     frames.
     """
-    return max(1.0, min(_BLOCK_S * fps, lasts / 12))
+    return max(1.0, min(FAST_S * fps, lasts / 12))

@@ -16,6 +16,7 @@ from shapepose_fg.calibration.from_people import (
 )
 from shapepose_fg.calibration.levelling import Measured
 from shapepose_fg.calibration.offsets_from_heights import offsets_without_poses
+from shapepose_fg.calibration.refinement import Steps
 from shapepose_fg.calibration.synchronisation import WHOLE_S, Synchronised, offsets
 from shapepose_fg.calibration.tracks import at_regular_times, next_of, on_one_clock
 from shapepose_fg.core.arrays import Array
@@ -51,14 +52,9 @@ def calibrate_unsynchronised(
     V = len(rig)
     frames = frames[: round(WHOLE_S * fps)]
     sightings = at_regular_times(Sightings.of(detections, frames), time_s, fps)
-    total, done = V - 1 + 100 * _ROUNDS, 0
-
-    def told() -> None:
-        nonlocal done
-        done += 1
-        progress(done, total)
-
-    shift = offsets_without_poses(own_tracks(sightings, rig, fps), fps, most_s, told)
+    total = V - 1 + 100 * _ROUNDS
+    tracks = own_tracks(sightings, rig, fps)
+    shift = offsets_without_poses(tracks, fps, most_s, Steps(progress, total))
     following, found, problems = next_of(sightings), None, tuple[str, ...]()
     for turn in range(_ROUNDS):
         seen = on_one_clock(sightings, following, shift, detections.skeleton)

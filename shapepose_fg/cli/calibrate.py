@@ -1,6 +1,5 @@
 """The command `calibrate`: estimates camera poses from walking people."""
 
-import json
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,6 +15,7 @@ from shapepose_fg.cli.found_cameras import (
     from_zero,
     report_option,
     show_clocks,
+    write_page,
 )
 from shapepose_fg.cli.options import (
     INPUT,
@@ -31,7 +31,7 @@ from shapepose_fg.cli.options import (
     option,
     picture_size,
 )
-from shapepose_fg.cli.terminal import note, progress, show, table
+from shapepose_fg.cli.terminal import note, progress, show, show_json, table
 from shapepose_fg.core.errors import InputError, naming
 
 if TYPE_CHECKING:
@@ -207,44 +207,47 @@ def calibrate(
                 rate,
                 0.0 if times is None else most,
                 guessed if seen.calibration is None else set(whole.names) if focal else set(),
-                within,
             )
         except Undetermined as error:
             note(*error.problems)
             raise typer.Exit(1) from None
     note(*found.notes)
+    refused = [each for name, start in starts.items() if (each := start.refusal(name, *within))]
+    if refused:
+        output = output.with_name(f"{output.stem}.refused{output.suffix}")
+        times = times and times.with_name(f"{times.stem}.refused{times.suffix}")
     (write_pose2sim if form == "pose2sim" else write_rig)(whole, output)
     if times is not None and clocks is not None:
         write_timestamps(times, whole.names, time_s)
+    if refused:
+        kept = f"--calibration {output}" + f" --timestamps {times}" * (clocks is not None)
+        note(*refused, f"they are kept, so that they can be accepted: {kept}")
+        raise typer.Exit(1)
     heads, rows = _figures(found, focal)
     lines = [_CAPTION, *_world(found, stature, distance or [])]
-    if report is not None:
-        from shapepose_fg.viz.report.cameras import CameraPage
-
-        people = found.adjusted.people
-        page = CameraPage(
-            rig=found.rig,
-            points=people.points,
-            frame=people.frame,
-            # Frame sets of an estimated clock start at time 0.
-            time_s=known.frame_s
-            if clocks is None
-            else np.arange(people.frame.max(initial=0) + 1) / fps,
-            skeleton=recording.skeleton,
-            heads=heads,
-            rows=rows,
-            missed_px={"joint, px": found.missed_px},
-            lines=lines,
-            remarks=found.notes,
-        )
-        page.write(report)
-        note(f"{report}: cameras and people in 3D, to open in a browser")
+    people = found.adjusted.people
+    write_page(
+        report,
+        rig=found.rig,
+        points=people.points,
+        frame=people.frame,
+        # Frame sets of an estimated clock start at time 0.
+        time_s=known.frame_s
+        if clocks is None
+        else np.arange(people.frame.max(initial=0) + 1) / fps,
+        skeleton=recording.skeleton,
+        heads=heads,
+        rows=rows,
+        missed_px={"joint, px": found.missed_px},
+        lines=lines,
+        remarks=found.notes,
+    )
     if as_json:
         told = found.as_dict() | (
             {} if clocks is None else {"clocks": clocks.as_dict(rig)["cameras"]}
         )
         told |= {"moving": {name: each.as_dict() for name, each in starts.items()}}
-        print(json.dumps(told, indent=2, allow_nan=False))
+        show_json(told)
     else:
         show(table(("camera", *heads), [(name, *each) for name, each in rows], caption=_CAPTION))
         print("\n".join(lines[1:]))
@@ -271,7 +274,6 @@ def _with_moving(
     rate: RateOptions,
     most: float,
     guessed: set[str],
-    within: tuple[float, float],
 ) -> "tuple[Rig, Array, dict[str, Start]]":
     """The rig `whole` with the fixed cameras as calibrated in `rig`, and with moving ones, whose
     start is found, with the lens of those in `guessed`; the times (T, V) of frames, from 0 on; and
@@ -281,7 +283,7 @@ def _with_moving(
     """
     from shapepose_fg.calibration.moving_camera import Filmed, Placed
     from shapepose_fg.core.camera import Rig
-    from shapepose_fg.io.calibration import carried
+    from shapepose_fg.io.calibration import with_first_poses
     from shapepose_fg.io.recording import own_times
 
     rig = found.rig
@@ -300,7 +302,7 @@ def _with_moving(
             odometry = trajectories[name].from_start(own_s)
             filmed = Filmed.of(own, given.cameras[0], odometry, own_s)
             starts[name] = start = filmed.started(
-                placed, most, name in guessed, *within, found.world.sigma_scale
+                placed, most, name in guessed, found.world.sigma_scale
             )
         cameras[name], trajectories[name] = start.of(given.cameras[0], odometry)
         columns[name] = own_s + start.offset_s
@@ -312,7 +314,7 @@ def _with_moving(
     begin = np.nanmin(time_s) if most > 0 else 0.0
     moving = tuple(replace(each, time_s=each.time_s - begin) for each in trajectories.values())
     moved = Rig(tuple(cameras[name] for name in whole.names), "z", trajectories=moving)
-    return carried(moved), time_s - begin, starts
+    return with_first_poses(moved), time_s - begin, starts
 
 
 _CAPTION = (
@@ -343,7 +345,7 @@ def _figures(found: "Calibrated", focal: bool) -> tuple[list[str], list[tuple[st
 
 def _world(found: "Calibrated", stature: float | None, distances: list[str]) -> list[str]:
     """Scale, up axis, fit, and how far to trust them, one line each."""
-    from shapepose_fg.calibration.adjustment import MOVE, TURN
+    from shapepose_fg.setup_check.fit import MOVE, TURN
 
     world = found.world
     if distances:

@@ -19,7 +19,7 @@ from shapepose_fg.cli.options import (
     result_frames,
 )
 from shapepose_fg.cli.terminal import note, show, table
-from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.bounds import Axis
 
 if TYPE_CHECKING:
     from shapepose_fg.evaluation.score import Score
@@ -38,7 +38,7 @@ def evaluate(
     ),
     frames: str | None = frames_option(),
     offset: int = option(INPUT, "Number of the truth's frame at frame 0 of the results.", 0),
-    up: str | None = option(
+    up: Axis | None = option(
         INPUT, "World axis that points up, for AMASS, if cameras.json is missing.", metavar="AXIS"
     ),
     fps: Hertz | None = option(INPUT, "Frame rate of the results, Hz, to which AMASS is thinned."),
@@ -51,16 +51,13 @@ def evaluate(
     the covariances.
     """
     from dataclasses import replace
-    from typing import Any, get_args
+    from typing import Any
 
-    from shapepose_fg.core.camera import Axis
     from shapepose_fg.core.rig_file import CAMERAS
     from shapepose_fg.evaluation.score import score
     from shapepose_fg.evaluation.truth import read_people
     from shapepose_fg.io.calibration import read_rig
 
-    if up is not None and up not in get_args(Axis):
-        raise InputError(f"--up {up}: must be one of {' '.join(get_args(Axis))}")
     cameras = results[0] / CAMERAS
     axis: Any = up or (read_rig(cameras).up if cameras.is_file() else None)
     how: Any = {"up": axis, "fps": fps, "body": body}

@@ -1,11 +1,10 @@
 """The command `explain`: explains which measurements determine a joint of a result."""
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from shapepose_fg.cli.options import INPUT, TIME, argument, grouped, json_option, option
-from shapepose_fg.cli.terminal import show, table
+from shapepose_fg.cli.terminal import show, show_json, table
 from shapepose_fg.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -51,7 +50,7 @@ def explain(
         people, rig, person=person, joint=joint, frame=frame, time_s=time, detections=seen
     )
     if as_json:
-        print(json.dumps(found.as_dict(), indent=2, allow_nan=False))
+        show_json(found.as_dict())
     else:
         show(_screen(found))
 

@@ -31,6 +31,15 @@ def report_option() -> Any:
     return option(RESULT, "Page for the browser with cameras and people in 3D: FILE.html.")
 
 
+def write_page(report: Path | None, **content: Any) -> None:
+    """Write the page of cameras and people to `report`, if given; `content` as for `CameraPage`."""
+    if report is not None:
+        from shapepose_fg.viz.report.cameras import CameraPage
+
+        CameraPage(**content).write(report)
+        note(f"{report}: cameras and people in 3D, to open in a browser")
+
+
 def found_clocks(
     detections: Path,
     rig: "Rig",

@@ -84,7 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             code = app(arguments or ["--help"], standalone_mode=False)
             sys.stdout.flush()
     except _UsageProblem as error:
-        message = cast(Any, error).format_message().rstrip(".")
+        message = cast(Any, error).format_message().rstrip(".").replace("Value error, ", "")
         code = _fail(f"{message}; see shapepose-fg --help")
     except InputError as error:
         code = _fail(str(error))

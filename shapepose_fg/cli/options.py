@@ -14,13 +14,12 @@ import typer
 from annotated_types import Interval
 
 from shapepose_fg.cli.terminal import note
-from shapepose_fg.core.bounds import interval_of, violated
+from shapepose_fg.core.bounds import Axis, Unit, interval_of, violated
 from shapepose_fg.core.errors import InputError, naming
 
 if TYPE_CHECKING:
-    from shapepose_fg.core.camera import Axis, Rig
+    from shapepose_fg.core.camera import Rig
     from shapepose_fg.core.frame_times import FrameTimes
-    from shapepose_fg.io.calibration import Unit
     from shapepose_fg.io.detection_table import DetectionTable
     from shapepose_fg.io.detections.people import DeclaredJoints
     from shapepose_fg.io.pose2sim_project import Pose2SimProject
@@ -180,10 +179,10 @@ class CameraOptions:
     calibration: Path | None = option(
         INPUT, "Calibration of the cameras: a file or folder in a known format."
     )
-    up: str | None = option(
+    up: Axis | None = option(
         INPUT, "World axis that points up: x, -x, y, -y, z or -z.", metavar="AXIS"
     )
-    unit: str | None = option(INPUT, "Unit of the calibration: m, cm or mm.", metavar="UNIT")
+    unit: Unit | None = option(INPUT, "Unit of the calibration: m, cm or mm.", metavar="UNIT")
     image_size: str | None = option(
         INPUT, "Size of the calibrated pictures, if the file does not contain it.", metavar="WxH"
     )
@@ -197,9 +196,8 @@ class CameraOptions:
         if self.calibration is None:
             raise InputError("--calibration: missing; give the calibration file or folder")
         size = picture_size(self.image_size)
-        up, unit = cast("Axis | None", self.up), cast("Unit | None", self.unit)
         chosen = {"cameras": names_of(self.cameras), "without": names_of(self.without) or ()}
-        found = read_rig(self.calibration, up=up, unit=unit, image_size=size, **chosen)
+        found = read_rig(self.calibration, up=self.up, unit=self.unit, image_size=size, **chosen)
         note(*found.notes)
         return found
 
@@ -371,7 +369,7 @@ class ResultOptions:
 
     results: Path = argument("RESULTS", "Folder of a reconstruction.")
     fps: Hertz | None = option(TIME, "Frame rate, Hz, instead of the result's own times.")
-    up: str | None = option(
+    up: Axis | None = option(
         INPUT, "World axis that points up, if cameras.json is missing.", metavar="AXIS"
     )
     body: Path | None = option(INPUT, "Body model of the result, if its file has moved.")

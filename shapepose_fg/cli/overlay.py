@@ -4,7 +4,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from annotated_types import Interval
 
@@ -26,9 +26,6 @@ from shapepose_fg.core.frame_times import ASSUMED_FPS
 from shapepose_fg.core.result_files import results_folder
 from shapepose_fg.core.run_summary import covered_frames
 from shapepose_fg.core.storage.files import inside
-
-if TYPE_CHECKING:
-    from shapepose_fg.core.camera import Rig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,9 +82,10 @@ def overlay(
     folder = results_folder(results)
     with Reconstruction.open(folder) as people:
         rig, run = cameras_of(folder), people.run
-        names = pictures.named(rig) if drawn.cameras is None else _cameras(drawn.cameras, rig)
-        with naming("--without"):
-            names = choose(names, without=names_of(drawn.without) or ())
+        wanted = names_of(drawn.cameras)
+        with naming("--cameras, --without"):
+            known = pictures.named(rig) if wanted is None else rig.names
+            names = choose(known, wanted, names_of(drawn.without) or ())
         shown = pictures.of_result(folder, run, rig, names, detections)
         if drawn.points and not people.observed:
             note(f"{folder}: observations.npz is missing, so no detections are drawn")
@@ -119,21 +117,6 @@ def overlay(
             )
         for path in written:
             print(f"written  {path}")
-
-
-def _cameras(text: str, rig: "Rig") -> list[str]:
-    """Names of the wanted cameras."""
-    names = names_of(text) or []
-    for name in names:
-        if name not in rig.names:
-            raise InputError(
-                f"--cameras {text}: there is no camera {name!r}; there are {' '.join(rig.names)}"
-            )
-    if len(names) == 0 or len(set(names)) < len(names):
-        raise InputError(
-            f"--cameras {text}: must be camera names without repetition, such as {rig.names[0]}"
-        )
-    return names
 
 
 def _fps(run: Mapping[str, Any]) -> float:

@@ -1,6 +1,5 @@
 """The command `refine-calibration`: refines cameras by the people of a recording."""
 
-import json
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 from annotated_types import Interval
 
-from shapepose_fg.cli.found_cameras import report_option
+from shapepose_fg.cli.found_cameras import report_option, write_page
 from shapepose_fg.cli.options import (
     REQUIRED,
     RESULT,
@@ -20,12 +19,11 @@ from shapepose_fg.cli.options import (
     next_reconstruct,
     option,
 )
-from shapepose_fg.cli.terminal import note, progress, show, table
+from shapepose_fg.cli.terminal import note, progress, show, show_json, table
 from shapepose_fg.core.errors import InputError
 
 if TYPE_CHECKING:
     from shapepose_fg.calibration.refinement import Refinement
-    from shapepose_fg.io.calibration import Unit
 
 _CAMERAS = "Prior uncertainty"
 
@@ -111,29 +109,25 @@ def refine_calibration(
             found = refine(recording, rig, times, span, freedom, reference, done)
     note(*found.notes)
     new = found.rig if may.stature is None else found.of_stature(may.stature)
-    form, output = write_like(source, new, output, cast("Unit | None", seen.unit))
+    form, output = write_like(source, new, output, seen.unit)
     heads, rows = _figures(found, may)
     lines = _words(found, may)
-    if report is not None:
-        from shapepose_fg.viz.report.cameras import CameraPage
-
-        page = CameraPage(
-            rig=new,
-            before=found.given if found.better else None,
-            points=found.adjusted.people.points,
-            frame=found.adjusted.people.frame,
-            time_s=times.frame_s,
-            skeleton=recording.skeleton,
-            heads=heads,
-            rows=rows,
-            missed_px=dict(zip(("before, px", "after, px"), found.missed_px, strict=True)),
-            lines=lines,
-            remarks=found.notes,
-        )
-        page.write(report)
-        note(f"{report}: cameras and people in 3D, to open in a browser")
+    write_page(
+        report,
+        rig=new,
+        before=found.given if found.better else None,
+        points=found.adjusted.people.points,
+        frame=found.adjusted.people.frame,
+        time_s=times.frame_s,
+        skeleton=recording.skeleton,
+        heads=heads,
+        rows=rows,
+        missed_px=dict(zip(("before, px", "after, px"), found.missed_px, strict=True)),
+        lines=lines,
+        remarks=found.notes,
+    )
     if as_json:
-        print(json.dumps(found.as_dict(), indent=2, allow_nan=False))
+        show_json(found.as_dict())
     else:
         show(table(("camera", *heads), [(name, *each) for name, each in rows], caption=lines[0]))
         print("\n".join(lines[1:]))

@@ -1,6 +1,5 @@
 """The command `check-calibration`: checks whether cameras and detections fit each other."""
 
-import json
 import tempfile
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from shapepose_fg.cli.options import (
     json_option,
 )
 from shapepose_fg.cli.pictures import PictureOptions
-from shapepose_fg.cli.terminal import show
+from shapepose_fg.cli.terminal import show, show_json
 
 
 @grouped
@@ -48,7 +47,7 @@ def check_calibration(
             recording, rig, frame_range(frames, len(recording), recording.first), sizes
         )
     if as_json:
-        print(json.dumps(report.as_dict(), indent=2, allow_nan=False))
+        show_json(report.as_dict())
     else:
         show(setup_report(report))
     if len(report.findings) > 0:

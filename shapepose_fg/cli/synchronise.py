@@ -1,6 +1,5 @@
 """The command `synchronise`: estimates start times of cameras from people."""
 
-import json
 import shlex
 from pathlib import Path
 
@@ -18,7 +17,7 @@ from shapepose_fg.cli.options import (
     next_reconstruct,
     option,
 )
-from shapepose_fg.cli.terminal import note
+from shapepose_fg.cli.terminal import note, show_json
 
 
 @grouped
@@ -45,7 +44,7 @@ def synchronise(
     if output is not None and not problems:
         write_timestamps(output, rig.names, taken_s)
     if as_json:
-        print(json.dumps(found.as_dict(rig), indent=2, allow_nan=False))
+        show_json(found.as_dict(rig))
     else:
         show_clocks(found, rig)
     note(*problems)

@@ -1,5 +1,6 @@
 """Output of the commands on a terminal: results, notes, and progress bars."""
 
+import json
 import logging
 import os
 import re
@@ -91,6 +92,11 @@ def show(content: "RenderableType") -> None:
     contains names and paths.
     """
     console().print(content)
+
+
+def show_json(value: Any) -> None:
+    """Print a plain value on stdout, as JSON."""
+    print(json.dumps(value, indent=2, allow_nan=False))
 
 
 def table(

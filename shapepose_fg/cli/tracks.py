@@ -1,12 +1,11 @@
 """The command `tracks`: lists the people of a result over time, and corrects identities by hand."""
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from shapepose_fg.cli.options import RESULT, argument, grouped, json_option, option
-from shapepose_fg.cli.terminal import note, show, table
+from shapepose_fg.cli.terminal import note, show, show_json, table
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.result_files import results_folder, set_aside
 
@@ -87,7 +86,7 @@ def _print_as_json(results: Path) -> None:
         {name: None if value != value else value for name, value in track.items()}
         for track in listed
     ]
-    print(json.dumps(plain, indent=2, allow_nan=False))
+    show_json(plain)
 
 
 def _undo(results: Path) -> None:

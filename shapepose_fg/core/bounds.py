@@ -1,9 +1,9 @@
 """Settings with bounds: declared in the type of a field, and checked whenever settings are
-created.
+created. Types of options with few values.
 """
 
 from functools import cache
-from typing import Annotated, Any, get_args, get_type_hints
+from typing import Annotated, Any, Literal, get_args, get_type_hints
 
 from annotated_types import Interval
 
@@ -23,6 +23,10 @@ Repeats = Annotated[int, Interval(ge=1, le=100)]
 """A number of repetitions, 1 or more."""
 RepeatsOrNone = Annotated[int, Interval(ge=0, le=100)]
 """A number of repetitions, 0 or more."""
+Axis = Literal["x", "-x", "y", "-y", "z", "-z"]
+"""A world axis, used to name the up direction of a calibration."""
+Unit = Literal["m", "cm", "mm"]
+"""A unit of lengths."""
 
 
 class Settings:

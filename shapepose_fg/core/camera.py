@@ -4,18 +4,15 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import PurePath
-from typing import Literal
 
 import numpy as np
 
 from factors.pinhole import project_with_jacobian, to_pixels
 from shapepose_fg.core.arrays import Array, Index, Real
+from shapepose_fg.core.bounds import Axis as Axis
 from shapepose_fg.core.decompositions import is_rotation, nearest_rotation, rigid
 from shapepose_fg.core.lens import COEFFICIENTS, Lens, distorted, padded_distortion, undistorted
 from shapepose_fg.core.trajectory import MOST_METRES, Carried, Trajectory
-
-Axis = Literal["x", "-x", "y", "-y", "z", "-z"]
-"""A world axis, used to name the up direction of a calibration."""
 
 _MOST_PIXELS, _MOST_DISTORTION, _LONGEST_NAME = 1_000_000, 1e6, 200
 """Upper bounds of the size of a picture, pixels, of distortion coefficients, and of the length of a

@@ -11,8 +11,6 @@ from importlib import import_module
 from threading import Thread, Timer
 from typing import Any
 
-from loky import ProcessPoolExecutor
-
 from shapepose_fg.core.kept_kernels import kept_folder, wanted_folder
 
 _BYTES_S = 1300
@@ -69,6 +67,8 @@ def _share_out(kernels: Sequence[Any], count: int) -> None:
         p for m in modules.values() for p in ([m] if _work(m) < bound else [[each] for each in m])
     ]
     groups.sort(key=_work, reverse=True)
+    from loky import ProcessPoolExecutor  # its import takes time that other runs need not spend
+
     pool = ProcessPoolExecutor(count, initializer=_begin, initargs=(os.getpid(),))
     try:
         waiting = [pool.submit(_load, [each.name for each in group]) for group in groups]

@@ -21,7 +21,7 @@ from shapepose_fg.estimation.linearisation import (
 _MIN_VIEWS = 3
 """Minimum number of views that agree on a joint; two that agree may both be wrong."""
 _MIN_CONFIDENCE = 0.4
-"""Minimum confidence of a detection to count as one of these views."""
+"""Minimum confidence of a detection from which an offset is estimated."""
 _MAX_SIGMA_M = 0.03
 """Maximum standard deviation of a used joint in its worst direction, m."""
 

@@ -1,11 +1,11 @@
 """Initial estimates of joints without a graph, for reassociating the detections."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from shapepose_fg.body.fitting.evidence import LEAST_JOINTS
-from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, JointTargets
+from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, FitStatus, JointTargets
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
@@ -30,10 +30,6 @@ On `tune`, frame by frame, MPJPE is 35 mm, and 44 if the body is fitted once, to
 `rho_2d_m` of the triangulated joints. With priors that are stiff while the kernel is wide F1 rose
 by 1.5 points there, but raised arms sank on real footage."""
 
-_AS_PROBABLY = 0.2
-"""Change of a detection's probability above which a row is estimated again: from 1 to 0.8 the
-detection's standard deviation grows by an eighth."""
-
 MOVED_M = 0.02
 """Motion of a target, m, above which the body of an initial estimate is fitted again, similar to a
 detector's deviation from the body; or a changed weight. On Shelf a quarter of all fits remain."""
@@ -44,8 +40,11 @@ class Draft:
     """Initial estimates of the joints of N rows."""
 
     observations: Observations
-    """Observations of the estimate; unchanged rows keep the probabilities used for
-    their estimate."""
+    """Observations of the estimate."""
+    body: BodyFit
+    """Bodies of the rows."""
+    fitted: JointTargets
+    """Targets to which they were fitted."""
     places: Array
     """(N, J, 3) positions, metres; NaN if neither views nor body determine them."""
     covariance: Array
@@ -53,58 +52,45 @@ class Draft:
 
 
 def draft(
-    observations: Observations, views: Views, fitter: BodyFitter, config: EstimatorConfig
-) -> tuple[Array, Array]:
-    """Initial estimates (N, J, 3), metres, and covariances (N, J, 3, 3) of the joints of N rows.
+    observations: Observations,
+    views: Views,
+    fitter: BodyFitter,
+    config: EstimatorConfig,
+    last: Draft | None = None,
+) -> Draft:
+    """Initial estimates of the joints of N rows.
 
     From the views, and from the body where these are weak or contradict it. Measurements are
     linearised at triangulated joints, then at the body's, with a decreasing kernel (`NARROWING_M`).
-    As a joint's views also determine the body, the covariances are too small.
+    Rows with the same detections as in the `last` estimate start from its body, with the narrowest
+    kernel. As a joint's views also determine the body, the covariances are too small.
     """
     X = triangulate(observations, views, config.observations)
     sigmas = observation_sigmas(observations, X, views, config.observations, config.joints)
     evidence = linearise(observations, sigmas, X, views, config.observations)
     enough = (evidence.sigma_m <= config.refine.max_sigma_m).sum(axis=1) >= LEAST_JOINTS
-    fitted = joint_targets(evidence, enough)
-    body = fitter.fit_whole(fitted)
+    N, J = X.shape[:2]
+    fitted = JointTargets(np.zeros((N, J, 3)), np.zeros((N, J, 3, 3)))
+    body, near = BodyFit.failed(np.full(N, FitStatus.TOO_FEW_JOINTS), J), np.zeros(N, dtype=bool)
+    if last is not None:
+        here, there = _unchanged(observations, last.observations)
+        fitted.put(here, last.fitted.rows(there))
+        body.put(here, last.body.rows(there))
+        near[here] = body.ok[here]
     for reach_m in NARROWING_M:
         around = np.where(body.ok[:, None, None], body.joints, X)
         evidence = linearise(observations, sigmas, around, views, config.observations, reach_m)
         targets = joint_targets(evidence, enough)
         rows = changed_targets(fitted, targets, MOVED_M, 2.0)
+        rows = rows[(reach_m == NARROWING_M[-1]) | ~near[rows]]
         if len(rows) == 0:
             continue
         again = fitter.fit_whole(targets.rows(rows))
-        fitted = fitted.with_rows(rows, targets.rows(rows))
+        fitted.put(rows, targets.rows(rows))
         placed = np.flatnonzero(again.ok)
-        body = body.with_rows(rows[placed], again.rows(placed))
-    return drafted(evidence, body)
-
-
-def redraft(
-    last: Draft | None,
-    observations: Observations,
-    views: Views,
-    fitter: BodyFitter,
-    config: EstimatorConfig,
-) -> Draft:
-    """`draft`, but rows keep their `last` estimate if their detections are the same, with similar
-    probabilities.
-    """
-    places = np.full(observations.initial.shape, np.nan)
-    covariance = np.full((*places.shape, 3), np.nan)
-    probability = observations.probability.copy()
-    here, there = np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp)
-    if last is not None:
-        here, there = _unchanged(observations, last.observations)
-        places[here], covariance[here] = last.places[there], last.covariance[there]
-        probability[here] = last.observations.probability[there]
-    rows = np.setdiff1d(np.arange(len(places)), here)
-    if len(rows) > 0:
-        places[rows], covariance[rows] = draft(
-            observations.rows(rows), views.rows(rows), fitter, config
-        )
-    return Draft(replace(observations, probability=probability), places, covariance)
+        body.put(rows[placed], again.rows(placed))
+    places, covariance = drafted(evidence, body)
+    return Draft(observations, body, fitted, places, covariance)
 
 
 def _unchanged(now: Observations, before: Observations) -> tuple[Index, Index]:
@@ -114,9 +100,7 @@ def _unchanged(now: Observations, before: Observations) -> tuple[Index, Index]:
     width = int(max(now.track.max(initial=0), before.track.max(initial=0))) + 1
     names = [each.frame * width + each.track for each in (now, before)]
     _, here, there = np.intersect1d(*names, assume_unique=True, return_indices=True)
-    same = (now.xy[here] == before.xy[there]).all(axis=-1)
-    same &= np.abs(now.probability[here] - before.probability[there]) < _AS_PROBABLY
-    same = same.all(axis=(1, 2))
+    same = (now.xy[here] == before.xy[there]).all(axis=(1, 2, 3))
     return here[same], there[same]
 
 
@@ -134,9 +118,9 @@ def first_places(
     rows = np.flatnonzero(unknown.any(axis=1) & (rows_of[whose] > 1))
     if len(rows) == 0:
         return X
-    places, _ = draft(observations.rows(rows), views.rows(rows), fitter, config)
+    found = draft(observations.rows(rows), views.rows(rows), fitter, config)
     complete = X.copy()
-    complete[rows] = np.where(unknown[rows][..., None], places, X[rows])
+    complete[rows] = np.where(unknown[rows][..., None], found.places, X[rows])
     return complete
 
 

@@ -47,9 +47,9 @@ class Floor:
     sigma_m: float
     """Standard deviation of the height, below the centre of the feet used, metres."""
     looks: int
-    """Number of looks at standing feet used."""
+    """Number of independent measurements of the floor, one for each 1.5 s that a foot stands."""
     share: float
-    """Share of these looks that agree with the floor."""
+    """Share of the measurements of standing feet that agree with the floor."""
 
     def above(self, points: Array) -> Array:
         """(...,) height of points (..., 3) above the floor, metres."""

@@ -45,17 +45,17 @@ carriers."""
 _REACHES_M = (0.5, 0.15, 0.15)
 """Maximum distance of a used detection from its joint, by round, m; the odometry may be wrong at
 first."""
-_WEAKEST_M = 0.15
+WEAKEST_M = 0.15
 """Maximum standard deviation, in the worst direction, of a joint used for camera poses, m."""
 _SAME_PERSON = 2.5
 """Number of joints of a person in a view that count as one, because their errors are correlated."""
-_ERRORS = ((0.45, 3.5), (0.25, 0.25))
-"""Shares of a detector's correlated errors, and their time constants, seconds, as in
-`calibration/refinement.py`."""
+_ERRORS = ((0.45, 3.5), (0.25, 0.25), (0.30, 1e-9))
+"""Shares of a detector's errors, and their time constants, s: measured on simulated recordings,
+whose detector has Shelf's statistics (0.8 after a frame, 0.35 after a second, 0.1 after four)."""
 _AVERAGED_S = 1.0
 """Time, s, over which an odometry of 1 % is more accurate than people's constraints on a pose;
 errors average out over it."""
-_ANYWHERE_M = 10.0
+ANYWHERE_M = 10.0
 """Standard deviation of a weak prior on joints, m; one behind its cameras would make the system
 singular."""
 _GAUGE = np.diag([1e-5**2] * 3 + [1e-4**2] * 3)
@@ -72,8 +72,15 @@ def dilution(step_s: float, over_s: float = _AVERAGED_S) -> float:
     the time within which odometry gives relative poses more accurately than people do.
     """
     lags = np.arange(1, max(int(over_s / step_s), 1) + 1) * step_s
-    lasting = sum(share * np.exp(-lags / lasts).sum() for share, lasts in _ERRORS)
-    return float(_SAME_PERSON * (1 + 2 * lasting))
+    return float(correlated(0.0) + 2 * correlated(lags).sum())
+
+
+def correlated(apart_s: NDArray[np.floating] | float) -> Array:
+    """(...) correlation of a detector's errors in frames `apart_s` (...), seconds, apart, times the
+    number of joints of a person in a view that count as one.
+    """
+    shares = [share * np.exp(-np.abs(apart_s) / lasts) for share, lasts in _ERRORS]
+    return _SAME_PERSON * np.sum(shares, axis=0)
 
 
 @dataclass(frozen=True)
@@ -200,15 +207,7 @@ class TrajectoryGraph:
                 return
             both = gtsam.NonlinearFactorGraph(anchors)
             both.push_back(self.graph)
-            # Ceres' damping uses each parameter's own information, since radians and metres are
-            # mixed.
-            parameters = gtsam.LevenbergMarquardtParams.CeresDefaults()
-            parameters.setMaxIterations(10)
-            parameters.setRelativeErrorTol(1e-4)
-            parameters.setOrdering(gtsam.Ordering([*joints, *self.keys.ravel().tolist()]))
-            self.values = gtsam.LevenbergMarquardtOptimizer(
-                both, self.values, parameters
-            ).optimize()
+            self.values = optimised(both, self.values, [*joints, *self.keys.ravel().tolist()])
             self.poses = poses_of(self.values, self.keys)
 
     def of_poses(self) -> list[gtsam.NonlinearFactor]:
@@ -269,7 +268,7 @@ class TrajectoryGraph:
         there = chosen.any(axis=2)
         joints = self._joint_keys[there].tolist()
         deque(map(self.values.insert, joints, points[there]), maxlen=0)
-        near = isotropic(3, _ANYWHERE_M)
+        near = isotropic(3, ANYWHERE_M)
         deque(map(self.graph.addPriorPoint3, joints, points[there], [near] * len(joints)), maxlen=0)
         for factor in self._own(self, self.keys) if self._own is not None else ():
             self.graph.add(factor)
@@ -290,12 +289,25 @@ class TrajectoryGraph:
         depth = views.pixels(evidence.target)[1]
         away_m = np.linalg.norm(evidence.residual_px, axis=-1) * depth / views.focal[:, None]
         with np.errstate(invalid="ignore"):
-            chosen = rows.seen & (away_m < reach_m) & (evidence.sigma_m < _WEAKEST_M)[..., None]
+            chosen = rows.seen & (away_m < reach_m) & (evidence.sigma_m < WEAKEST_M)[..., None]
         on = self.mounted.rig.carrier
         groups = np.sum(
             [chosen[..., on == each].any(axis=-1) for each in np.unique(on).tolist()], axis=0
         )
         return chosen & (groups >= 2)[..., None], evidence.target, sigmas
+
+
+def optimised(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, order: Sequence[int]
+) -> gtsam.Values:
+    """The solution by Levenberg-Marquardt; `order` are the keys in order of elimination."""
+    # Ceres' damping uses each parameter's own information, since radians, metres and pixels are
+    # mixed.
+    parameters = gtsam.LevenbergMarquardtParams.CeresDefaults()
+    parameters.setMaxIterations(10)
+    parameters.setRelativeErrorTol(1e-4)
+    parameters.setOrdering(gtsam.Ordering(order))
+    return gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
 
 
 def poses_of(values: gtsam.Values, keys: NDArray[np.int64]) -> Array:

@@ -15,7 +15,7 @@ from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 
 @dataclass(frozen=True)
 class UserFactor:
-    """A user factor."""
+    """A factor that a function of the user has added to the graph of people."""
 
     factor: gtsam.NonlinearFactor
     keys: tuple[int, ...]

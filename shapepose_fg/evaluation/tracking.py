@@ -2,9 +2,6 @@
 covariances.
 """
 
-from dataclasses import dataclass
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,14 +9,8 @@ from shapepose_fg.body.model.body_model import BodyParameters
 from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.evaluation.metrics import (
-    CovarianceCalibration,
-    JointMetrics,
-    covariance_calibration,
-    match_people,
-    metrics_of,
-)
-from shapepose_fg.evaluation.track_metrics import TrackFrame, TrackMetrics, track_metrics
+from shapepose_fg.evaluation.metrics import covariance_calibration, match_people, metrics_of
+from shapepose_fg.evaluation.track_metrics import TrackFrame, track_metrics
 from shapepose_fg.io.solved_setup import model_of
 
 WRISTS = [BODY_25.index("RWrist"), BODY_25.index("LWrist")]
@@ -27,71 +18,30 @@ UNMATCHED = np.iinfo(np.int64).min
 """Code for "no identity"; every other number may be an identity."""
 
 
-@dataclass(frozen=True)
-class MotionScore:
-    """Motion of the joints of matched rows, or of those of their bodies, against the truth."""
-
-    mpjpe_mm: float
-    """Mean distance to the true joints, millimetres."""
-    acceleration_error: float
-    """Mean length of the difference between a joint's acceleration and the true one, m/s²."""
-    fast_wrist_error_mm: float
-    """Median error of wrists with a true speed above 1.5 m/s, millimetres."""
-
-
-@dataclass(frozen=True)
-class TrackingScore:
-    """Result of `score_tracks`."""
-
-    joints: JointMetrics
-    """Precision, recall, F1 at 0.2 m, MPJPE, duplicates and other false positives."""
-    identities: TrackMetrics | None
-    """IDF1, MOTA, HOTA, switches; None if `person` is not an identity."""
-    motion: MotionScore
-    """The motion of the joints."""
-    bodies: MotionScore
-    """The motion of the bodies' own joints."""
-    velocity_error: float
-    """Mean length of the difference between a joint's velocity and the true one, m/s; NaN without
-    velocities."""
-    calibration: dict[str, CovarianceCalibration]
-    """Covariances of `velocity`, and of the joints of matched rows that two views or more see in
-    that frame (`seen`), one view (`one_view`), none (`no_view`), and none in this frame and the
-    nine before (`unseen`)."""
-
-    def as_dict(self) -> dict[str, Any]:
-        """The figures by plain names, for tables and JSON; None if there is nothing to measure."""
-        figures = {name: 100 * getattr(self.joints, name) for name in ("f1", "precision", "recall")}
-        figures["idf1"] = np.nan if self.identities is None else 100 * self.identities.idf1
-        figures["velocity_error"] = self.velocity_error
-        for prefix, motion in {"": self.motion, "body_": self.bodies}.items():
-            figures |= {f"{prefix}{name}": value for name, value in vars(motion).items()}
-        counts = {
-            "false_positives": self.joints.false_positives,
-            "people_missed": self.joints.people_missed,
-        }
-        for name, calibration in self.calibration.items():
-            figures |= {
-                f"{name}_inside_{100 * level:.0f}": 100 * s
-                for level, s in calibration.coverage.items()
-            }
-            figures[f"{name}_log_score"] = calibration.log_score
-            counts[f"joints_{name}"] = len(calibration.nees)
-        if self.identities is not None:
-            counts["switches"] = self.identities.switches
-        return {name: float(v) if np.isfinite(v) else None for name, v in figures.items()} | counts
-
-
 def score_tracks(
     people: Reconstruction, truth: Reconstruction, fps: float, *, identities: bool = True
-) -> TrackingScore:
+) -> dict[str, float | None]:
     """Compare `people` with the `truth` of a recording of `fps` frames a second (`truth_of`, or any
-    result).
+    result); returns figures by name, None if there is nothing to measure.
+
+    | figure | of |
+    |---|---|
+    | `f1`, `precision`, `recall` | joints within 0.2 m, % |
+    | `false_positives`, `people_missed` | number of people (`JointMetrics`) |
+    | `idf1`, `switches` | identities (`track_metrics`), % and number |
+    | `mpjpe_mm`, `acceleration_error` | mean error of joints of matched rows, mm and m/s² |
+    | `fast_wrist_error_mm` | median error of wrists with a true speed above 1.5 m/s, mm |
+    | `body_...` | these three for the bodies' own joints |
+    | `velocity_error` | mean error of the velocities of joints, m/s |
+    | `..._inside_50`, `..._log_score`, `joints_...` | covariances of a class (`CovarianceCalibration`) and number of its joints |
+
+    Classes are `velocity`, and joints that two views or more see in that frame (`seen`), one view
+    (`one_view`), none (`no_view`), and none in this frame and the nine before (`unseen`).
 
     The frames from the first to the last of the truth are scored. Without `identities` the column
     `person` only numbers the people of a frame; metrics over time then use the true person with
     whom a row is matched. ValueError for an identity twice in one frame.
-    """
+    """  # noqa: E501
     true, first = joints_by_frame(truth), int(truth.frame.min()) if len(truth) > 0 else 0
     frames = range(first, first + len(true))
     matches = match_people(people.frame, people.joints, true, frames)
@@ -100,44 +50,43 @@ def score_tracks(
     who, follows = np.full(true.shape[:2], UNMATCHED), np.zeros(true.shape[:2], dtype=bool)
     who[at] = identity
     follows[1:] = (who[1:] != UNMATCHED) & (who[1:] == who[:-1])
-
-    def motion(joints: Array) -> MotionScore:
+    joints = metrics_of(matches, people.joints, true)
+    figures = {name: 100 * getattr(joints, name) for name in ("f1", "precision", "recall")}
+    figures |= {name: getattr(joints, name) for name in ("false_positives", "people_missed")}
+    if identities:
+        placed = people.rows(np.isfinite(people.joints.sum(axis=2)).any(axis=1))
+        by_frame = ((truth.rows(truth.frame == frame), placed.rows(placed.frame == frame))
+                    for frame in frames)  # fmt: skip
+        tracks = track_metrics(TrackFrame.of(*pair) for pair in by_frame)
+        figures |= {"idf1": 100 * tracks.idf1, "switches": tracks.switches}
+    for prefix, given in {"": found.joints, "body_": body_joints(found)}.items():
         placed = np.full(true.shape, np.nan)
-        placed[at] = joints
+        placed[at] = given
         fast = fast_wrist_errors(placed, true, fps)
-        return MotionScore(
-            mpjpe_mm=1e3 * _mean(np.linalg.norm(placed - true, axis=-1)),
-            acceleration_error=_mean(acceleration_errors(placed, true, follows, fps)),
-            fast_wrist_error_mm=1e3 * float(np.median(fast)) if len(fast) > 0 else float("nan"),
-        )
-
+        figures |= {
+            f"{prefix}mpjpe_mm": 1e3 * _mean(np.linalg.norm(placed - true, axis=-1)),
+            f"{prefix}acceleration_error": _mean(acceleration_errors(placed, true, follows, fps)),
+            f"{prefix}fast_wrist_error_mm": 1e3 * np.median(fast) if len(fast) > 0 else np.nan,
+        }
     views, error = views_used(found), found.joints - true[at]
     moving = found.velocity - velocities(true, fps)[at]
-    # Number of consecutive frames without a view, the current one included, from which a
-    # joint counts as long unseen.
+    figures["velocity_error"] = _mean(np.linalg.norm(moving, axis=-1))
     classes = {
         "seen": views >= 2,
         "one_view": views == 1,
         "no_view": views == 0,
         "unseen": frames_unseen(views > 0, found.frame, identity) >= 10,
     }
-    calibration = {
-        name: covariance_calibration(error[those], found.covariance[those])
-        for name, those in classes.items()
-    }
-    placed = people.rows(np.isfinite(people.joints.sum(axis=2)).any(axis=1))
-    by_frame = ((truth.rows(truth.frame == frame), placed.rows(placed.frame == frame))
-                for frame in frames)  # fmt: skip
-    tracks = track_metrics(TrackFrame.of(*pair) for pair in by_frame) if identities else None
-    return TrackingScore(
-        metrics_of(matches, people.joints, true),
-        tracks,
-        motion=motion(found.joints),
-        bodies=motion(body_joints(found)),
-        velocity_error=_mean(np.linalg.norm(moving, axis=-1)),
-        calibration=calibration
-        | {"velocity": covariance_calibration(moving, found.velocity_covariance)},
-    )
+    pairs = {name: (error[those], found.covariance[those]) for name, those in classes.items()}
+    for name, pair in (pairs | {"velocity": (moving, found.velocity_covariance)}).items():
+        calibration = covariance_calibration(*pair)
+        figures |= {
+            f"{name}_inside_{100 * level:.0f}": 100 * share
+            for level, share in calibration.coverage.items()
+        }
+        figures |= {f"{name}_log_score": calibration.log_score}
+        figures |= {f"joints_{name}": len(calibration.nees)}
+    return {name: float(v) if np.isfinite(v) else None for name, v in figures.items()}
 
 
 def body_joints(people: Reconstruction) -> Array:

@@ -15,10 +15,10 @@ from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.core.detections import Input
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.rows import Rows
-from shapepose_fg.proposal.nearby import Sight
+from shapepose_fg.proposal.nearby import FrameArrays
 from shapepose_fg.tracking.global_hypotheses import PLACED_M
 from shapepose_fg.tracking.identities import observed
-from shapepose_fg.tracking.sides import hold_now
+from shapepose_fg.tracking.sides import correct_swaps_now
 from shapepose_fg.tracking.stitching import LEAST_ROWS, Ends, StitchingConfig, Trace, stitch
 from shapepose_fg.tracking.track_selection import APPEARS_S, LEAST_S, own_evidence, weighed
 from shapepose_fg.tracking.tracker import Tracker, Tracks
@@ -126,7 +126,7 @@ class Filter:
         second new people are searched for in the unassigned detections.
         """
         time_s, last_s, tracker = float(given.time_s.mean()), before.tracks.time_s, self.tracker
-        tracks, given = hold_now(tracker, before.tracks, given)
+        tracks, given = correct_swaps_now(tracker, before.tracks, given)
         tracks, candidate = tracker.step(tracks, given.detections, given.rig, time_s)
         now = replace(before, tracks=replace(tracks, time_s=time_s))
         # Maximum duration of a frame's evidence, s, also after a longer gap between
@@ -154,8 +154,8 @@ class Filter:
         if len(now.tracks) == 0:
             return now, candidate
         places, tracker = self.placed(now), self.tracker
-        sight = Sight.of(given.detections, given.rig, tracker.skeleton)
-        weight, price = weighed(candidate, places, sight, tracker.skeleton, now.tracks.world)
+        arrays = FrameArrays.of(given.detections, given.rig, tracker.skeleton)
+        weight, price = weighed(candidate, places, arrays, tracker.skeleton, now.tracks.world)
         running_s = now.running_s + lasts_s * own_evidence(candidate, weight, price)
         views = (candidate >= 0).sum(axis=2)
         seen = np.where((views >= 2)[..., None], places, np.nan)
@@ -204,11 +204,11 @@ class Filter:
         trace = self._trace(places)
         blank = np.zeros((count, trace.bones.shape[1]))
         # A person whom one frame makes certain has sufficient evidence at once.
-        sight, world = (
-            Sight.of(given.detections, given.rig, tracker.skeleton),
+        arrays, world = (
+            FrameArrays.of(given.detections, given.rig, tracker.skeleton),
             np.zeros(count, dtype=np.intp),
         )
-        evidence = own_evidence(own, *weighed(own, places, sight, tracker.skeleton, world))
+        evidence = own_evidence(own, *weighed(own, places, arrays, tracker.skeleton, world))
         running_s = np.where(evidence >= _SURE, LEAST_S, 0.0)
         columns: dict[str, Any] = {
             "views": (own >= 0).sum(axis=2),

@@ -125,9 +125,12 @@ class _Sender:
             self.good += 1
 
     def end(self) -> None:
-        """Raise InputError if there were lines, but none was accepted."""
-        if self.good == 0 and self.refused is not None:
-            raise self.refused
+        """Raise InputError if no detections were accepted."""
+        if self.good == 0:
+            raise self.refused or InputError(
+                f"{self.name}: the input ended without detections; check that the detector runs "
+                "and writes a line for each picture"
+            )
 
     def _read(self, line: bytes | None, place: str) -> tuple[Any, ...] | None:
         if line is None:

@@ -131,9 +131,9 @@ def people_at(
     newest: Newest, skeleton: Skeleton, motion: MotionModel, ahead_s: float
 ) -> Reconstruction:
     """Rows of all people, predicted `ahead_s` after the newest frame, with its frame number."""
-    now, surely, code, fit = newest.people
+    now, present, code, fit = newest.people
     P, J = now.views.shape
-    mean, covariance = later(now, surely, skeleton, motion, ahead_s)
+    mean, covariance = later(now, present, skeleton, motion, ahead_s)
     known = code != Known.UNKNOWN
     moved = (mean[..., :3] - now.tracks.joints.position)[:, list(skeleton.core)].mean(axis=1)
     body = {name: getattr(fit, name).copy() for name in BODY}
@@ -159,12 +159,12 @@ def people_at(
 
 
 def later(
-    now: FilterState, surely: Array, skeleton: Skeleton, motion: MotionModel, ahead_s: float
+    now: FilterState, present: Array, skeleton: Skeleton, motion: MotionModel, ahead_s: float
 ) -> tuple[Array, Array]:
     """Position and velocity (A, J, 6) of all joints `ahead_s` later, and covariances (A, J, 6, 6)
     to report.
 
-    The covariances neglect the correlation of position and velocity. `surely` (A, J, 3, 3) are the
+    The covariances neglect the correlation of position and velocity. `present` (A, J, 3, 3) are the
     joints' present covariances. A joint's velocity converges to that of its person, the median of
     the core joints', which decays. Accelerations are white noise with friction, stronger the faster
     the joint and the person's joints are: in walking, the leg that stood still swings next.
@@ -186,7 +186,7 @@ def later(
         * joints.covariance[..., 3:6, 3:6]
     )
     grows = (density * tau**3 * (a + 2 * np.expm1(-a) + fades))[..., None, None]
-    covariance[..., :3, :3] = surely + own**2 * moves + grows * eye
+    covariance[..., :3, :3] = present + own**2 * moves + grows * eye
     covariance[..., 3:, 3:] = moves + (density * tau * fades)[..., None, None] * eye
     return mean, covariance
 

@@ -109,19 +109,19 @@ def with_pose(
             f"pose must be (4, 4) and pose_covariance (6, 6), got {pose.shape} and "
             f"{covariance.shape}"
         )
-    times, poses, surely = np.array([time_s - _BEFORE_S]), pose[None], covariance[None]
+    times, poses, covariances = np.array([time_s - _BEFORE_S]), pose[None], covariance[None]
     if len(known) > 0:
-        times, poses, surely = (
+        times, poses, covariances = (
             known[0].time_s,
             known[0].wTb,
             known[0].covariance_at(known[0].time_s),
         )
     stays = (times != time_s) & (times >= times[times <= since_s].max(initial=-np.inf))
     times, poses = np.append(times[stays], time_s), np.append(poses[stays], pose[None], axis=0)
-    order, surely = (
+    order, covariances = (
         np.argsort(times, kind="stable"),
-        np.append(surely[stays], covariance[None], axis=0),
+        np.append(covariances[stays], covariance[None], axis=0),
     )
-    goes = Trajectory(name, times[order], poses[order], surely[order])
+    goes = Trajectory(name, times[order], poses[order], covariances[order])
     cameras = [replace(each, carrier=name) if each is camera else each for each in rig.cameras]
     return replace(rig, cameras=tuple(cameras), trajectories=(*others, goes))

@@ -14,7 +14,7 @@ from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.alternation import alternate
 from shapepose_fg.estimation.asynchronous_views import widened
 from shapepose_fg.estimation.body_solution import solve_bodies
-from shapepose_fg.estimation.draft import Draft, redraft
+from shapepose_fg.estimation.draft import Draft, draft
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.estimation.smoothing import smoothed
@@ -74,7 +74,7 @@ def solve_window(
     drafted: Draft | None = None
     for n in range(assigning.rounds if assigning is not None and len(observations) > 0 else 0):
         assert assigning is not None
-        drafted = redraft(drafted, observations, views, fitter, config)
+        drafted = draft(observations, views, fitter, config, drafted)
         places, covariance = drafted.places, drafted.covariance
         if assigning.over_time:
             times_s = observations.time_s.mean(axis=1)

@@ -251,11 +251,11 @@ def _refined(
     near = np.minimum(np.abs(middle[place] - own), np.abs(middle[place - 1] - own)) < 1e-4
     times = np.sort(np.concatenate([own[~near], middle]))
     correction = Trajectory(given.name, middle, poses @ np.linalg.inv(odometry))
-    surely = Trajectory(given.name, middle, poses, covariance).covariance_at(times)
+    covariances = Trajectory(given.name, middle, poses, covariance).covariance_at(times)
     return replace(
         given,
         time_s=times,
         wTb=correction.at(times) @ given.at(times),
-        covariance=surely,
+        covariance=covariances,
         refined=True,
     )

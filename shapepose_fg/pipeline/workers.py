@@ -19,7 +19,6 @@ from multiprocessing import resource_tracker
 from typing import Any, Generic, TypeVar
 
 import cloudpickle
-from loky import ProcessPoolExecutor
 
 from shapepose_fg.core.compiling import cores, end_with
 from shapepose_fg.core.errors import WorkLost
@@ -106,6 +105,8 @@ class Processes(Executor):
         """Each of `count` processes calls `initializer(*arguments)` first; it must be in an
         importable module.
         """
+        from loky import ProcessPoolExecutor  # not imported by runs in one process
+
         given = (os.getpid(), initializer, *arguments)
         self._pool = ProcessPoolExecutor(
             count, initializer=_begin, initargs=given, env=_ENVIRONMENT

@@ -13,7 +13,7 @@ from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.proposal.candidates import Candidates
-from shapepose_fg.proposal.nearby import LEAST_AFFINITY, Sight, nearby
+from shapepose_fg.proposal.nearby import LEAST_AFFINITY, FrameArrays, nearby
 from shapepose_fg.proposal.proposals import ProposalConfig, Proposals
 
 _NEAR_M = 0.08
@@ -63,10 +63,10 @@ def _claimed(
     (P, J, V).
     """
     world, unplaced = np.zeros(len(own), dtype=np.intp), np.isnan(places[..., 0])
-    sight = Sight.of(detections, rig, skeleton)
-    near = nearby(places, np.full(unplaced.shape, _FAR_M), world, sight)
+    arrays = FrameArrays.of(detections, rig, skeleton)
+    near = nearby(places, np.full(unplaced.shape, _FAR_M), world, arrays)
     if unplaced.any():
-        near = near.with_tied(own, unplaced, sight)
+        near = near.with_tied(own, unplaced, arrays)
     lost, reachable = np.isinf(near.distance_m), np.ones(len(near.person), dtype=bool)
     (xy, depth), of = rig.project(places), near.detection[lost]
     beside, view = skeleton.tree_neighbours[detections.joint[of]], detections.view[of]
@@ -79,7 +79,7 @@ def _claimed(
     reachable[lost] = ((beside >= 0) & (away_m < _REACH_M)).any(axis=1)
     nearness = np.where(reachable, np.exp(-0.5 * near.distance_m**2 / _NEAR_M**2), -np.inf)
     rule = nearness, lost & reachable, LEAST_AFFINITY
-    chosen, claims = near.claimed(*rule, own, world, sight)
+    chosen, claims = near.claimed(*rule, own, world, arrays)
     near.share(claims.tied, chosen)
     return chosen
 

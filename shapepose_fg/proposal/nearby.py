@@ -27,7 +27,7 @@ OVERLAP_M = 0.025
 detection serves both. A detector's error is 2 to 3 cm."""
 
 
-class Sight(NamedTuple):
+class FrameArrays(NamedTuple):
     """A frame in the form that kernels take: V cameras, D detections, and the limbs of J joints."""
 
     kinds = "f3 f1 f2 i1 i1 f2 f1 i1 f1 i1 i1 f1 i1 i1 b1"
@@ -61,7 +61,7 @@ class Sight(NamedTuple):
     """(J,) joints of arms and legs except shoulders and hips."""
 
     @classmethod
-    def of(cls, detections: Detections, rig: Rig, skeleton: Skeleton) -> "Sight":
+    def of(cls, detections: Detections, rig: Rig, skeleton: Skeleton) -> "FrameArrays":
         """Build it from detections and cameras."""
         view, joint, xy, _, _ = detections.columns
         confidence = np.require(detections.confidence, float, ["C", "W"])
@@ -97,7 +97,13 @@ class Nearby:
     """(N,) distance from the joint's projection, metres at its depth."""
 
     def claimed(
-        self, nearness: Array, lost: Mask, sure: float, own: Index, world: Index, sight: Sight
+        self,
+        nearness: Array,
+        lost: Mask,
+        sure: float,
+        own: Index,
+        world: Index,
+        arrays: FrameArrays,
     ) -> tuple[Index, Claims]:
         """Assign detections (A, J, V) to people, -1 for none, given their present ones `own` (A, J,
         V): greedy by score, each detection once in a `world` (A,), one per person, joint and view.
@@ -108,29 +114,29 @@ class Nearby:
         """
         N, chosen = len(self.person), np.empty(own.shape, dtype=np.intp)
         claims = Claims(np.empty(N), np.empty(N), np.empty(N, dtype=bool))
-        room = np.empty(N), np.empty(N, dtype=np.intp), np.empty(len(sight.of_view), dtype=np.intp)
+        room = np.empty(N), np.empty(N, dtype=np.intp), np.empty(len(arrays.of_view), dtype=np.intp)
         near = self.first, self.person, self.detection
-        claim(*near, nearness, lost, sure, own, world, sight, *claims, *room, chosen)
+        claim(*near, nearness, lost, sure, own, world, arrays, *claims, *room, chosen)
         return chosen, claims
 
-    def with_tied(self, own: Index, unplaced: Mask, sight: Sight) -> "Nearby":
+    def with_tied(self, own: Index, unplaced: Mask, arrays: FrameArrays) -> "Nearby":
         """Add detections of `unplaced` joints (A, J) with affinities to people's detections `own`
         (A, J, V).
 
         Their distance is infinite.
         """
         person, joint, view = np.nonzero(own >= 0)
-        mine, views = own[person, joint, view], len(sight.cameras)
-        start, count = sight.begin[mine], sight.begin[mine + 1] - sight.begin[mine]
+        mine, views = own[person, joint, view], len(arrays.cameras)
+        start, count = arrays.begin[mine], arrays.begin[mine + 1] - arrays.begin[mine]
         whose = np.repeat(person, count)
-        tied = sight.other[
+        tied = arrays.other[
             np.arange(len(whose)) + np.repeat(start - np.cumsum(count) + count, count)
         ]
-        lacks = unplaced[whose, sight.of_joint[tied]]
-        key = np.unique(whose[lacks] * len(sight.of_view) + tied[lacks])
-        whose, tied = np.divmod(key, max(len(sight.of_view), 1))
+        lacks = unplaced[whose, arrays.of_joint[tied]]
+        key = np.unique(whose[lacks] * len(arrays.of_view) + tied[lacks])
+        whose, tied = np.divmod(key, max(len(arrays.of_view), 1))
         person, detection = np.append(self.person, whose), np.append(self.detection, tied)
-        slot = sight.of_joint[detection] * views + sight.of_view[detection]
+        slot = arrays.of_joint[detection] * views + arrays.of_view[detection]
         order = np.lexsort((person, slot))
         first = np.searchsorted(slot[order], np.arange(len(self.first)))
         distance_m = np.append(self.distance_m, np.full(len(tied), np.inf))
@@ -143,14 +149,14 @@ class Nearby:
         share(self.first, self.person, self.detection, self.distance_m, tied, chosen)
 
 
-def nearby(places: Array, reach_m: Array, world: Index, sight: Sight) -> Nearby:
+def nearby(places: Array, reach_m: Array, world: Index, arrays: FrameArrays) -> Nearby:
     """Detections within `reach_m` (A, J) of joints at `places` (A, J, 3), metres; people have a
     `world` (A,).
     """
     people, places = np.argsort(world, kind="stable"), np.ascontiguousarray(places)
-    slots = places.shape[1] * len(sight.cameras) + 1
+    slots = places.shape[1] * len(arrays.cameras) + 1
     first, begins = np.zeros((2, slots), dtype=np.intp)
-    room, count = 0, 4 * reach_m.size * len(sight.cameras)
+    room, count = 0, 4 * reach_m.size * len(arrays.cameras)
     person = detection = np.zeros(0, dtype=np.intp)
     distance_m = np.zeros(0)
     while count > room:
@@ -161,19 +167,19 @@ def nearby(places: Array, reach_m: Array, world: Index, sight: Sight) -> Nearby:
             np.empty(room),
         )
         count = find_near(
-            places, reach_m, people, sight, first, begins, person, detection, distance_m
+            places, reach_m, people, arrays, first, begins, person, detection, distance_m
         )
     return Nearby(begins, person[:count], detection[:count], distance_m[:count])
 
 
 def own_affinity(
-    person: Index, detection: Index, candidate: Index, sight: Sight
+    person: Index, detection: Index, candidate: Index, arrays: FrameArrays
 ) -> tuple[Array, Index]:
     """Mean affinity (N,) of each `detection` (N,) to the detections `candidate` (A, J, V) of
     `person` (N,) at the other ends of the joint's limbs, and their number (N,).
     """
     mean, neighbours = np.empty(len(person)), np.empty(len(person), dtype=np.intp)
-    tie(person, detection, candidate, sight, mean, neighbours)
+    tie(person, detection, candidate, arrays, mean, neighbours)
     return mean, neighbours
 
 
@@ -197,14 +203,20 @@ def limbs_of(skeleton: Skeleton) -> Index:
     )
 
 
-@kernel("f3 f2 i1", Sight, "i1 i1 i1 i1 f1")
-def find_near(places, reach_m, people, sight, first, begins, person, detection, distance_m):
+@kernel("f3 f2 i1", FrameArrays, "i1 i1 i1 i1 f1")
+def find_near(places, reach_m, people, arrays, first, begins, person, detection, distance_m):
     """Fill in the results of `nearby`, as far as the arrays reach; returns the number of pairs.
 
-    `first` (J V + 1,) gets the offset of each joint and view in `sight.order`.
+    `first` (J V + 1,) gets the offset of each joint and view in `arrays.order`.
     """
-    views, count, xy, order, cameras = len(sight.cameras), 0, sight.xy, sight.order, sight.cameras
-    of_joint, of_view, focal = sight.of_joint, sight.of_view, sight.focal
+    views, count, xy, order, cameras = (
+        len(arrays.cameras),
+        0,
+        arrays.xy,
+        arrays.order,
+        arrays.cameras,
+    )
+    of_joint, of_view, focal = arrays.of_joint, arrays.of_view, arrays.focal
     for slot in range(len(first)):
         first[slot] = begins[slot] = 0
     for d in range(len(order)):
@@ -238,17 +250,17 @@ def find_near(places, reach_m, people, sight, first, begins, person, detection, 
     return count
 
 
-@kernel("i1 i1 i3", Sight, "f1 i1")
-def tie(person, detection, own, sight, mean, neighbours):
+@kernel("i1 i1 i3", FrameArrays, "f1 i1")
+def tie(person, detection, own, arrays, mean, neighbours):
     """Fill in the `mean` affinity (N,) and `neighbours` (N,) of `own_affinity`."""
     of_joint, of_view, begin, other, value = (
-        sight.of_joint,
-        sight.of_view,
-        sight.begin,
-        sight.other,
-        sight.value,
+        arrays.of_joint,
+        arrays.of_view,
+        arrays.begin,
+        arrays.other,
+        arrays.value,
     )
-    limb, limb_ends = sight.limb, sight.limb_ends
+    limb, limb_ends = arrays.limb, arrays.limb_ends
     for e in range(len(person)):
         a, d = person[e], detection[e]
         j, v, total, there = of_joint[d], of_view[d], 0.0, 0
@@ -263,17 +275,17 @@ def tie(person, detection, own, sight, mean, neighbours):
         mean[e], neighbours[e] = total, there
 
 
-@kernel("i1 i1 i1 f1 b1 f0 i3 i1", Sight, "f1 f1 b1 f1 i1 i1 i3")
+@kernel("i1 i1 i1 f1 b1 f0 i3 i1", FrameArrays, "f1 f1 b1 f1 i1 i1 i3")
 def claim(
-    first, person, detection, nearness, lost, sure, own, world, sight, tied, score, likely, key,
+    first, person, detection, nearness, lost, sure, own, world, arrays, tied, score, likely, key,
     queue, taken, chosen,
 ):  # fmt: skip
     """Fill in the results of `Nearby.claimed`; `key` and `queue` (N,) and `taken` (D,) are
     workspace.
     """
     people, joints, views = chosen.shape
-    rank, count = sight.rank, first[len(first) - 1]
-    tie(person[:count], detection[:count], own, sight, tied, queue)
+    rank, count = arrays.rank, first[len(first) - 1]
+    tie(person[:count], detection[:count], own, arrays, tied, queue)
     for e in range(count):
         neighbours = queue[e]
         # Without detected neighbours the affinities are neutral.

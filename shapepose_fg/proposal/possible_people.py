@@ -12,7 +12,7 @@ from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.kernel_geometry import solved
 from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.proposal.nearby import Sight, nearby
+from shapepose_fg.proposal.nearby import FrameArrays, nearby
 
 _NEAR_M = 0.06
 """Standard deviation of the nearness score, as a length at the joint's depth, m; as in `assign`."""
@@ -43,9 +43,9 @@ class Frame:
     """(J,) maximum distance of each joint from its parent on the skeleton, metres."""
 
     @cached_property
-    def sight(self) -> Sight:
+    def arrays(self) -> FrameArrays:
         """Detections and cameras of the frame as the arrays that compiled kernels take."""
-        return Sight.of(self.detections, self.rig, self.skeleton)
+        return FrameArrays.of(self.detections, self.rig, self.skeleton)
 
     @cached_property
     def rays(self) -> Array:
@@ -135,13 +135,13 @@ def _claimed(places: Array, own: Index, frame: Frame, *, exclusive: bool) -> Ind
     """
     H, J, _ = own.shape
     world = np.zeros(H, dtype=np.intp) if exclusive else np.arange(H)
-    near = nearby(places, np.full((H, J), _FAR_M), world, frame.sight)
+    near = nearby(places, np.full((H, J), _FAR_M), world, frame.arrays)
     unplaced = np.isnan(places[..., 0])
     if unplaced.any():
-        near = near.with_tied(own, unplaced, frame.sight)
+        near = near.with_tied(own, unplaced, frame.arrays)
     nearness = np.exp(-0.5 * near.distance_m**2 / _NEAR_M**2)
     lost = np.isinf(near.distance_m)
-    chosen, claims = near.claimed(nearness, lost, _SURE_AFFINITY, own, world, frame.sight)
+    chosen, claims = near.claimed(nearness, lost, _SURE_AFFINITY, own, world, frame.arrays)
     if exclusive:
         near.share(claims.tied, chosen)
     return chosen

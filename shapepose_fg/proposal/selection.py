@@ -72,7 +72,7 @@ class Evidence:
         chosen, detections = people.chosen, frame.detections
         has, worth = chosen >= 0, np.zeros(chosen.shape)
         whose, which = np.ascontiguousarray(np.nonzero(has)[0]), chosen[has]
-        affinity, neighbours = own_affinity(whose, which, chosen, frame.sight)
+        affinity, neighbours = own_affinity(whose, which, chosen, frame.arrays)
         near = np.exp(-0.5 * (np.nan_to_num(people.gap_m[has], posinf=1.0) / DETECTOR_M) ** 2)
         worth[has] = (
             detections.confidence[which] * np.where(neighbours > 0, affinity, LEAST_AFFINITY) * near

@@ -24,9 +24,9 @@ from shapepose_fg.setup_check.findings import SURE, Finding, Kind, one_of
 from shapepose_fg.setup_check.fit import difference
 from shapepose_fg.setup_check.hypotheses import GOOD_PAIR, Lag, lag_of, lags, mistake_of_cameras
 from shapepose_fg.setup_check.joint_order import order_of_joints
-from shapepose_fg.setup_check.matching import same_frame
+from shapepose_fg.setup_check.matching import MIN_SIGHTINGS, same_frame
 from shapepose_fg.setup_check.over_time import in_pieces, parted, restlessness
-from shapepose_fg.setup_check.small_errors import Problem
+from shapepose_fg.setup_check.small_errors import LEAST_DEG, Problem
 
 _SAME_PX = 0.6
 """Maximum distance, px, between detections of one picture stored with pixel accuracy."""
@@ -180,10 +180,8 @@ _UNFIT = 0.15
 """Score below which a camera without any explanation does not fit."""
 _CROWD = 8.0
 """Mean number of people per picture above which occlusions, not mistakes, explain low scores."""
-MIN_SIGHTINGS = 20
-"""Minimum number of people seen for any statement on a camera."""
-_LEAST_DEG, _LEAST_FOCAL = 0.25, 0.04
-"""Minimum rotation, degrees, and change of focal length of one camera that are reported."""
+_LEAST_FOCAL = 0.04
+"""Minimum change of the focal length of one camera that is reported."""
 _NOBODY = 0.05
 """Minimum people placed per sighting; with fewer, cameras see no people in common."""
 _STOPPED = 0.02
@@ -406,7 +404,7 @@ def _small_findings(problem: Problem, known: set[int]) -> tuple[list[Finding], l
         return [], biased
     found = one_of(of_cameras)
     size, least = (
-        (found.amount, _LEAST_DEG)
+        (found.amount, LEAST_DEG)
         if found.kind != Kind.FOCAL
         else (abs(np.log(found.amount)), _LEAST_FOCAL)
     )

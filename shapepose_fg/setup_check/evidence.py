@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.compiled import kernel
 from shapepose_fg.core.detections import DetectionSequence
@@ -28,8 +28,6 @@ from shapepose_fg.setup_check.matching import (
     median_over,
 )
 
-_STEPS = 6
-"""Gauss-Newton steps of a robust triangulation; errors are below 0.01 px after four."""
 KERNEL = 0.02
 """Width of the Cauchy kernel, as a share of a person's size in the picture: a detector errs by 3 cm
 of 170."""
@@ -145,10 +143,10 @@ def observed(groups: Groups, sightings: Sightings) -> tuple[Array, Array, Array]
 
 
 def triangulate(
-    xy: Array, confidence: Array, size: Array, views: Views, steps: int = _STEPS
+    xy: Array, confidence: Array, size: Array, views: Views, steps: int = 6
 ) -> Structure:
-    """Robust triangulation of the arrays of `observed`, two or more views: linear, then reweighted
-    Gauss-Newton.
+    """Robust triangulation of the arrays of `observed`, two or more views: linear, then `steps` of
+    reweighted Gauss-Newton; errors are below 0.01 px after four.
     """
     seen = ~np.isnan(xy[..., 0])
     prior = (
@@ -163,6 +161,24 @@ def triangulate(
         xy, prior, views.K @ views.cTw, views.focal[0], steps, points, miss_px, depth, weight
     )
     return Structure(points, xy, miss_px, depth, size, weight)
+
+
+def left_out(
+    xy: Array, weight: Array, size: Array, views: Views, used: Mask
+) -> tuple[Array, Array]:
+    """(P, J, V) distances of detections from joints triangulated by the `used` ones (P, J, V) of
+    two or more *other* views only, pixels; and the joints' depths.
+
+    The other arguments are those of `triangulate`.
+    """
+    px, depth = np.full(weight.shape, np.nan), np.full(weight.shape, np.nan)
+    for view in range(len(views)):
+        others = used & (np.arange(len(views)) != view)
+        kept = np.where(others[..., None], xy, np.nan)
+        placed = triangulate(kept, np.where(others, weight, 0.0), size, views)
+        at, depth[..., view] = Pinhole(views.K[view], views.cTw[view]).project(placed.points)
+        px[..., view] = np.linalg.norm(at - xy[..., view, :], axis=-1)
+    return px, depth
 
 
 @kernel("f4 f3 f3 f1 i0 f3 f3 f3 f3")

@@ -104,7 +104,7 @@ def _words(finding: Finding, rig: Rig) -> str:
     width, height = rig.cameras[finding.cameras[0] if names else 0].image_size
     shifts = [_shift(x, y) for x, y in finding.shift_px]
     count = abs(round(amount))
-    return (words if isinstance(words, str) else words(finding, max(width, height))).format(
+    return (words if isinstance(words, str) else words(finding)).format(
         who="all cameras"
         if all_of_them
         else " and ".join(filter(None, (", ".join(names[:-1]), *names[-1:]))),
@@ -133,7 +133,7 @@ def _words(finding: Finding, rig: Rig) -> str:
 _POSE_AGAIN = "calibrate its pose again, or refine it with shapepose-fg refine-calibration"
 
 
-def _turned(finding: Finding, side_px: int) -> str:
+def _turned(finding: Finding) -> str:
     return (
         "{who} appears to be rotated by about {degrees} degrees"
         + (" and moved by {moved}" if finding.moved > 0.1 else "")
@@ -141,7 +141,7 @@ def _turned(finding: Finding, side_px: int) -> str:
     )
 
 
-def _principal_point(finding: Finding, side_px: int) -> str:
+def _principal_point(finding: Finding) -> str:
     cure = (
         "check that pictures have the calibrated sizes and are not cropped, or calibrate the "
         "intrinsics again"
@@ -154,7 +154,7 @@ def _principal_point(finding: Finding, side_px: int) -> str:
     )
 
 
-def _late(finding: Finding, side_px: int) -> str:
+def _late(finding: Finding) -> str:
     if finding.amount > 0:
         late, rest = "late", "its first {frames}"
     else:
@@ -163,7 +163,7 @@ def _late(finding: Finding, side_px: int) -> str:
     return f"{{who}} appears to be about {{frames}} {late}: {words} {rest}"
 
 
-def _focal(finding: Finding, side_px: int) -> str:
+def _focal(finding: Finding) -> str:
     what = "long" if finding.amount > 1 else "short"
     by, more = (
         ("{percent:.0f} %", "")
@@ -176,7 +176,7 @@ def _focal(finding: Finding, side_px: int) -> str:
     )
 
 
-def _duplicate(finding: Finding, side_px: int) -> str:
+def _duplicate(finding: Finding) -> str:
     if finding.same == "":
         return "{first} and {second} are one camera listed twice; remove one of them"
     detections = finding.same == "detections"
@@ -202,7 +202,7 @@ _UNITS = (
 """Apparent scale of lengths, with the true unit and the unit assumed when reading."""
 
 
-def _unit(finding: Finding, side_px: int) -> str:
+def _unit(finding: Finding) -> str:
     factor = finding.amount / ADULT_M
     for times, truth, taken in _UNITS:
         if 0.55 < factor / times < 1.45:
@@ -218,7 +218,7 @@ def _unit(finding: Finding, side_px: int) -> str:
     )
 
 
-def _joint_order(finding: Finding, side_px: int) -> str:
+def _joint_order(finding: Finding) -> str:
     if len(finding.joints) == 2:
         fits, read_as = finding.joints
         order = (
@@ -243,7 +243,7 @@ def _joint_order(finding: Finding, side_px: int) -> str:
     )
 
 
-def _nobody(finding: Finding, side_px: int) -> str:
+def _nobody(finding: Finding) -> str:
     if len(finding.cameras) > 0:
         return "{who} {sees} no people in the checked frames; check the detections"
     if finding.amount < 1:
@@ -255,7 +255,7 @@ def _nobody(finding: Finding, side_px: int) -> str:
     )
 
 
-def _unfit(finding: Finding, side_px: int) -> str:
+def _unfit(finding: Finding) -> str:
     check = "check that its calibration and its detections belong to it"
     if len(finding.cameras) == 1:
         return f"{{who}} fits the others under no tested explanation; {check}"
@@ -270,7 +270,7 @@ def _unfit(finding: Finding, side_px: int) -> str:
     )
 
 
-_WORDS: dict[Kind, str | Callable[[Finding, int], str]] = {
+_WORDS: dict[Kind, str | Callable[[Finding], str]] = {
     Kind.TURNED: _turned,
     Kind.MOVED: (
         "{who} appears to be moved by about {moved} and rotated by {amount:.1f} degrees; "
@@ -332,8 +332,8 @@ _WORDS: dict[Kind, str | Callable[[Finding, int], str]] = {
         "give --image-placement, or calibrate with these pictures"
     ),
 }
-"""Sentence of each kind: a template for `sentence`, or a function that chooses it by the finding
-and the longer side of the camera's picture, pixels."""
+"""Sentence of each kind: a template for `sentence`, or a function that chooses it by the
+finding."""
 
 
 def _when(first: int | None, last: int | None) -> str:

@@ -40,10 +40,8 @@ _MOST_ZOOM = 5.0
 _TRIES = 40
 """Number of pairs of a person and a sighting that are tried; with two people, half of them are
 correct."""
-_ROUNDS = 6
+_ROUNDS = 4
 """Number of rounds of matching and fitting."""
-_WIDTH = 0.03
-"""Width of the Cauchy kernel, as a share of a person's size in the picture."""
 _STEPS = 4
 """Number of steps between matchings."""
 CORNER = np.array([-0.5, -0.5])
@@ -244,7 +242,7 @@ def refined(others: Others, seen: Sightings, camera: Pinhole, columns: list[int]
         points, xy = others.points[found.person], seen.xy[found.sighting]
         both = ~np.isnan(points[..., 0]) & ~np.isnan(xy[..., 0])
         size = np.broadcast_to(seen.size_px[found.sighting][:, None], both.shape)[both]
-        camera = _solved(points[both], xy[both], _WIDTH * size, camera, columns)
+        camera = _solved(points[both], xy[both], ERROR * size, camera, columns)
     return camera
 
 
@@ -252,37 +250,38 @@ def _solved(
     points: Array, xy: Array, width_px: Array, camera: Pinhole, columns: list[int]
 ) -> Pinhole:
     """The camera fitted robustly (Cauchy) to points (N, 3) observed at xy (N, 2)."""
+    from scipy.optimize import least_squares  # takes long to import
+
     ahead = camera.project(points)[1] > 0
     if ahead.sum() < 4:
         return camera
     points, xy, width_px = points[ahead, None], xy[ahead], width_px[ahead, None]
 
-    def linearised(views: Views) -> tuple[float, Array, Array]:
-        at, place, by_point = seen_by(points, views)
-        error = (at[:, 0, 0] - xy) / width_px
-        cost = float(np.log1p(error**2).sum()) if (place[..., 2] > 0).all() else np.inf
-        return (
-            cost,
-            error,
-            by_parameters(at, place, by_point, views)[:, 0, 0][..., columns] / width_px[..., None],
-        )
+    given = Views(camera.K[None], camera.cTw[None])
 
-    views = Views(camera.K[None], camera.cTw[None])
-    cost, error, J = linearised(views)
-    for _ in range(_STEPS):
-        weight, step = 1 / (1 + error**2), np.zeros((1, Q))
-        H = np.einsum("nij,ni,nik->jk", J, weight, J)
-        step[0, columns] = -np.linalg.lstsq(
-            H, np.einsum("nij,ni,ni->j", J, weight, error), rcond=1e-12
-        )[0]
-        for part in (1.0, 0.25, 0.06):
-            tried = changed(views, part * step)
-            new = linearised(tried)
-            if new[0] < cost:
-                views, (cost, error, J) = tried, new
-                break
-        else:
-            break
+    def moved(x: Array) -> Views:
+        change = np.zeros((1, Q))
+        change[0, columns] = x
+        return changed(given, change)
+
+    def residuals(x: Array) -> Array:
+        at, place, _ = seen_by(points, moved(x))
+        behind = (place[..., 2] <= 0).any()
+        return np.full(xy.size, np.inf) if behind else np.ravel((at[:, 0, 0] - xy) / width_px)
+
+    def slopes(x: Array) -> Array:
+        J = by_parameters(*seen_by(points, moved(x)), moved(x))[:, 0, 0][..., columns]
+        return (J / width_px[..., None]).reshape(-1, len(columns))
+
+    found = least_squares(
+        residuals,
+        np.zeros(len(columns)),
+        slopes,  # type: ignore[arg-type]
+        loss="cauchy",
+        x_scale="jac",
+        max_nfev=_STEPS,
+    )
+    views = moved(found.x)
     return Pinhole(views.K[0], views.cTw[0])
 
 

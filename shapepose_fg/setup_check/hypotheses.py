@@ -49,25 +49,26 @@ _STRIDE = 4
 _MOST_PEOPLE = 400
 """Number of people sufficient for estimating an offset."""
 _LEAST_FRAMES = 40
-"""Minimum number of frames. In fewer, people hardly move enough to separate a small time offset
-from chance: in 20 frames of the built-in scene a correct camera looked 4 frames early."""
+"""Minimum number of frames for time offsets, and number sufficient for mistakes of all cameras. In
+fewer, people hardly move enough to separate a small time offset from chance: in 20 frames of the
+built-in scene a correct camera looked 4 frames early."""
 
 
 @dataclass(frozen=True)
 class Lag:
     """Time offset of a camera."""
 
-    frames: int
+    frames: int = 0
     """The camera shows at t + frames what the others show at frame t; positive is late."""
-    gain: float
+    gain: float = 0.0
     """Mean decrease of the joints' errors, as a share of people's size."""
-    likely: float
+    likely: float = 0.0
     """Gain in log-likelihood."""
-    agreement: float
+    agreement: float = 0.0
     """The gain relative to the motion of the joints within the offset: near 1 for a true offset,
     near -1 without any, 0 without motion. The minimum over both halves of the frames: a true offset
     is in both, while in one of them people may come by chance to where they were."""
-    followed: float
+    followed: float = 0.0
     """Agreement of people seen near enough both with and without the offset; when people occlude
     each other, others are near by chance at some offset."""
 
@@ -84,7 +85,7 @@ class Lag:
         return self.exceeds(1.0)
 
 
-NONE = Lag(0, 0.0, 0.0, 0.0, 0.0)
+NONE = Lag()
 
 
 def lags(look: Look) -> list[Lag]:
@@ -175,7 +176,7 @@ def _compare(
     way = np.where(np.isnan(way), GATE, np.minimum(way, GATE))
     both = ~np.isnan(error_a) & ~np.isnan(error_b)
     if both.sum() < 10 * MIN_JOINTS:
-        return Lag(lag, 0.0, 0.0, 0.0, 0.0)
+        return Lag(lag)
     better, way = np.where(both, error_a - error_b, 0.0), np.where(both, way, 0.0)
     late = frame[usable] > np.median(frame[usable])
     halves = [(float(better[half].sum()), float(way[half].sum())) for half in (late, ~late)]
@@ -224,8 +225,6 @@ GAIN, _LIKELY = 0.12, 10.0
 """Minimum gain of a change in a camera's score, and in log-likelihood."""
 _EXPLAINED = 0.65
 """Total score above which no other explanation than detector errors is searched for."""
-_FEW = 40
-"""Number of frames sufficient for mistakes common to all cameras."""
 _PRICE = 0.02
 """Minimum gain in score per fitted parameter: half a centimetre of a person's joints is 0.02."""
 _SLIGHT = 0.08
@@ -239,9 +238,6 @@ class Change:
     """The mistake that the change corrects."""
     look: Look
     """The look after the change."""
-    score: float
-    """Score of the camera after the change (`Match.score`); total score for changes of
-    all cameras."""
     freedom: int = 0
     """Number of fitted parameters."""
     fitted: Kind | None = None
@@ -258,27 +254,30 @@ def mistake_of_cameras(look: Look, rng: np.random.Generator) -> Change | None:
     for view in weak:
         worth = independent(look.others(view))
         least = likelihood(fits[view], worth, 0) + _LIKELY
-        options = [each for each in _of_one(look, view, rng) if each.score - fits[view] > GAIN]
-        options = [each for each in options if not _slight(each.finding)]
-        options = [each for each in options if likelihood(each.score, worth, each.freedom) > least]
-        options.sort(key=lambda change: change.score - _PRICE * change.freedom, reverse=True)
-        tried += options[:4]
+        options = [(score_of(look, each), each) for each in _of_one(look, view, rng)]
+        options = [
+            (score, each)
+            for score, each in options
+            if score - fits[view] > GAIN and likelihood(score, worth, each.freedom) > least
+        ]
+        options.sort(key=lambda option: option[0] - _PRICE * option[1].freedom, reverse=True)
+        tried += [each for _, each in options if not _slight(each.finding)][:4]
     for first, second in combinations(weak, 2):
-        change = _of_two(look, first, second)
-        if look.view_count == 3 or (change.score - max(fits[first], fits[second]) > GAIN):
+        cameras = {first: look.camera(second), second: look.camera(first)}
+        change = Change(Finding(Kind.EXCHANGED, (first, second)), look.with_cameras(cameras))
+        if look.view_count == 3 or (score_of(look, change) - max(fits[first], fits[second]) > GAIN):
             tried.append(change)
-    found = [(judged(look, change), change) for change in tried]
     if look.view_count == 2 and len(weak) > 0:
-        poses = [_misread(look, kind, (view,)) for view in (0, 1) for kind in _MISREAD]
-        poses += [change for view in (0, 1) for change in _in_mirror(look, view)]
-        found += [(change.score - look.total, change) for change in poses]
+        tried += [_misread(look, kind, (view,)) for view in (0, 1) for kind in _MISREAD]
+        tried += [change for view in (0, 1) for change in _in_mirror(look, view)]
+    found = [(judged(look, change), change) for change in tried]
     best = max((gain for gain, _ in found), default=0.0) + look.total
     poor = [view for view in weak if look.beside_biases(view) < GOOD]
     if len(poor) > look.view_count / 2 and best < _EXPLAINED:
-        few = replace(look, evidence=look.evidence.thinned(_FEW))
+        few = replace(look, evidence=look.evidence.thinned(_LEAST_FRAMES))
         found += [
             (
-                change.score - few.total,
+                judged(few, change),
                 replace(change, look=replace(change.look, evidence=look.evidence)),
             )
             for change in _of_all(few)
@@ -286,8 +285,7 @@ def mistake_of_cameras(look: Look, rng: np.random.Generator) -> Change | None:
     found = [(gain, change) for gain, change in found if gain > GAIN / look.view_count]
     for view in range(look.view_count if look.cameras_used > 2 else 0):
         changes = [
-            Change(finding, after, 0.0, freedom)
-            for finding, after, freedom in stories(look, view, rng)
+            Change(finding, after, freedom) for finding, after, freedom in stories(look, view, rng)
         ]
         found += [(judged(look, change), change) for change in changes]
     return _likeliest(look, found)
@@ -360,20 +358,27 @@ def judged(look: Look, change: Change) -> float:
     return change.look.total - look.total - _PRICE * change.freedom / look.view_count
 
 
+def score_of(look: Look, change: Change) -> float:
+    """Score of the changed cameras for the people that all others see (`Match.score`), the lowest;
+    0 if they see none.
+    """
+    others = look.others(*change.finding.cameras)
+    return min(
+        match(others, change.look.seen_by(view), change.look.camera(view)).score
+        for view in change.finding.cameras
+    )
+
+
 def _of_one(look: Look, view: int, rng: np.random.Generator) -> Iterator[Change]:
     """Changes of one camera that fit it to the people of the others, the best of each kind."""
     others, seen, camera = look.others(view), look.seen_by(view), look.camera(view)
     if len(others) == 0 or len(seen) == 0:
         return
     for kind in _MISREAD:
-        other = misread(kind, camera)
-        score = match(others, seen, other).score
-        yield Change(Finding(kind, (view,)), look.with_cameras({view: other}), score)
-    for change in _in_mirror(look, view):
-        yield replace(change, score=match(others, change.look.seen_by(view), camera).score)
+        yield _misread(look, kind, (view,))
+    yield from _in_mirror(look, view)
     lag = lag_of(look, view).frames
-    score = match(others, look.seen_by(view, every_frame=True), camera, lag).score
-    yield Change(Finding(Kind.LATE, (view,), lag), look.later(view, lag), score, 1)
+    yield Change(Finding(Kind.LATE, (view,), lag), look.later(view, lag), 1)
     pairs = list(fit.tries(others, seen, rng))
     for kind, fitted, columns in _FITTED:
         best = fit.best_of(others, seen, camera, pairs, fitted)
@@ -385,11 +390,10 @@ def _of_one(look: Look, view: int, rng: np.random.Generator) -> Iterator[Change]
             finding = Finding(kind, (view,), float(best.K[0, 0] / camera.K[0, 0]))
         else:
             finding = named(kind, view, look.views, after.views)
-        score = match(others, seen, best).score
         # Cameras are bumped more often than lenses change: a shift must not win by having one
         # parameter less.
         freedom = len(TURN) if kind == Kind.PRINCIPAL_POINT else max(len(columns), 1)
-        yield Change(finding, after, score, freedom, kind if kind in ONE else None)
+        yield Change(finding, after, freedom, kind if kind in ONE else None)
 
 
 def _in_mirror(look: Look, view: int) -> list[Change]:
@@ -407,20 +411,7 @@ def _in_mirror(look: Look, view: int) -> list[Change]:
     looks = [
         look.seeing(view, partial(mirrored, joints=each)) for each in (side, np.arange(len(side)))
     ]
-    return [
-        Change(Finding(Kind.MIRRORED, (view,)), each, each.total if look.view_count == 2 else 0.0)
-        for each in looks
-    ]
-
-
-def _of_two(look: Look, first: int, second: int) -> Change:
-    """Two cameras exchanged, scored by the people that all others see; 0 if they see none."""
-    others = look.others(first, second)
-    change = look.with_cameras({first: look.camera(second), second: look.camera(first)})
-    score = min(
-        match(others, look.seen_by(view), change.camera(view)).score for view in (first, second)
-    )
-    return Change(Finding(Kind.EXCHANGED, (first, second)), change, score)
+    return [Change(Finding(Kind.MIRRORED, (view,)), each) for each in looks]
 
 
 def _of_all(look: Look) -> Iterator[Change]:
@@ -430,20 +421,13 @@ def _of_all(look: Look) -> Iterator[Change]:
         yield _misread(look, kind, everybody)
     for factor in _FACTORS:
         cameras = {view: fit.scaled(look.camera(view), factor, fit.CORNER) for view in everybody}
-        yield _whole(look, Finding(Kind.RESIZED, everybody, factor), cameras)
+        yield Change(Finding(Kind.RESIZED, everybody, factor), look.with_cameras(cameras))
 
 
 def _misread(look: Look, kind: Kind, views: tuple[int, ...]) -> Change:
-    """Misinterpreted poses of some cameras, with the total score."""
-    return _whole(
-        look, Finding(kind, views), {view: misread(kind, look.camera(view)) for view in views}
-    )
-
-
-def _whole(look: Look, finding: Finding, cameras: dict[int, Pinhole]) -> Change:
-    """A change with the total score."""
-    change = look.with_cameras(cameras)
-    return Change(finding, change, change.total)
+    """Misinterpreted poses of some cameras."""
+    cameras = {view: misread(kind, look.camera(view)) for view in views}
+    return Change(Finding(kind, views), look.with_cameras(cameras))
 
 
 def misread(kind: Kind, camera: Pinhole) -> Pinhole:

@@ -15,12 +15,9 @@ from shapepose_fg.core.joint_names import keypoint_names
 from shapepose_fg.core.skeleton import SKELETONS, Skeleton
 from shapepose_fg.setup_check.evidence import Look
 from shapepose_fg.setup_check.findings import Finding, Kind
-from shapepose_fg.setup_check.matching import people_of
+from shapepose_fg.setup_check.matching import MIN_SIGHTINGS, people_of
+from shapepose_fg.setup_check.small_errors import MOST_PEOPLE
 
-_MOST_PEOPLE = 150
-"""Maximum number of people compared, in pictures and in 3D."""
-_FEWEST = 20
-"""Minimum number of people for any statement."""
 _FEWEST_JOINTS = 7
 """Minimum number of joints in trunk and limbs for any statement."""
 _GAIN, _SHARE = 0.02, 0.8
@@ -42,7 +39,7 @@ def order_of_joints(detections: DetectionSequence, look: Look) -> list[Finding]:
     """Findings on the names of joints; `look` has the set-up with other mistakes corrected."""
     skeleton = detections.skeleton
     pictures = _people(detections, look, skeleton)
-    told = _other_layout(pictures, skeleton) if len(pictures) >= _FEWEST else None
+    told = _other_layout(pictures, skeleton) if len(pictures) >= MIN_SIGHTINGS else None
     if told is not None:
         return [Finding(Kind.JOINT_ORDER, (), joints=(told, skeleton.name))]
     made = {joint for joint, _, _ in skeleton.middles}
@@ -51,9 +48,9 @@ def order_of_joints(detections: DetectionSequence, look: Look) -> list[Finding]:
     names = [skeleton.joints[skeleton.core[place]] for place in own]
     flat = _some(look.sightings.xy[:, own])
     space = _some(look.structure()[1].points[:, own])
-    if len(flat) < _FEWEST or len(own) < _FEWEST_JOINTS:
+    if len(flat) < MIN_SIGHTINGS or len(own) < _FEWEST_JOINTS:
         return []
-    in_space = np.isfinite(fit_of_order(space, names)).sum() >= _FEWEST
+    in_space = np.isfinite(fit_of_order(space, names)).sum() >= MIN_SIGHTINGS
     order = exchanges(space if in_space else flat, names, _sides(names))
     order = (
         order
@@ -104,12 +101,14 @@ def _gains(flat: Array, space: Array | None, names: Sequence[str], order: Sequen
         more = fit_of_order(people[:, order], names) - fit_of_order(people, names)
         more = more[np.isfinite(more)]
         return (
-            (float(more.mean()), float((more > 0).mean())) if len(more) >= _FEWEST else (0.0, 0.0)
+            (float(more.mean()), float((more > 0).mean()))
+            if len(more) >= MIN_SIGHTINGS
+            else (0.0, 0.0)
         )
 
     fits = fit_of_order(flat[:, order], names)
     fits = fits[np.isfinite(fits)]
-    if len(fits) < _FEWEST or fits.mean() < LIKE_A_BODY:
+    if len(fits) < MIN_SIGHTINGS or fits.mean() < LIKE_A_BODY:
         return False
     in_picture, share = gain(flat)
     in_pictures = in_picture > _GAIN_2D and share > _SHARE_2D
@@ -132,7 +131,7 @@ def _other_layout(people: Array, skeleton: Skeleton) -> str | None:
         if each.keypoint_count == len(own) and keypoint_names(each) != own:
             more = fit_of_order(people, keypoint_names(each)) - found
             more = more[np.isfinite(more)]
-            sure = len(more) >= _FEWEST and (more > 0).mean() > _SHARE
+            sure = len(more) >= MIN_SIGHTINGS and (more > 0).mean() > _SHARE
             if sure and more.mean() > gain and np.nanmean(found) + more.mean() > LIKE_A_BODY:
                 best, gain = each.name, float(more.mean())
     return best
@@ -155,7 +154,7 @@ def _backwards(points: Array, names: Sequence[str]) -> bool:
     along = np.sum(np.array(bends) * ahead, axis=-1)
     seen = np.isfinite(along).sum(axis=0) >= 2
     forwards = np.nansum(along[:, seen], axis=0) > 0
-    return len(forwards) >= _FEWEST and bool(forwards.mean() < _FACING)
+    return len(forwards) >= MIN_SIGHTINGS and bool(forwards.mean() < _FACING)
 
 
 def _sides(names: Sequence[str]) -> list[list[tuple[int, int]]]:
@@ -186,5 +185,5 @@ def _people(detections: DetectionSequence, look: Look, skeleton: Skeleton) -> Ar
 
 
 def _some(people: Array) -> Array:
-    """At most `_MOST_PEOPLE` of the `people`, evenly spread."""
-    return people[:: -(-len(people) // _MOST_PEOPLE) if len(people) > 0 else 1]
+    """At most `MOST_PEOPLE` of the `people`, evenly spread."""
+    return people[:: -(-len(people) // MOST_PEOPLE) if len(people) > 0 else 1]

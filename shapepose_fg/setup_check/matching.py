@@ -4,14 +4,13 @@ All errors are relative to the person's size in the picture, so that matches do 
 calibration's unit.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index
-from shapepose_fg.core.assignment import least_cost_pairs
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.detections import Detections, DetectionSequence
 from shapepose_fg.core.rows import Rows
@@ -20,6 +19,8 @@ from shapepose_fg.proposal.people_2d import group_people
 
 MIN_JOINTS = 5
 """Minimum number of core joints in view for a person to be used."""
+MIN_SIGHTINGS = 20
+"""Minimum number of people seen for any statement on a camera or on the order of joints."""
 _STATURE_PER_SPREAD = 3.4
 """Stature of a standing person over the root of the joints' summed variances: 1 / 0.29 for a
 uniform spread."""
@@ -236,6 +237,17 @@ def centres_of(views: Views) -> Array:
     return -np.einsum("vji,vj->vi", views.cTw[:, :, :3], views.cTw[:, :, 3])
 
 
+def depths_of_meeting(a: Array, b: Array, between: Array) -> tuple[Array, Array, Array]:
+    """Depths (...) along unit rays `a` and `b` (..., 3) where they are nearest to each other, and
+    the sines (...) of their angles; `between` (..., 3) is the second camera from the first.
+    """
+    cosine = (a * b).sum(axis=-1)
+    along_a, along_b = ((each * between).sum(axis=-1) for each in (a, b))
+    sine2 = np.maximum(1 - cosine**2, 1e-12)
+    s, t = (along_a - cosine * along_b) / sine2, (cosine * along_a - along_b) / sine2
+    return s, t, np.sqrt(sine2)
+
+
 def _meeting(
     sightings: Sightings, views: Views, first: Index, second: Index
 ) -> tuple[Array, Array]:
@@ -247,16 +259,9 @@ def _meeting(
     """
     rays, centres = rays_of(sightings, views), centres_of(views)
     a, b = rays[first], rays[second]
-    between = (centres[sightings.view[first]] - centres[sightings.view[second]])[:, None]
-    cosine = np.einsum("mji,mji->mj", a, b)
-    along_a, along_b = (
-        np.einsum("mji,mji->mj", a, between + 0 * a),
-        np.einsum("mji,mji->mj", b, between + 0 * b),
-    )
-    sine2 = np.maximum(1 - cosine**2, 1e-12)
-    s, t = (cosine * along_b - along_a) / sine2, (along_b - cosine * along_a) / sine2
-    on_a = s[..., None] * a
-    on_b = t[..., None] * b - between
+    between = (centres[sightings.view[second]] - centres[sightings.view[first]])[:, None]
+    s, t, sine = depths_of_meeting(a, b, between)
+    on_a, on_b = s[..., None] * a, between + t[..., None] * b
     half_gap = np.linalg.norm(on_a - on_b, axis=-1) / 2
     focal, size = views.focal_px[sightings.view], sightings.size_px
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -264,7 +269,7 @@ def _meeting(
             half_gap / s * (focal / size)[first, None], half_gap / t * (focal / size)[second, None]
         )
     error = np.where(np.isfinite(half_gap) & ((s <= 0) | (t <= 0)), np.inf, error)
-    angle = median_of(np.arcsin(np.minimum(np.sqrt(sine2), 1.0)))
+    angle = median_of(np.arcsin(np.minimum(sine, 1.0)))
     median = np.where(angle > _MIN_ANGLE, median_of(error, MIN_JOINTS), np.inf)
     points = centres[sightings.view[first]][:, None] + (on_a + on_b) / 2
     return median, points
@@ -362,29 +367,39 @@ _REACH, _FORGOTTEN = 1.4, 40
 thirds of a metre), and the number of frames after which a lost person is forgotten."""
 
 
-def followed(frame: Index, points: Array) -> Index:
-    """(P,) identities of people (P, J, 3) over frames: each continues the nearest of the frame
-    before, if near.
+def follow(frame: Index, away: Callable[[Index, Index], Array], reach: float, gap: int) -> Index:
+    """(N,) identities of rows over frames (N,): rows of a frame and of the `gap` frames before
+    are the same if they are nearest to each other, and within `reach`.
+
+    `away` are the distances (A, B) of rows (A,) of earlier frames from rows (B,).
     """
-    middle = _middle(points)
-    spread = _middle((points - middle[:, None]) ** 2).sum(axis=-1) ** 0.5
-    reach = _REACH * float(np.median(spread)) if len(frame) > 0 else 0.0
     who, last, count = np.full(len(frame), -1, dtype=np.intp), np.zeros(0, dtype=np.intp), 0
     for now in np.unique(frame).tolist():
-        here = np.flatnonzero(frame == now)
-        away = np.linalg.norm(middle[here, None] - middle[last], axis=-1)
-        before, after = least_cost_pairs(np.minimum(np.nan_to_num(away, nan=np.inf), reach).T)
-        near = away[after, before] < reach
-        who[here[after[near]]] = who[last[before[near]]]
-        new, lost = here[who[here] < 0], last[~np.isin(who[last], who[here])]
-        if len(new) == len(lost) == 1:  # the only possible pair, e.g. after a cut
-            who[new], lost = who[lost], lost[:0]
-        else:
-            who[new] = count + np.arange(len(new))
-            count += len(new)
-        gone = lost[frame[lost] > now - _FORGOTTEN]
-        last = np.concatenate([here, gone])
+        here, last = np.flatnonzero(frame == now), last[frame[last] >= now - gap]
+        if len(last) > 0:
+            far = away(last, here)
+            nearest = far.argmin(axis=1)
+            mutual = far.argmin(axis=0)[nearest] == np.arange(len(last))
+            mutual &= far.min(axis=1) < reach
+            who[here[nearest[mutual]]] = who[last[mutual]]
+        new = here[who[here] < 0]
+        who[new] = count + np.arange(len(new))
+        count += len(new)
+        last = np.concatenate([here, last[~np.isin(who[last], who[here])]])
     return who
+
+
+def followed(frame: Index, points: Array) -> Index:
+    """(P,) identities of people (P, J, 3) over frames (P,), by the mean of their joints."""
+    middle = _middle(points)
+    spread = _middle((points - middle[:, None]) ** 2).sum(axis=-1) ** 0.5
+
+    def away(one: Index, other: Index) -> Array:
+        far = np.linalg.norm(middle[one, None] - middle[other], axis=-1)
+        return far if far.size > 1 else 0 * far  # one person is the same one after a cut
+
+    reach = _REACH * float(np.median(spread)) if len(frame) > 0 else 0.0
+    return follow(frame, away, reach, _FORGOTTEN)
 
 
 def _middle(points: Array) -> Array:

@@ -19,7 +19,7 @@ from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.reconstruction import Reconstruction, Status
 from shapepose_fg.core.trust import BELIEVED, Spell, Trust, trust_in
 from shapepose_fg.setup_check.diagnosis import Build, Diagnosis, diagnose
-from shapepose_fg.setup_check.evidence import Look, triangulate
+from shapepose_fg.setup_check.evidence import Look, left_out
 from shapepose_fg.setup_check.findings import ADULT_M, Finding, Kind, sentence
 from shapepose_fg.setup_check.fit import match
 from shapepose_fg.setup_check.matching import GATE, miss_px, size_of
@@ -234,8 +234,6 @@ def rounded(value: Any) -> Any:
     return float(f"{value:.4g}") if isinstance(value, float) else value
 
 
-_ROWS = 300
-"""Number of rows sufficient for the distances of a camera from the others."""
 _MOST_BETA = 5.0
 """Absolute shape component above which a body is implausible, standard deviations."""
 _SHARE = 0.1
@@ -248,7 +246,8 @@ _MOST, _FEW = 0.5, 50
 _LOST, _LOST_SHARE = 0.5, 0.1
 """Minimum number of missing people per frame, and minimum share of them, for a warning."""
 _LOOKED_AT = 200
-"""Number of frames, spread over the recording, in which unused detections are counted."""
+"""Number of frames in which unused detections are counted, and of rows whose distances from the
+other cameras are measured, spread over the recording."""
 _SHORT_S = 1.0
 """Duration, s, below which people seen by two cameras may lack evidence."""
 _REASONS = {
@@ -407,18 +406,11 @@ def _left_out(table: ObservationTable, rig: Rig) -> tuple[Array, Array]:
     """(R, J, V) distances of detections from joints triangulated by two or more others, px and mm;
     R sampled rows.
     """
-    rows = np.unique(np.linspace(0, len(table) - 1, min(len(table), _ROWS)).astype(np.intp))
+    rows = np.unique(np.linspace(0, len(table) - 1, min(len(table), _LOOKED_AT)).astype(np.intp))
     xy, gate = table.xy[rows].astype(np.float64), table.gate[rows]
-    confidence, size = table.confidence[rows].astype(np.float64), size_of(np.moveaxis(xy, 2, 1))
-    px, mm, views = np.full(gate.shape, np.nan), np.full(gate.shape, np.nan), Views.of(rig)
-    for view in range(len(rig)):  # few iterations
-        rest = (gate == Gate.USED) & (np.arange(len(rig)) != view)
-        kept = np.where(rest[..., None], xy, np.nan)
-        structure = triangulate(kept, np.where(rest, confidence, 0.0), size, views, steps=3)
-        at, depth = (each[view] for each in rig.project(structure.points))
-        px[..., view] = np.linalg.norm(at - xy[..., view, :], axis=-1)
-        mm[..., view] = 1e3 * px[..., view] * depth / rig.focal_px[view]
-    return px, mm
+    weight, size = table.confidence[rows].astype(np.float64), size_of(np.moveaxis(xy, 2, 1))
+    px, depth = left_out(xy, weight, size, Views.of(rig), gate == Gate.USED)
+    return px, 1e3 * px * depth / rig.focal_px
 
 
 def _shapes(people: Reconstruction) -> Iterator[str]:

@@ -38,13 +38,14 @@ _KNOCKED = 3
 _PARTS = 8
 """Maximum number of parts of a recording at whose borders a camera may be bumped; errors of a
 detector last for some frames, so a part has `_LEAST_OF_ONE` or more."""
-_MOST_PEOPLE = 160
+MOST_PEOPLE = 150
+"""Maximum number of people used, spread over the recording."""
 _LEAST_OF_ONE = 6
 """Minimum number of frames of a person; people with fewer are pooled for the biases."""
 _TURN_DEG = 1.0
 """Rotation, degrees, above which a translated and rotated camera is called rotated."""
-_NOTABLE_DEG = 0.25
-"""Minimum shift of a principal point, degrees, that is reported for several cameras."""
+LEAST_DEG = 0.25
+"""Minimum rotation, or shift of a principal point, that is reported, degrees."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +82,7 @@ class Problem:
         """
         groups, structure = look.structure(steps=2)
         who = followed(groups.frame, structure.points)
-        step = max(1, -(-len(groups) // _MOST_PEOPLE))
+        step = max(1, -(-len(groups) // MOST_PEOPLE))
         groups, who = groups.rows(slice(None, None, step)), who[::step]
         frame = groups.frame
         often = np.bincount(who, minlength=1) >= _LEAST_OF_ONE
@@ -211,7 +212,7 @@ class Problem:
         likely, change = self._likelihood(directions, sigma)
         change = change.reshape(V, 2)
         degrees = np.rad2deg(np.hypot(*change.T) / self.given.focal_px)
-        rest = np.flatnonzero(degrees > _NOTABLE_DEG).tolist()
+        rest = np.flatnonzero(degrees > LEAST_DEG).tolist()
         if len(rest) < 2:
             return []
         shifts = tuple((float(x), float(y)) for x, y in change[rest])

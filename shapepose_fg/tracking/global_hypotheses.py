@@ -17,7 +17,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from shapepose_fg.core.detections import Input
-from shapepose_fg.proposal.nearby import Sight
+from shapepose_fg.proposal.nearby import FrameArrays
 from shapepose_fg.tracking.motion_filter import JointStates
 from shapepose_fg.tracking.track_selection import EvidenceTable, SelectedTracks, weighed
 from shapepose_fg.tracking.tracker import Tracker, Tracks
@@ -385,8 +385,8 @@ class _Log:
             return
         frame, joints = self.frames[t], tracks.joints
         places = np.where((joints.sigma_m < PLACED_M)[..., None], joints.position, np.nan)
-        sight = Sight.of(frame.detections, frame.rig, self.tracker.skeleton)
-        weight, price = weighed(candidate, places, sight, self.tracker.skeleton, tracks.world)
+        arrays = FrameArrays.of(frame.detections, frame.rig, self.tracker.skeleton)
+        weight, price = weighed(candidate, places, arrays, self.tracker.skeleton, tracks.world)
         self.parts.append((t, tracks.ids, candidate, places, weight, price))
         if t == self.keep:
             self.kept.append((tracks.ids, joints))

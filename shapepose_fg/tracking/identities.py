@@ -14,7 +14,7 @@ from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.tracking.global_hypotheses import Hypotheses, explained, times_of
 from shapepose_fg.tracking.motion_filter import JointStates
-from shapepose_fg.tracking.sides import hold, hold_now
+from shapepose_fg.tracking.sides import correct_swaps, correct_swaps_now
 from shapepose_fg.tracking.track_selection import SelectedTracks, own_evidence
 from shapepose_fg.tracking.tracker import Tracker, Tracks, mean_distance
 
@@ -25,7 +25,7 @@ MOST_FRAMES = 256
 _SAME_M = 0.35
 """Mean distance of core joints, m, below which two hypotheses in a frame are the same person."""
 _WALK_MPS = 1.5
-"""Growth of the re-identification distance while a person is out of sight, m/s."""
+"""Growth of the re-identification distance while a person is out of arrays, m/s."""
 
 _ROUNDS = 3
 """Maximum number of searches for people in an isolated frame, repeated while sides are
@@ -33,7 +33,7 @@ exchanged."""
 _PACE_S = 0.2
 """Duration over which the speed before a disappearance is measured, s."""
 _COASTS_S = 0.5
-"""Longest extrapolation of a person out of sight, s; as long as a track is followed without
+"""Longest extrapolation of a person out of arrays, s; as long as a track is followed without
 evidence."""
 
 
@@ -100,7 +100,7 @@ def _decide(tracker: Tracker, state: FollowState, own: int) -> tuple[FollowState
     """
     keys = [n for n, frame in enumerate(state.pending) if frame.key]
     frames, until = [state.pending[n] for n in keys], [*keys, len(state.pending)][own]
-    frames = hold(tracker, frames, state.people)
+    frames = correct_swaps(tracker, frames, state.people)
     found, chosen = explained(tracker, frames, state.people, own - 1)
     rest = found.account.left_over(chosen)
     for start, stop in zip(rest.start.tolist(), rest.stop.tolist(), strict=True):
@@ -152,7 +152,7 @@ def alone(tracker: Tracker, given: Input, next_id: int) -> Decided:
         places, candidate = tracker.newcomers(nobody, none, given.detections, given.rig)
         there = np.arange(len(places))
         found = tracker.at(places, there, 0 * there, float(given.time_s.mean()))
-        before, given = given, hold_now(tracker, found, given, followed=False)[1]
+        before, given = given, correct_swaps_now(tracker, found, given, followed=False)[1]
         if given is before:
             break
     return given, observed(given, candidate, places, next_id + np.arange(len(places)))

@@ -12,7 +12,7 @@ from shapepose_fg.core.compiled import kernel, part
 from shapepose_fg.core.kernel_geometry import ROBUST, project, triangulated
 from shapepose_fg.estimation.kernels import add_detection
 from shapepose_fg.estimation.linearisation import MIN_DEPTH_M, ObservationConfig
-from shapepose_fg.proposal.nearby import Sight
+from shapepose_fg.proposal.nearby import FrameArrays
 from shapepose_fg.tracking.motion_filter import TRUSTED_M, Bones, JointStates, sigma
 from shapepose_fg.tracking.plausibility import tear
 from shapepose_fg.tracking.view_assignment import FARTHEST_M
@@ -59,7 +59,7 @@ def measured(
     lost: Mask,
     candidate: Index,
     weight: Array,
-    sight: Sight,
+    arrays: FrameArrays,
     trust: Trust,
     bones: Bones,
 ) -> tuple[JointStates, Index, Mask]:
@@ -73,12 +73,12 @@ def measured(
     """
     mean, covariance, kept = joints.mean.copy(), joints.covariance.copy(), candidate.copy()
     evident = np.empty(len(mean), dtype=bool)
-    _measure(mean, covariance, lost, kept, weight, sight, trust, bones, evident)
+    _measure(mean, covariance, lost, kept, weight, arrays, trust, bones, evident)
     return JointStates(mean, covariance), kept, evident
 
 
-@kernel("f3 f4 b2 i3 f1", Sight, Trust, Bones, "b1")
-def _measure(mean, covariance, lost, candidate, confident, sight, trust, bones, evident):
+@kernel("f3 f4 b2 i3 f1", FrameArrays, Trust, Bones, "b1")
+def _measure(mean, covariance, lost, candidate, confident, arrays, trust, bones, evident):
     """Update `mean` (A, J, S) and `covariance` (A, J, S, S) in place, set rejected detections in
     `candidate` to -1, and fill in `evident` (A,).
     """
@@ -95,9 +95,9 @@ def _measure(mean, covariance, lost, candidate, confident, sight, trust, bones, 
     seen_by, above = np.empty(joints, dtype=np.intp), np.empty(joints, dtype=np.intp)
     way_m, count, too_long = np.empty(joints), np.empty(joints), np.empty(joints)
     cameras, focal, xy, core, scatter = (
-        sight.cameras,
-        sight.focal,
-        sight.xy,
+        arrays.cameras,
+        arrays.focal,
+        arrays.xy,
         bones.core,
         trust.scatter,
     )
@@ -108,7 +108,7 @@ def _measure(mean, covariance, lost, candidate, confident, sight, trust, bones, 
             depths[v] = _mean_depth(mean[a], cameras[v])
         trunk = 0
         for j in range(joints):
-            for v in range(views if not sight.swings[j] else 0):
+            for v in range(views if not arrays.swings[j] else 0):
                 d = candidate[a, j, v]
                 trunk += (
                     d >= 0 and _apart_m(mean[a, j], cameras[v], focal[v], xy[d]) < trust.rho_2d_m
@@ -124,11 +124,11 @@ def _measure(mean, covariance, lost, candidate, confident, sight, trust, bones, 
                     depth = fixed_m if fixed_m > 0 else depth
                     px = focal[v] * np.sqrt(trust.floor_rad**2 + (trust.sigma_m / depth) ** 2)
                     sigma_px[v], seen = px * scatter[j] / np.sqrt(confident[d]), seen + 1
-            swings = near == 0 and sight.swings[j] and trunk >= MIN_SEEN_TWICE
+            swings = near == 0 and arrays.swings[j] and trunk >= MIN_SEEN_TWICE
             if seen >= 2 and (lost[a, j] or swings):
                 for v in range(views):
                     d = candidate[a, j, v]
-                    sure[v] = sight.confidence[d] if d >= 0 else 0.0
+                    sure[v] = arrays.confidence[d] if d >= 0 else 0.0
                     uv[v, 0], uv[v, 1] = xy[d, 0], xy[d, 1]
                 scale_m, reach_m = 2.0 * trust.sigma_m, trust.rho_2d_m
                 if (

@@ -10,7 +10,7 @@ from shapepose_fg.core.detections import Input
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.proposal.assignment import lesser
-from shapepose_fg.proposal.nearby import Sight
+from shapepose_fg.proposal.nearby import FrameArrays
 from shapepose_fg.proposal.possible_people import Frame, PossiblePeople, gaps
 from shapepose_fg.proposal.selection import PRIOR_WITH_BODY, existence
 from shapepose_fg.tracking.identities import core_distance
@@ -74,7 +74,7 @@ def _given_out(
 ) -> tuple[Index, Array]:
     """(P, J, V) detections assigned to one frame's people, and their probabilities."""
     predicted = Predicted(joints, sigma_m, lost=~np.isfinite(sigma_m))
-    return assign_with_probability(predicted, Sight.of(frame.detections, frame.rig, skeleton))
+    return assign_with_probability(predicted, FrameArrays.of(frame.detections, frame.rig, skeleton))
 
 
 def probabilities_of(frame: Input, candidate: Index, joints: Array, skeleton: Skeleton) -> Array:

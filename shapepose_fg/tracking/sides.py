@@ -130,8 +130,9 @@ class _Compared:
                 of, (turned, doubt) = part[found.joint[group]], own.get(who, (right, right))
                 if who in own:
                     mirrored[group] = np.append(0.0, doubt)[of]
-                if not _doubtful(doubt, skeleton):
-                    wrong[group] = np.append(False, exchanged != turned)[of]
+                change = exchanged != turned
+                if change.any() and not _doubtful(doubt, skeleton):
+                    wrong[group] = np.append(False, change)[of]
         if not wrong.any() and (mirrored == found.mirrored).all():
             return given
         first, second = found.pairs.T
@@ -157,11 +158,11 @@ class _Look:
     """(G', S) log-probabilities of swaps in the views (`_Compared.log`)."""
 
 
-def hold(tracker: Tracker, frames: Sequence[Input], carried: Tracks) -> list[Input]:
-    """Correct left-right swaps in consecutive frames; `carried` are the people of the
+def correct_swaps(tracker: Tracker, frames: Sequence[Input], people: Tracks) -> list[Input]:
+    """Correct left-right swaps in consecutive frames; `people` are the people of the
     frame before.
     """
-    tracks, sought_s, count = replace(carried, ids=np.arange(len(carried))), -np.inf, len(carried)
+    tracks, sought_s, count = replace(people, ids=np.arange(len(people))), -np.inf, len(people)
     compared, looks = list[_Compared](), dict[int, list[_Look]]()
     for n, each in enumerate(frames):
         time_s, skeleton = float(each.time_s.mean()), tracker.skeleton
@@ -192,7 +193,7 @@ def hold(tracker: Tracker, frames: Sequence[Input], carried: Tracks) -> list[Inp
                     _Look(n, time_s, tracks.joints.rows(np.array([row])), views),
                 ]
     own = {
-        name: _own_sides(tracker, found, followed=name < len(carried))
+        name: _own_sides(tracker, found, followed=name < len(people))
         for name, found in looks.items()
     }
     held = list[Input]()
@@ -207,7 +208,7 @@ def hold(tracker: Tracker, frames: Sequence[Input], carried: Tracks) -> list[Inp
     return held
 
 
-def hold_now(
+def correct_swaps_now(
     tracker: Tracker, tracks: Tracks, given: Input, *, followed: bool = True
 ) -> tuple[Tracks, Input]:
     """Correct left-right swaps in the tracks and the next frame; returns both.

@@ -14,7 +14,7 @@ from shapepose_fg.core.compiled import kernel, part
 from shapepose_fg.core.kernel_geometry import project
 from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.proposal.nearby import Sight, limbs_of, tie
+from shapepose_fg.proposal.nearby import FrameArrays, limbs_of, tie
 
 _PRICE = 0.4
 """Cost of an expected but missing detection, relative to a present one. The price of a person's
@@ -76,7 +76,7 @@ class SelectedTracks(Rows):
 
 
 def weighed(
-    candidate: Index, places: Array, sight: Sight, skeleton: Skeleton, world: Index
+    candidate: Index, places: Array, arrays: FrameArrays, skeleton: Skeleton, world: Index
 ) -> tuple[Array, Array]:
     """Weight of each detection of A people (A, J, V), and price of their presence (A,), as shares
     of expected detections.
@@ -91,13 +91,13 @@ def weighed(
     weight, price, limbs = np.zeros(candidate.shape), np.zeros(A), limbs_of(skeleton)
     lists, tied = np.empty((3, candidate.size), dtype=np.intp), np.empty(candidate.size)
     room = np.empty((A, J, 3)), np.empty((3, A, J)), np.empty((A, 3)), np.zeros(A)
-    _weigh(candidate, places, known, world, sight, limbs, lists, tied, *room, weight, price)
+    _weigh(candidate, places, known, world, arrays, limbs, lists, tied, *room, weight, price)
     return weight, price
 
 
-@kernel("i3 f3 b2 i1", Sight, "i2 i2 f1 f3 f3 f2 f1 f3 f1")
+@kernel("i3 f3 b2 i1", FrameArrays, "i2 i2 f1 f3 f3 f2 f1 f3 f1")
 def _weigh(
-    candidate, places, known, world, sight, limbs, lists, tied, at, seen, box, expected, weight,
+    candidate, places, known, world, arrays, limbs, lists, tied, at, seen, box, expected, weight,
     price
 ):  # fmt: skip
     """Fill in the results of `weighed`, zero before; `expected` (A,) counts the expected
@@ -108,22 +108,22 @@ def _weigh(
     others.
     """
     people, joints, views = weight.shape
-    cameras, count, whose, which, neighbours = sight.cameras, 0, lists[0], lists[1], lists[2]
+    cameras, count, whose, which, neighbours = arrays.cameras, 0, lists[0], lists[1], lists[2]
     for a in range(people):
         for j in range(joints):
             for v in range(views):
                 if candidate[a, j, v] >= 0:
                     whose[count], which[count] = a, candidate[a, j, v]
                     count += 1
-    tie(whose[:count], which[:count], candidate, sight, tied, neighbours)
-    of_joint, of_view = sight.of_joint, sight.of_view
+    tie(whose[:count], which[:count], candidate, arrays, tied, neighbours)
+    of_joint, of_view = arrays.of_joint, arrays.of_view
     for n in range(count):
         counts, d = min(max(tied[n] / _SURE_AFFINITY, 0.0), 1.0), which[n]
         weight[whose[n], of_joint[d], of_view[d]] = counts if neighbours[n] > 0 else _ALONE
     for a in range(people):
         _fill(places[a], known[a], at[a])
     for v in range(views):
-        width, height, focal = sight.sizes[v, 0], sight.sizes[v, 1], sight.focal[v]
+        width, height, focal = arrays.sizes[v, 0], arrays.sizes[v, 1], arrays.focal[v]
         for a in range(people):
             _picture(at[a], known[a], cameras[v], focal, a, seen, box[a])
         for a in range(people):

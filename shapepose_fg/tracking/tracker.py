@@ -22,7 +22,7 @@ from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.linearisation import ObservationConfig
-from shapepose_fg.proposal.nearby import Sight
+from shapepose_fg.proposal.nearby import FrameArrays
 from shapepose_fg.tracking.measuring import Trust, measured
 from shapepose_fg.tracking.motion_filter import LOST_M, Bones, JointStates, predicted
 from shapepose_fg.tracking.view_assignment import Predicted, assign
@@ -125,16 +125,16 @@ class Tracker:
             return replace(tracks, time_s=time_s), np.zeros(
                 (0, len(self.skeleton), len(rig)), dtype=np.intp
             )
-        sight, bones = Sight.of(detections, rig, self.skeleton), self._bones
+        arrays, bones = FrameArrays.of(detections, rig, self.skeleton), self._bones
         step_s = time_s - tracks.time_s
         joints, lost = predicted(
             tracks.joints, step_s, self.scale.motion, self.scale.density, bones
         )
-        candidate = assign(Predicted(joints.position, joints.sigma_m, lost, tracks.world), sight)
+        candidate = assign(Predicted(joints.position, joints.sigma_m, lost, tracks.world), arrays)
         certain = detections.confidence
         weight = np.where(certain > 0, self.observation.weight(certain), 0.0)
         joints, candidate, evident = measured(
-            joints, lost, candidate, weight, sight, self._trust, bones
+            joints, lost, candidate, weight, arrays, self._trust, bones
         )
         evident_s = np.where(evident, time_s, tracks.evident_s)
         return replace(tracks, time_s=time_s, joints=joints, evident_s=evident_s), candidate

@@ -7,7 +7,14 @@ import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.compiled import kernel
-from shapepose_fg.proposal.nearby import LEAST_AFFINITY, OVERLAP_M, Sight, claim, find_near, share
+from shapepose_fg.proposal.nearby import (
+    LEAST_AFFINITY,
+    OVERLAP_M,
+    FrameArrays,
+    claim,
+    find_near,
+    share,
+)
 
 _NEAR_M = 0.06
 """Standard deviation of the nearness score around an exact prediction, as a length at the joint's
@@ -73,27 +80,27 @@ class Scored(NamedTuple):
     """(N,) whether the pair is possible: near a joint of known position, or likely by affinity."""
 
 
-def assign(predicted: Predicted, sight: Sight) -> Index:
+def assign(predicted: Predicted, arrays: FrameArrays) -> Index:
     """Detection (A, J, V) of each person's joint in each view, -1 for none: greedy by score, each
     detection once, except those on which joints of several people coincide.
     """
-    return _assigned(predicted, sight)[0]
+    return _assigned(predicted, arrays)[0]
 
 
-def assign_with_probability(predicted: Predicted, sight: Sight) -> tuple[Index, Array]:
+def assign_with_probability(predicted: Predicted, arrays: FrameArrays) -> tuple[Index, Array]:
     """`assign`, and the probability (A, J, V) that each detection is the person's; 0 without a
     detection.
 
     A detection that two people share, because joints of both coincide, is well placed for both if
     it is right for either.
     """
-    chosen, near = _assigned(predicted, sight)
-    probable = probabilities(near, len(sight.of_view))
-    of, count = near.detection, len(sight.of_view)
+    chosen, near = _assigned(predicted, arrays)
+    probable = probabilities(near, len(arrays.of_view))
+    of, count = near.detection, len(arrays.of_view)
     serves = np.bincount(chosen[chosen >= 0], minlength=count)[of] > 1
     # Belief propagation is inexact with cycles of competitors: the sum may slightly exceed 1.
     together = np.minimum(np.bincount(of, probable, count)[of], 1.0)
-    place = near.person, sight.of_joint[of], sight.of_view[of]
+    place = near.person, arrays.of_joint[of], arrays.of_view[of]
     taken, probability = chosen[place] == of, np.zeros(chosen.shape)
     probability[tuple(each[taken] for each in place)] = np.where(serves, together, probable)[taken]
     return chosen, probability
@@ -114,9 +121,9 @@ def probabilities(near: Scored, detections: int) -> Array:
     return probable
 
 
-def _assigned(predicted: Predicted, sight: Sight) -> tuple[Index, Scored]:
+def _assigned(predicted: Predicted, arrays: FrameArrays) -> tuple[Index, Scored]:
     """The detections (A, J, V), and the scores of all near pairs."""
-    (A, J), V = predicted.sigma_m.shape, len(sight.cameras)
+    (A, J), V = predicted.sigma_m.shape, len(arrays.cameras)
     world = np.zeros(A, dtype=np.intp) if predicted.world is None else predicted.world
     people, given = np.argsort(world, kind="stable"), np.ascontiguousarray(predicted.places)
     chosen, first = np.empty((2, A, J, V), dtype=np.intp), np.empty((2, J * V + 1), dtype=np.intp)
@@ -128,9 +135,9 @@ def _assigned(predicted: Predicted, sight: Sight) -> tuple[Index, Scored]:
             np.empty((2, count), dtype=bool),
         )
         near = Scored(first[0], whole[0], whole[1], real[0], real[1], flag[0])
-        gates, taken = np.empty((2, A, J)), np.empty(len(sight.of_view), np.intp)
+        gates, taken = np.empty((2, A, J)), np.empty(len(arrays.of_view), np.intp)
         count = _assign(
-            given, predicted.sigma_m, predicted.lost, world, people, sight, near, gates, first[1],
+            given, predicted.sigma_m, predicted.lost, world, people, arrays, near, gates, first[1],
             whole[2], taken, real[2:], flag[1], chosen,
         )  # fmt: skip
     begins, person, detection, distance_m, score, possible = near
@@ -138,9 +145,9 @@ def _assigned(predicted: Predicted, sight: Sight) -> tuple[Index, Scored]:
     return chosen[0], Scored(begins, person[:count], detection[:count], *ends)
 
 
-@kernel("f3 f2 b2 i1 i1", Sight, Scored, "f3 i1 i1 i1 f2 b1 i4")
+@kernel("f3 f2 b2 i1 i1", FrameArrays, Scored, "f3 i1 i1 i1 f2 b1 i4")
 def _assign(
-    places, sigma_m, lost, world, people, sight, near, gates, first, queue, taken, reals, sought,
+    places, sigma_m, lost, world, people, arrays, near, gates, first, queue, taken, reals, sought,
     both
 ):  # fmt: skip
     """Fill in `near` and the first of `both` (2, A, J, V), as far as the arrays reach; returns the
@@ -155,13 +162,13 @@ def _assign(
             for v in range(views):
                 before[a, j, v] = -1
             reach_m[a, j] = (
-                _REACH_M if lost[a, j] or sight.swings[j] else max(gate_m[a, j], OVERLAP_M)
+                _REACH_M if lost[a, j] or arrays.swings[j] else max(gate_m[a, j], OVERLAP_M)
             )
     begins, person, detection, distance_m, score, possible = near
-    count = find_near(places, reach_m, people, sight, first, begins, person, detection, distance_m)
+    count = find_near(places, reach_m, people, arrays, first, begins, person, detection, distance_m)
     if count > len(person):
         return count
-    of_joint = sight.of_joint
+    of_joint = arrays.of_joint
     for e in range(count):
         a, j = person[e], of_joint[detection[e]]
         sought[e] = lost[a, j]
@@ -170,15 +177,15 @@ def _assign(
             nearness[e] = np.exp(-0.5 * distance_m[e] ** 2 / (_NEAR_M**2 + sigma_m[a, j] ** 2))
     for n in range(1 + _PASSES):
         for e in range(count if n > 0 else 0):
-            a, j, v = person[e], of_joint[detection[e]], sight.of_view[detection[e]]
-            if sight.swings[j] and not sought[e] and not distance_m[e] < gate_m[a, j]:
+            a, j, v = person[e], of_joint[detection[e]], arrays.of_view[detection[e]]
+            if arrays.swings[j] and not sought[e] and not distance_m[e] < gate_m[a, j]:
                 trunk = 0
                 for k in range(joints):
-                    trunk += before[a, k, v] >= 0 and not sight.swings[k]
+                    trunk += before[a, k, v] >= 0 and not arrays.swings[k]
                 nearness[e] = 0.0 if trunk >= _TRUNK_JOINTS else -np.inf
         claim(
-            begins, person, detection, nearness, sought, LEAST_AFFINITY, before, world, sight, tied,
-            score, possible, key, queue, taken, chosen,
+            begins, person, detection, nearness, sought, LEAST_AFFINITY, before, world, arrays,
+            tied, score, possible, key, queue, taken, chosen,
         )  # fmt: skip
         changed = False
         for a in range(people_count):

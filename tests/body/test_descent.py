@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from shapepose_fg.body.fitting.descent import (
     BodyState,
     LearnedDescent,
-    Sight,
+    NetworkInputs,
     gradient_scale,
     moved,
 )
@@ -186,7 +186,7 @@ def test_what_the_network_sees(any_body, name):
     model, places = any_body.with_keypoints(TARGET_SKELETONS[name]), slots(TARGET_SKELETONS[name])
     model = model.with_keypoint_offsets(offsets)
     rest, state = [place for place in ALL if place not in places], states()
-    see = Sight(
+    see = NetworkInputs(
         model.keypoint_points, places, 60.0, any_body.points.part(rest), model.offsets_of_keypoints
     )
     xyz, information = (each[:, list(places)] for each in targets_of(places))

@@ -18,7 +18,6 @@ from tests.calibration.conftest import moving
 
 K = np.array([[1000.0, 0, 639.5], [0, 1000, 359.5], [0, 0, 1]])
 LATE_S = 7.31
-ANY = (5.0, 0.5)
 OWN_S = np.arange(0, 30, 1 / 30)
 
 
@@ -56,7 +55,7 @@ def filmed(two_people) -> Filmed:
 
 
 def test_the_start_is_found_anywhere(walk, filmed):
-    start = filmed.started(walk, 60.0, False, *ANY)
+    start = filmed.started(walk, 60.0, False)
     camera, odometry = start.of(filmed.camera, filmed.trajectory)
     found = odometry.wTb @ camera.bTc
     away = np.linalg.norm(found[:, :3, 3] - path(OWN_S)[:, :3, 3], axis=1)
@@ -71,14 +70,15 @@ def test_the_start_is_found_anywhere(walk, filmed):
 
 
 def test_it_is_refused_if_it_is_less_sure_than_asked_or_the_fixed_cameras_are(walk, filmed):
-    """The sentence has the option that accepts it; errors of the fixed cameras count."""
-    start = filmed.started(walk, 60.0, False, *ANY)
-    with pytest.raises(Undetermined, match=r"camera phone: .* are asked; .*--tolerance ") as said:
-        filmed.started(walk, 60.0, False, 1.9 * start.sigma_turn_deg, 1.9 * start.sigma_move_m)
-    words = str(said.value).rpartition(" ")[2].split(",")
-    filmed.started(walk, 60.0, False, float(words[0]), float(words[1]) / 1e3)
+    """The sentence has the figures and the cure; errors of the fixed cameras count."""
+    start = filmed.started(walk, 60.0, False)
+    sigmas = np.array([start.sigma_turn_deg, start.sigma_move_m])
+    said = start.refusal("phone", *(1.9 * sigmas))
+    assert said is not None and "camera phone: its poses are known to" in said
+    assert "are asked; calibrate the lenses" in said
+    assert start.refusal("phone", *(2.1 * sigmas)) is None
     shifted = replace(walk, spread=np.full((1, *walk.points.shape), 0.05))
-    other = filmed.started(shifted, 60.0, False, *ANY)
+    other = filmed.started(shifted, 60.0, False)
     assert other.sigma_move_m == pytest.approx(np.hypot(start.sigma_move_m, 0.0866), rel=0.1)
 
 
@@ -95,7 +95,7 @@ def test_the_drift_and_the_unit_of_an_odometry_are_found(walk, filmed):
     turn = Rotation.from_rotvec(np.radians(1.5) * part[:, None] * up).as_matrix()
     at = 1.02 * log.wTb[:, :3, 3] + 0.15 * part[:, None] * up
     drifted = replace(filmed, trajectory=replace(log, wTb=rigid(turn @ log.wTb[:, :3, :3], at)))
-    start = drifted.started(walk, 60.0, False, *ANY)
+    start = drifted.started(walk, 60.0, False)
     found = start.of(drifted.camera, drifted.trajectory)[1].wTb @ start.bTc
     away = np.linalg.norm(found[:, :3, 3] - path(OWN_S)[:, :3, 3], axis=1)
     turned = Rotation.from_matrix(found[:, :3, :3].mT @ path(OWN_S)[:, :3, :3]).magnitude()
@@ -105,7 +105,7 @@ def test_the_drift_and_the_unit_of_an_odometry_are_found(walk, filmed):
 
 def test_an_unknown_focal_length_is_found_too(walk, filmed):
     wrong = replace(filmed, rays=filmed.rays * [1.06, 1.06, 1.0])
-    assert wrong.started(walk, 60.0, True, *ANY).focal == pytest.approx(1.06, abs=0.015)
+    assert wrong.started(walk, 60.0, True).focal == pytest.approx(1.06, abs=0.015)
 
 
 def test_a_log_of_another_walk_and_people_who_stand_are_refused(walk, filmed):
@@ -114,11 +114,11 @@ def test_a_log_of_another_walk_and_people_who_stand_are_refused(walk, filmed):
     still[:, :3, 3] += np.cumsum(rng.normal(0, 0.05, (len(OWN_S), 3)), axis=0)
     other = replace(filmed, trajectory=replace(filmed.trajectory, wTb=still))
     with pytest.raises(Undetermined, match="camera phone: ") as refused:
-        other.started(walk, 60.0, False, *ANY)
+        other.started(walk, 60.0, False)
     assert "; film the people" in str(refused.value)
     standing = Placed.of(walk.time_s, walk.moment, walk.points[walk.moment * 0])
     with pytest.raises(Undetermined, match="camera phone: "):
-        filmed.started(standing, 60.0, False, *ANY)
+        filmed.started(standing, 60.0, False)
     nobody = replace(filmed, own_s=filmed.own_s[:3], rays=filmed.rays[:3])
     with pytest.raises(Undetermined, match="camera phone: too few people are seen"):
-        nobody.started(walk, 60.0, False, *ANY)
+        nobody.started(walk, 60.0, False)

@@ -122,7 +122,6 @@ def test_the_command_finds_the_start_of_a_camera_with_a_log(
     write_trajectory(log, Path("log.tum"))
     base = ["calibrate", "--calibration", "lenses.json", "--detections", "detection", "--fps", "25"]
     base += ["--times", "times.csv", "--most", "8", "--trajectory", "cam2=log.tum"]
-    base += ["--tolerance", "5,300"]
 
     def run(*more: str) -> tuple[int, str]:
         with pytest.raises(SystemExit) as ended:
@@ -130,6 +129,15 @@ def test_the_command_finds_the_start_of_a_camera_with_a_log(
         said = capsys.readouterr()
         return int(str(ended.value.code)), " ".join((said.out + said.err).split())
 
+    code, said = run("--output", "new.json", "--tolerance", "0.001,0.01")
+    assert (
+        code == 1
+        and "camera cam2: its poses are known to" in said
+        and not Path("new.json").exists()
+    )
+    assert "accepted: --calibration new.refused.json --timestamps times.refused.csv" in said
+    kept = read_rig("new.refused.json")
+    base += ["--tolerance", "5,300"]
     code, said = run("--output", "new.json", "--format", "pose2sim")
     assert code == 2 and "--format pose2sim: cannot hold --trajectory" in said
     code, said = run("--output", "new.json")
@@ -137,6 +145,7 @@ def test_the_command_finds_the_start_of_a_camera_with_a_log(
     assert "camera cam2: its trajectory starts" in said
     assert "trust: rotations to" in said and "--distance" in said
     found = read_rig("new.json")
+    np.testing.assert_array_equal(kept.wTc, found.wTc)
     assert [bool(each.carrier) for each in found.cameras] == [False, False, True, False]
     turned, moved, _ = off_after_growing(found, rig)
     assert turned.max() < 1.0 and moved.max() < 0.1

@@ -383,8 +383,8 @@ def test_frames_are_half_open(recording, pipeline, text, frames):
         ),
         (["--shapes", "s.npz", "--no-temporal"], "--shapes: shapes need people over time"),
         (["--shapes", __file__], "cannot be read as an .npz file without pickled objects"),
-        (["--up", "up"], "up must be one of x -x y -y z -z, got 'up'"),
-        (["--unit", "inch"], "unit must be one of m cm mm, got 'inch'"),
+        (["--up", "up"], "'--up': 'up' is not one of 'x', '-x', 'y', '-y', 'z', '-z'"),
+        (["--unit", "inch"], "'--unit': 'inch' is not one of 'm', 'cm', 'mm'"),
         (["--config", "/nothing.toml"], "/nothing.toml: there is no such file; check the path"),
         (["--body", "/nothing.npz"], "/nothing.npz: there is no such file"),
         (

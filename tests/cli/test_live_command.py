@@ -108,6 +108,17 @@ def test_a_line_that_is_none_is_named(tmp_path, cameras, five_cameras, capsys, l
     assert said in told and "line 1" in told and "Traceback" not in told
 
 
+@pytest.mark.parametrize("content", ["", "\n\n"])
+def test_an_input_without_detections_is_said(tmp_path, cameras, capsys, content):
+    (tmp_path / "seen.jsonl").write_text(content)
+    given = ["--calibration", cameras, "--detections", str(tmp_path / "seen.jsonl")]
+    with pytest.raises(SystemExit) as ended:
+        main(["live", *given, "--workers", "1"])
+    assert ended.value.code == 2
+    told = " ".join(capsys.readouterr().err.split())
+    assert "seen.jsonl: the input ended without detections; check" in told
+
+
 def started(arguments: list[str]) -> threading.Thread:
     """The command in a thread, which ends with its input."""
 

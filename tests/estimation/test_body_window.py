@@ -37,8 +37,12 @@ def _views() -> Views:
     return Views(K, np.array(cTw))
 
 
-def _person(seed: int, hidden: float = 0.0) -> tuple[BodyWindow, np.ndarray, np.ndarray]:
-    """A window, its true joints (T, J, 3) and a start (T, P) near the truth."""
+def _person(
+    seed: int, hidden: float = 0.0, *, lasts: bool = False, step_s: float = 1 / 30
+) -> tuple[BodyWindow, np.ndarray, np.ndarray]:
+    """A window, its true joints (T, J, 3) and a start (T, P) near the truth; errors that last are
+    those of the first frame.
+    """
     rng, model, views = np.random.default_rng(seed), BodyModel.default(), _views()
     energy = BodyEnergy(model, PosePrior.default())
     free = np.zeros((T, energy.num_free))
@@ -53,11 +57,12 @@ def _person(seed: int, hidden: float = 0.0) -> tuple[BodyWindow, np.ndarray, np.
     names = tuple(model.keypoint_names)
     observations = Observations(
         xy, confidence, truth, track=np.zeros(T, dtype=np.intp), frame=np.arange(T),
-        time_s=np.tile(np.arange(T)[:, None] / 30, (1, CAMERAS)),
+        time_s=np.tile(step_s * np.arange(T, dtype=np.float64)[:, None], (1, CAMERAS)),
     )  # fmt: skip
     config = ObservationConfig()
     sigmas = observation_sigmas(observations, truth, views, config, names)
-    noisy = xy + rng.normal(size=xy.shape) * sigmas[..., None]
+    noise = rng.normal(size=xy.shape)
+    noisy = xy + (noise[:1] if lasts else noise) * sigmas[..., None]
     object.__setattr__(observations, "xy", noisy)
     window = BodyWindow(
         observations, sigmas, views, model, config, MotionModel.load(names), CONSTANT_VELOCITY
@@ -88,6 +93,22 @@ def test_regions_hold_what_they_say(hidden: float) -> None:
             < 7.815
         )
     assert np.mean(inside) > 0.9
+
+
+def test_covariances_grow_where_errors_last() -> None:
+    factors, inside = dict[bool, list[float]](), dict[bool, list[np.ndarray]]()
+    for lasts in (False, True):
+        factors[lasts], inside[lasts] = [], []
+        for seed in range(4):
+            window, truth, start = _person(seed, lasts=lasts, step_s=0.2)
+            state = window.solve(start)
+            away, marginals = window.joints(state) - truth, window.covariances(state)
+            factors[lasts].append(marginals.lasting())
+            covariance = factors[lasts][-1] * marginals.joints()
+            whitened = np.linalg.solve(covariance, away[..., None])[..., 0]
+            inside[lasts].append(np.einsum("tji,tji->tj", away, whitened) < 7.815)
+    assert min(factors[True]) > 1.2 * max(factors[False])
+    assert all(np.mean(each) > 0.8 for each in inside.values())
 
 
 def test_marginals_are_those_of_the_graph_and_its_step_moves_nothing() -> None:

@@ -37,7 +37,7 @@ class Killing:
     """A recording, and what comes of it when nobody is killed."""
 
     command: list[str]
-    """What reconstructs it, but for the folder."""
+    """What reconstructs it, but for the folder and the number of workers."""
     people: bytes
     """people.npz."""
     kept: int
@@ -58,9 +58,9 @@ class Killing:
             "--detections",
             str(files["detections"]),
         ]
-        command += ["--config", str(folder / "settings.toml"), "--fps", "30", "--workers", "2"]
+        command += ["--config", str(folder / "settings.toml"), "--fps", "30"]
         command += ["--no-report", "--no-check"]
-        process = _begun([*command, "--output", str(folder / "whole")])
+        process = _begun([*command, "--workers", "1", "--output", str(folder / "whole")])
         kept = max(_kept_so_far(process, folder / "whole"))
         if (said := _ended(process)) != "":
             raise AssertionError(said)
@@ -71,7 +71,9 @@ class Killing:
         not.
         """
         rng = random.Random(number)
-        process = _begun([*self.command, "--output", str(out)])
+        workers = 1 if number % 4 == 3 else 2
+        command = [*self.command, "--workers", str(workers), "--output", str(out)]
+        process = _begun(command)
         least = rng.randint(-1, self.kept)
         for kept in _kept_so_far(process, out):
             if kept >= least:
@@ -96,7 +98,7 @@ class Killing:
                 content[rng.randrange(len(content))] ^= 1 << rng.randrange(8)
                 file.write_bytes(content)
                 flipped = file.name
-        second = "" if done else _ended(_begun([*self.command, "--output", str(out), "--resume"]))
+        second = "" if done else _ended(_begun([*command, "--resume"]))
         if second.startswith("error:"):
             if flipped == "nothing":
                 raise AssertionError(f"kill {number}: it did not go on: {second}")

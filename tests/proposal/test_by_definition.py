@@ -19,7 +19,7 @@ from shapepose_fg.proposal.candidates import (
     vote,
 )
 from shapepose_fg.proposal.growth import GrowthConfig, Links, grow, link
-from shapepose_fg.proposal.nearby import LEAST_AFFINITY, Nearby, Sight, own_affinity
+from shapepose_fg.proposal.nearby import LEAST_AFFINITY, FrameArrays, Nearby, own_affinity
 from shapepose_fg.proposal.proposals import ProposalConfig, Search, standing_apart
 
 CONFIG = CandidateConfig()
@@ -360,9 +360,9 @@ def test_mean_affinity_is_over_the_neighbours_that_the_person_owns_in_that_view(
     for person, row in np.argwhere(rng.random(owns.shape) < 0.3).tolist():
         own[person, crowded.joint[row], crowded.view[row]] = row  # the last of a joint in a view
     owns[np.nonzero(own >= 0)[0], own[own >= 0]] = True
-    sight = Sight.of(crowded, five_cameras, BODY_25)
+    arrays = FrameArrays.of(crowded, five_cameras, BODY_25)
     every = [np.ascontiguousarray(index.ravel()) for index in np.indices(owns.shape)]
-    affinity, neighbours = (each.reshape(owns.shape) for each in own_affinity(*every, own, sight))
+    affinity, neighbours = (each.reshape(owns.shape) for each in own_affinity(*every, own, arrays))
     listed = {
         tuple(pair): value
         for pair, value in zip(crowded.pairs.tolist(), crowded.affinity, strict=True)

@@ -13,7 +13,7 @@ from shapepose_fg.core.notes import Notebook
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.pipeline.pipeline import PipelineConfig
 from shapepose_fg.pipeline.setup import Setup
-from shapepose_fg.proposal.nearby import Sight, nearby
+from shapepose_fg.proposal.nearby import FrameArrays, nearby
 from shapepose_fg.proposal.possible_people import Frame, _claimed
 from shapepose_fg.proposal.stage_one import StageOne
 from shapepose_fg.tracking.identities import FollowState, finish
@@ -40,7 +40,9 @@ def test_what_is_near_and_in_order(people, crowded, five_cameras):
     at = crowded.view, slice(None), crowded.joint
     away = np.linalg.norm(xy[at] - crowded.xy[:, None], axis=-1) * depth[at]
     away_m = (away / five_cameras.focal_px[crowded.view][:, None]).T
-    near = nearby(places, np.full((4, 25), 0.3), world, Sight.of(crowded, five_cameras, BODY_25))
+    near = nearby(
+        places, np.full((4, 25), 0.3), world, FrameArrays.of(crowded, five_cameras, BODY_25)
+    )
     inside = np.zeros(away_m.shape, dtype=bool)
     inside[near.person, near.detection] = True
     np.testing.assert_array_equal(inside, away_m < 0.3)

@@ -12,7 +12,7 @@ from numba import njit
 from shapepose_fg.core.detections import Detections, Input
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.proposal.nearby import Sight
+from shapepose_fg.proposal.nearby import FrameArrays
 from shapepose_fg.tracking import view_assignment
 from shapepose_fg.tracking.plausibility import tear
 from shapepose_fg.tracking.reassociation import LEAST_PROBABILITY, reassociate
@@ -75,7 +75,7 @@ def test_everybody_gets_their_own_detection_once(five_cameras, two_people, seen_
     predicted = two_people + rng.normal(0, 0.02, two_people.shape)
     sigma, lost = np.full((2, 25), 0.02), np.zeros((2, 25), dtype=bool)
     candidate = assign(
-        Predicted(predicted, sigma, lost), Sight.of(detections, five_cameras, BODY_25)
+        Predicted(predicted, sigma, lost), FrameArrays.of(detections, five_cameras, BODY_25)
     )
     share, total = own(detections, five_cameras, two_people, candidate)
     assert share == 1.0 and total == 2 * 25 * 5
@@ -91,7 +91,7 @@ def test_a_lost_wrist_is_found_by_its_elbow(five_cameras, two_people, seen_exact
     predicted[:, WRIST] = predicted[:, ELBOW]
     sigma[:, WRIST] = 0.3
     candidate = assign(
-        Predicted(predicted, sigma, lost), Sight.of(detections, five_cameras, BODY_25)
+        Predicted(predicted, sigma, lost), FrameArrays.of(detections, five_cameras, BODY_25)
     )
     share, _ = own(detections, five_cameras, two_people, candidate)
     assert share == 1.0 and (candidate[:, WRIST] >= 0).all()
@@ -101,7 +101,7 @@ def test_nobody_gets_what_is_too_far_away(five_cameras, two_people, seen_exactly
     detections = seen_exactly(five_cameras, two_people[:1])
     beside = two_people[:1] + np.array([0.0, 0.0, 0.4])
     predicted = Predicted(beside, np.full((1, 25), 0.02), np.zeros((1, 25), bool))
-    nothing = assign(predicted, Sight.of(detections, five_cameras, BODY_25))
+    nothing = assign(predicted, FrameArrays.of(detections, five_cameras, BODY_25))
     # 0.4 m up is farther than 0.12 + 2 x 0.02 m, but for other joints of the same kind; there are
     # none.
     assert (nothing < 0).all()
@@ -283,7 +283,7 @@ def test_two_people_side_by_side_are_less_certain_than_one_alone(
         detections = replace(seen, pairs=np.zeros((0, 2), dtype=int), affinity=np.zeros(0))
         sigma, lost = np.full((2, 25), 0.02), np.zeros((2, 25), dtype=bool)
         chosen, probability = assign_with_probability(
-            Predicted(people, sigma, lost), Sight.of(detections, five_cameras, BODY_25)
+            Predicted(people, sigma, lost), FrameArrays.of(detections, five_cameras, BODY_25)
         )
         assert (chosen >= 0).all()
         median.append(np.median(probability))

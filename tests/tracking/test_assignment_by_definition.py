@@ -12,7 +12,7 @@ from shapepose_fg.core.detections import Input
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.proposal import nearby
-from shapepose_fg.proposal.nearby import Sight
+from shapepose_fg.proposal.nearby import FrameArrays
 from shapepose_fg.tracking import view_assignment
 from shapepose_fg.tracking.reassociation import (
     LEAST_PROBABILITY,
@@ -156,15 +156,15 @@ def test_detections_are_taken_best_first_by_nearness_and_affinity(
 ):
     expected = assigned(predicted, crowded, five_cameras, SimpleNamespace(**DEFAULTS | settings))
     settle(**settings)
-    sight = Sight.of(crowded, five_cameras, BODY_25)
-    found = assign(predicted, sight)
+    arrays = FrameArrays.of(crowded, five_cameras, BODY_25)
+    found = assign(predicted, arrays)
     np.testing.assert_array_equal(found, expected)
     assert (found >= 0).mean() > 0.5 and (found[predicted.lost] >= 0).any(), (
         "lost joints are found, too"
     )
     settle(overlap_m=0.005)
     assert (
-        assign(predicted, Sight.of(crowded, five_cameras, BODY_25)) != found
+        assign(predicted, FrameArrays.of(crowded, five_cameras, BODY_25)) != found
     ).any() or "overlap_m" not in settings
 
 
@@ -178,8 +178,8 @@ def test_a_detection_that_serves_two_is_theirs_with_a_probability_of_one_at_most
         view_assignment, "probabilities", lambda scored, _: np.full(len(scored.score), 0.6)
     )
     settle(passes=1, overlap_m=0.6, farthest_m=0.6)
-    sight = Sight.of(crowded, five_cameras, BODY_25)
-    chosen, probability = view_assignment.assign_with_probability(predicted, sight)
+    arrays = FrameArrays.of(crowded, five_cameras, BODY_25)
+    chosen, probability = view_assignment.assign_with_probability(predicted, arrays)
     owners = np.bincount(chosen[chosen >= 0], minlength=len(crowded))
     assert (owners > 1).any(), "overlaps happen here"
     expected = np.where(owners[chosen] > 1, 1.0, 0.6)
@@ -194,7 +194,7 @@ def three(five_cameras, two_people, seen_exactly):
     candidate = np.full((3, 25, 5), -1)
     sure = np.full((2, 25), 0.02), np.zeros((2, 25), dtype=bool)
     candidate[:2] = assign(
-        Predicted(two_people, *sure), Sight.of(detections, five_cameras, BODY_25)
+        Predicted(two_people, *sure), FrameArrays.of(detections, five_cameras, BODY_25)
     )
     return Input(0, np.zeros(5), detections, five_cameras), candidate, places
 
@@ -266,7 +266,9 @@ def test_what_is_tied_to_the_elbow_is_the_wrist_wherever_it_was_predicted(
     predicted = two_people[:1].copy()
     predicted[0, wrist] += away_m * right
     sigma, lost = np.full((1, 25), 1e-6), np.zeros((1, 25), dtype=bool)
-    found = assign(Predicted(predicted, sigma, lost), Sight.of(detections, five_cameras, BODY_25))
+    found = assign(
+        Predicted(predicted, sigma, lost), FrameArrays.of(detections, five_cameras, BODY_25)
+    )
     assert (found[0, wrist, 0] >= 0) == taken
     assert (np.delete(found, wrist, axis=1) >= 0).all()
 

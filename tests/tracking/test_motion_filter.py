@@ -11,7 +11,7 @@ from shapepose_fg.core.kernel_geometry import ROBUST, robust_weight
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, observation_sigmas
-from shapepose_fg.proposal.nearby import Sight
+from shapepose_fg.proposal.nearby import FrameArrays
 from shapepose_fg.tracking.measuring import Trust, measured
 from shapepose_fg.tracking.motion_filter import Bones, JointStates, predicted
 from shapepose_fg.tracking.view_assignment import Predicted, assign
@@ -65,8 +65,8 @@ def test_a_measurement_is_the_information_filter_s_also_for_a_ray(
         confidence=rng.uniform(0.2, 1, len(seen)),
     )
     sure, lost = np.full((2, 25), 0.05), np.zeros((2, 25), dtype=bool)
-    sight = Sight.of(seen, five_cameras, BODY_25)
-    candidate = assign(Predicted(two_people, sure, lost), sight)
+    arrays = FrameArrays.of(seen, five_cameras, BODY_25)
+    candidate = assign(Predicted(two_people, sure, lost), arrays)
     wrist, knee, ankle = (names.index(name) for name in ("RWrist", "RKnee", "LAnkle"))
     candidate[:, wrist, 1:] = candidate[:, knee] = -1
     candidate[0, ankle, 1:] = candidate[1, ankle, 1:]  # outside the gate
@@ -86,7 +86,7 @@ def test_a_measurement_is_the_information_filter_s_also_for_a_ray(
         mean = np.einsum("...ij,...j->...i", covariance, right)
         at = mean[..., :3]
     weight = config.weight(seen.confidence)
-    given = before, lost, candidate, weight, sight, Trust.of(config, names), BONES
+    given = before, lost, candidate, weight, arrays, Trust.of(config, names), BONES
     after, kept, evident = measured(*given)
     inlier = kept >= 0
     assert evident.all()
@@ -104,12 +104,12 @@ def test_a_lost_joint_begins_where_the_views_put_it(five_cameras, two_people, se
     """Half a metre beside, where no gate would let its detections through."""
     seen, sure = seen_exactly(five_cameras, two_people), np.full((2, 25), 0.4)
     lost = np.arange(50).reshape(2, 25) == 4
-    sight, config = Sight.of(seen, five_cameras, BODY_25), ObservationConfig()
-    candidate = assign(Predicted(two_people, sure / 20, lost & False), sight)
+    arrays, config = FrameArrays.of(seen, five_cameras, BODY_25), ObservationConfig()
+    candidate = assign(Predicted(two_people, sure / 20, lost & False), arrays)
     before = JointStates.at(two_people + 0.5 * lost[..., None], sure, (2.0,))
     trust = Trust.of(config, BODY_25.joints)
     after, kept, _ = measured(
-        before, lost, candidate, config.weight(seen.confidence), sight, trust, BONES
+        before, lost, candidate, config.weight(seen.confidence), arrays, trust, BONES
     )
     assert (kept >= 0).all()
     np.testing.assert_allclose(after.position, two_people, atol=2e-3)

@@ -13,7 +13,7 @@ from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.core.detections import Detections, Input
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.linearisation import ObservationConfig
-from shapepose_fg.tracking.sides import hold_now
+from shapepose_fg.tracking.sides import correct_swaps_now
 from shapepose_fg.tracking.tracker import BodyScale, Tracker, TrackingConfig
 
 MIRROR = np.array(BODY_25.mirror)
@@ -56,7 +56,7 @@ def held(tracker, found, rig, people, *, followed=True):
     """Tracks of people after a frame, and its detections."""
     number = np.arange(len(people))
     tracks = tracker.at(people, number, 0 * number, 0.0)
-    tracks, given = hold_now(
+    tracks, given = correct_swaps_now(
         tracker, tracks, Input(0, np.zeros(len(rig)), found, rig), followed=followed
     )
     return tracks, given.detections

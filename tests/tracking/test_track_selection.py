@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.proposal.nearby import Sight
+from shapepose_fg.proposal.nearby import FrameArrays
 from shapepose_fg.tracking.global_hypotheses import lasting
 from shapepose_fg.tracking.track_selection import (
     EvidenceTable,
@@ -233,7 +233,11 @@ def test_detections_count_by_the_affinity_to_the_same_person_s(
     candidate[1, :, 2] = -1
     candidate[1, elbow, 2] = own[1, elbow, 2]
     weight, _ = weighed(
-        candidate, two_people, Sight.of(detections, five_cameras, BODY_25), BODY_25, np.arange(2)
+        candidate,
+        two_people,
+        FrameArrays.of(detections, five_cameras, BODY_25),
+        BODY_25,
+        np.arange(2),
     )
     whole = weight[0, wrist, 0]
     assert weight[0, wrist, 1] == 0.0 and weight[1, elbow, 2] == whole / 2
@@ -253,14 +257,14 @@ def test_who_is_seen_wholly_has_a_second_of_evidence_in_a_second(
     own = np.full((1, 25, 5), -1)
     own[0, detections.joint, detections.view] = np.arange(len(detections))
     beside = np.concatenate([two_people[:1], two_people[:1] + 0.3])
-    sight = Sight.of(detections, five_cameras, BODY_25)
+    arrays = FrameArrays.of(detections, five_cameras, BODY_25)
     for places, candidate in (
         (two_people[:1], own),
         (beside, np.concatenate([own, np.full_like(own, -1)])),
     ):
-        weight, price = weighed(candidate, places, sight, BODY_25, np.zeros(len(places), int))
+        weight, price = weighed(candidate, places, arrays, BODY_25, np.zeros(len(places), int))
         np.testing.assert_allclose(weight[0].sum() - price[0], 1.0)
-    none = np.full_like(own, -1), two_people[:1], sight, BODY_25, np.zeros(1, int)
+    none = np.full_like(own, -1), two_people[:1], arrays, BODY_25, np.zeros(1, int)
     assert weighed(*none)[1] == pytest.approx(0.4)
 
 
@@ -278,10 +282,10 @@ def test_a_joint_behind_somebody_else_costs_little_unseen(
     towards = to_camera / np.linalg.norm(to_camera)
     person = person - ((person - person[0].mean(axis=0)) @ towards)[..., None] * towards
     places, none = np.concatenate([person, person + metres * towards]), np.full((2, 25, 1), -1)
-    sight = Sight.of(seen_exactly(rig, person), rig, BODY_25)
-    price = weighed(none, places, sight, BODY_25, np.zeros(2, int))[1][0]
+    arrays = FrameArrays.of(seen_exactly(rig, person), rig, BODY_25)
+    price = weighed(none, places, arrays, BODY_25, np.zeros(2, int))[1][0]
     assert price < 0.4 - 0.8 * 0.35 if hides else price == pytest.approx(0.4)
-    apart = weighed(none, places, sight, BODY_25, np.arange(2))[1]
+    apart = weighed(none, places, arrays, BODY_25, np.arange(2))[1]
     np.testing.assert_allclose(apart, 0.4)
 
 
@@ -294,12 +298,12 @@ def test_joints_outside_the_picture_cost_nothing_and_unknown_ones_little(
     far = two_people[:1] + np.array([0.0, 0.0, 100.0])
     detections = seen_exactly(five_cameras, two_people)
     none, zero = np.full((1, 25, 5), -1), np.zeros(1, dtype=np.intp)
-    assert weighed(none, far, Sight.of(detections, five_cameras, BODY_25), BODY_25, zero)[
+    assert weighed(none, far, FrameArrays.of(detections, five_cameras, BODY_25), BODY_25, zero)[
         1
     ].tolist() == [0]
     half = two_people[:1].copy()
     half[0, 10:] = np.nan
-    price = weighed(none, half, Sight.of(detections, five_cameras, BODY_25), BODY_25, zero)[1]
+    price = weighed(none, half, FrameArrays.of(detections, five_cameras, BODY_25), BODY_25, zero)[1]
     np.testing.assert_allclose(price, (10 * 0.4 + 15 * 0.05) / 25)
 
 

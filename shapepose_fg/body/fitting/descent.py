@@ -63,7 +63,10 @@ class LearnedDescent:
         `others`: the remaining points of the body (50 - K), in order; required if there are any.
         `offsets`: the detector's keypoint offsets (K, 3), in the frames of the bones (K,).
         """
-        self.network, self._see = network, Sight(points, slots, kernel_scale, others, offsets)
+        self.network, self._inputs = (
+            network,
+            NetworkInputs(points, slots, kernel_scale, others, offsets),
+        )
 
     def unroll(self, state: BodyState, xyz: Array, information: Array) -> Iterator[BodyState]:
         """Yield the state after each update, given targets (B, K, 3) in the person's own frame,
@@ -71,13 +74,13 @@ class LearnedDescent:
         for an unseen joint.
         """
         for step in range(self.network.config.steps):
-            inputs = self._see(state, xyz, information, self.network.gradient_scale)
+            inputs = self._inputs(state, xyz, information, self.network.gradient_scale)
             state = BodyState(*(np.array(part, order="C") for part in vars(state).values()))
             moved(self.network(inputs, step), STEP, state.betas, state.local, state.transl)
             yield state
 
 
-class Sight:
+class NetworkInputs:
     """Computes the network's inputs from bodies and targets; parameters as in `LearnedDescent`."""
 
     def __init__(

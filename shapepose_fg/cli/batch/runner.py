@@ -112,7 +112,7 @@ class BatchRunner:
                 leader.ask_to_stop()
             for leader in leaders:
                 found = leader.end()
-                if found is not None:  # it finished before it was asked to stop
+                if isinstance(found, Ended):  # it finished before it was asked to stop
                     self._done(leader, found, batch_status)
 
     def _next(self, batch_status: BatchStatus, leaders: "Sequence[Leader]") -> Entry | None:
@@ -143,20 +143,20 @@ class BatchRunner:
     def _heard(self, leader: "Leader", batch_status: BatchStatus, watcher: Bars) -> bool:
         """Process the next message of a coordinator; returns whether it has ended."""
         name, told = leader.assignment.name, leader.next()
-        if isinstance(told, tuple):
+        if told is not None:
             if batch_status.of[name].anew:  # what is saved from now on belongs to this run
                 batch_status.set(name, replace(batch_status.of[name], anew=False))
             watcher.frames(name, *told)
             return False
-        leader.end()
-        if isinstance(told, Ended):
-            self._done(leader, told, batch_status)
+        found = leader.end()
+        if isinstance(found, Ended):
+            self._done(leader, found, batch_status)
             watcher.ended(name, failed=None, again=False)
         else:
             # Maximum number of attempts for a recording.
-            now = batch_status.of[name].failed(told, time.monotonic() - leader.began, 2)
+            now = batch_status.of[name].failed(found, time.monotonic() - leader.began, 2)
             batch_status.set(name, now)
-            watcher.ended(name, failed=told, again=now.status == "waiting")
+            watcher.ended(name, failed=found, again=now.status == "waiting")
         return True
 
     def _done(self, leader: "Leader", found: Ended, batch_status: BatchStatus) -> None:
@@ -174,36 +174,31 @@ class Leader:
         self.began = time.monotonic()
         """Start time, by `time.monotonic`."""
         self.told, tell = Pipe(duplex=False)
-        """Messages of the process: (finished frames, all frames); at the end `Ended`, or the reason
-        of the failure."""
+        """Messages of the process: (finished frames, all frames). It is closed at the end."""
         self._process = Processes(1, _tell_by, tell)
         tell.close()
         self._pid = self._process.submit(os.getpid)
         self._end = self._process.submit(_lead, assignment)
 
-    def next(self) -> tuple[int, int] | Ended | str:
-        """The next message; if the process has died, the reason."""
+    def next(self) -> tuple[int, int] | None:
+        """The next message; None if the process has ended."""
         try:
             return self.told.recv()
         except (EOFError, OSError):
-            return "its process was killed; there may be too little memory"
+            return None
 
-    def end(self) -> Ended | None:
-        """Wait for the process to end, and terminate it if necessary; returns the last `Ended`
-        message, if there is one.
+    def end(self) -> Ended | str:
+        """Wait for the process to end, and terminate it if necessary; returns its result, or the
+        reason of its failure.
         """
         # Maximum time for a coordinator to stop, s.
         wait_for([self._end], 20.0)
         self._process.shutdown()
-        found = None
-        try:
-            while self.told.poll():
-                told = self.told.recv()
-                found = told if isinstance(told, Ended) else found
-        except (EOFError, OSError):
-            pass
         self.told.close()
-        return found
+        try:
+            return self._end.result(0)
+        except (BrokenProcessPool, OSError):
+            return "its process was killed; there may be too little memory"
 
     def ask_to_stop(self) -> None:
         """Ask the process to save finished work and to stop; `end` waits for it."""
@@ -221,8 +216,10 @@ def _tell_by(tell: Connection) -> None:
     _tell = tell
 
 
-def _lead(assignment: Assignment) -> None:
-    """Entry point of a coordinator process; all output is appended to the log of the recording."""
+def _lead(assignment: Assignment) -> Ended | str:
+    """Reconstruct a recording in a coordinator process; returns the result, or the reason of a
+    failure. All output is appended to the log of the recording.
+    """
     use_any_streams()
     log = inside(assignment.folder, LOG)
     with log.open("ab", buffering=0) as stream:
@@ -239,16 +236,17 @@ def _lead(assignment: Assignment) -> None:
         with stoppable():
             known = prepare(assignment.request, assignment.folder)
             again = {"resume": assignment.resume, "restart": assignment.restart, "overwrite": True}
-            _tell.send(carry_out(known, execution, **again))
+            return carry_out(known, execution, **again)
     except Stopped as stop:
         print(f"stopped: {stop.message}", flush=True)
+        return "its process was stopped"
     except InputError as error:
         print(f"error: {error}", flush=True)
-        _tell.send(" ".join(str(error).split()))
+        return " ".join(str(error).split())
     except Exception as error:
         traceback.print_exc()
         words = " ".join(str(error).split())[:300]
-        _tell.send(f"{type(error).__name__}: {words} (details in {log})")
+        return f"{type(error).__name__}: {words} (details in {log})"
     finally:
         _tell.close()
 

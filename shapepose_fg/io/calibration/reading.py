@@ -89,7 +89,7 @@ def read_rig(
         carriers = {camera.carrier for camera in finished}
         trajectories = tuple(each for each in written.trajectories if each.name in carriers)
         notes = tuple(f"{path}: {each}" for each in written.notes)
-        return carried(
+        return with_first_poses(
             Rig(finished, up, trajectories=trajectories, notes=notes, unwanted=tuple(unwanted))
         )
 
@@ -102,7 +102,7 @@ def recognised(content: Content) -> tuple[Format, WrittenRig] | None:
     return next(((form, written) for form, written in read if written is not None), None)
 
 
-def carried(rig: Rig) -> Rig:
+def with_first_poses(rig: Rig) -> Rig:
     """The rig with the pose of each moving camera set to the start of its trajectory."""
     if not rig.moves:
         return rig
@@ -140,7 +140,7 @@ def with_trajectories(rig: Rig, given: Sequence[str]) -> Rig:
         trajectories.append(read_trajectory(file, name))
         cameras[name] = replace(cameras[name], carrier=name, bTc=np.eye(4))
     with naming("--trajectory"):
-        return carried(
+        return with_first_poses(
             replace(rig, cameras=tuple(cameras.values()), trajectories=tuple(trajectories))
         )
 

@@ -5,14 +5,16 @@ values as None.
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
 from shapepose_fg.core.arrays import Array
-from shapepose_fg.core.camera import Axis, Camera
+from shapepose_fg.core.bounds import Axis
+from shapepose_fg.core.bounds import Unit as Unit
+from shapepose_fg.core.camera import Camera
 from shapepose_fg.core.decompositions import ROTATION_TOLERANCE, nearest_rotation, rigid
 from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.lens import Lens, padded_distortion
@@ -20,8 +22,6 @@ from shapepose_fg.core.trajectory import Trajectory
 from shapepose_fg.io.calibration.content import Content
 from shapepose_fg.io.validation import describe, numbers
 
-Unit = Literal["m", "cm", "mm"]
-"""The unit of lengths in a calibration file."""
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 """Length of each unit, metres."""
 

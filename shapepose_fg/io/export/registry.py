@@ -6,7 +6,7 @@ from enum import StrEnum
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 
@@ -227,8 +227,6 @@ def read_take(
     rows; `observations` also reads their detections. `options` are those of `Take.of`.
     """
     cameras = results_folder(path) / CAMERAS
-    if up is not None and up not in get_args(Axis):
-        raise InputError(f"--up {up}: must be one of x -x y -y z -z")
     with Reconstruction.open(path) as opened:
         rig = read_rig(cameras) if cameras.is_file() else None
         axis: Any = up or (None if rig is None else rig.up)

@@ -119,13 +119,19 @@ def read_views(
         while waiting:
             (camera, seen, time_s), frame = waiting[0]
             with naming(file, _CURE_POSES):
-                (pose,), (surely,), (there,) = frames.at(frame, np.array([time_s]))
+                (pose,), (covariances,), (there,) = frames.at(frame, np.array([time_s]))
             stands = not (carrier[camera] or frames.moves(frame))
             if now_s < (begun_s if stands else time_s) + LONGEST_GAP_S and not there:
                 return
             waiting.popleft()
             if there or stands:
-                yield camera, seen, time_s, None if stands else pose, None if stands else surely
+                yield (
+                    camera,
+                    seen,
+                    time_s,
+                    None if stands else pose,
+                    None if stands else covariances,
+                )
             else:
                 unplaced[camera, frame] += 1
 

@@ -30,9 +30,9 @@ class Frames:
 
     def __init__(self) -> None:
         self._parent: dict[str, str] = {}
-        self._told: dict[str, dict[int, tuple[Array, Array | None]]] = defaultdict(dict)
+        self._received: dict[str, dict[int, tuple[Array, Array | None]]] = defaultdict(dict)
         self._fixed: dict[str, Array] = {}
-        self._sure = set[str]()
+        self._with_covariance = set[str]()
         self._known: dict[str, Trajectory] = {}
 
     def add(self, topic: str, kind: str, message: Any, place: str) -> None:
@@ -47,21 +47,21 @@ class Frames:
                     parent,
                 )
                 continue
-            surely = _covariance(covariance, pose, f"{place}, frame {child}")
-            if surely is None and child in self._sure:
+            covariances = _covariance(covariance, pose, f"{place}, frame {child}")
+            if covariances is None and child in self._with_covariance:
                 continue
-            if surely is not None and child not in self._sure:
-                self._sure.add(child)
-                self._told[child].clear()
-            self._told[child][stamp] = _matrix(pose, f"{place}, frame {child}"), surely
+            if covariances is not None and child not in self._with_covariance:
+                self._with_covariance.add(child)
+                self._received[child].clear()
+            self._received[child][stamp] = _matrix(pose, f"{place}, frame {child}"), covariances
             self._parent[child] = parent
             self._known.pop(child, None)
 
     @property
     def moving(self) -> list[str]:
         """Frames that move relative to their parents, without descendants that do."""
-        carries = {self._parent[child] for child in self._told}
-        return sorted(child for child in self._told if child not in carries)
+        carries = {self._parent[child] for child in self._received}
+        return sorted(child for child in self._received if child not in carries)
 
     def chain(self, frame: str) -> list[str]:
         """A frame, its parent, and so on, up to the frame below `world`, or to the last one with a
@@ -75,7 +75,7 @@ class Frames:
 
     def moves(self, frame: str) -> bool:
         """Whether the frame, or one of its ancestors, has several poses over time."""
-        return any(each in self._told for each in self.chain(frame))
+        return any(each in self._received for each in self.chain(frame))
 
     def at(self, frame: str, time_s: Array) -> tuple[Array, Array, Mask]:
         """Poses (N, 4, 4) of a frame in the root of its tree at times (N,), their covariances (N,
@@ -83,50 +83,50 @@ class Frames:
         close enough in time exist.
         """
         poses = np.tile(np.eye(4), (len(time_s), 1, 1))
-        surely, there = np.zeros((len(time_s), 6, 6)), np.full(len(time_s), self.moves(frame))
+        covariances, there = np.zeros((len(time_s), 6, 6)), np.full(len(time_s), self.moves(frame))
         for each in self.chain(frame):
             # The error of a product A B is the error of A, transformed to B, plus the error of B.
-            link = self._trajectory(each) if each in self._told else None
+            link = self._trajectory(each) if each in self._received else None
             if link is not None:
                 there &= link.covers(time_s)
                 carry = _of_inverse(poses)
-                surely += carry @ link.covariance_at(time_s) @ carry.mT
-            elif each in self._told:
+                covariances += carry @ link.covariance_at(time_s) @ carry.mT
+            elif each in self._received:
                 there[:] = False
             poses = (self._fixed.get(each, np.eye(4)) if link is None else link.at(time_s)) @ poses
-        return poses, surely, there
+        return poses, covariances, there
 
     def trajectory(self, frame: str, name: str) -> Trajectory:
         """The trajectory of a frame, at the times of the link in its chain with the most poses.
         ValueError if it has none.
         """
-        moved = [each for each in self.chain(frame) if each in self._told]
-        most = max(moved, key=lambda each: len(self._told[each]))
-        time_s = np.array(sorted(self._told[most])) / NS
-        poses, surely, there = self.at(frame, time_s)
+        moved = [each for each in self.chain(frame) if each in self._received]
+        most = max(moved, key=lambda each: len(self._received[each]))
+        time_s = np.array(sorted(self._received[most])) / NS
+        poses, covariances, there = self.at(frame, time_s)
         if there.sum() < 2:
             raise ValueError(
                 f"2 poses are needed, with {' in '.join(self.chain(frame))} known at the same time"
             )
-        says = surely[there].any()
-        return Trajectory(name, time_s[there], poses[there], surely[there] if says else None)
+        says = covariances[there].any()
+        return Trajectory(name, time_s[there], poses[there], covariances[there] if says else None)
 
     def forget(self, before_s: float) -> None:
         """Drop poses before `before_s`, except for the last one of each link."""
-        for child, told in self._told.items():
-            for stamp in sorted(stamp for stamp in told if stamp < before_s * NS)[:-1]:
-                del told[stamp]
+        for child, received in self._received.items():
+            for stamp in sorted(stamp for stamp in received if stamp < before_s * NS)[:-1]:
+                del received[stamp]
                 self._known.pop(child, None)
 
     def _trajectory(self, child: str) -> Trajectory | None:
         """One link over time; None if it has only one pose."""
-        if child not in self._known and len(self._told[child]) > 1:
-            told = sorted(self._told[child].items())
+        if child not in self._known and len(self._received[child]) > 1:
+            received = sorted(self._received[child].items())
             time_s, poses = (
-                np.array([at for at, _ in told]) / NS,
-                np.stack([pose for _, (pose, _) in told]),
+                np.array([at for at, _ in received]) / NS,
+                np.stack([pose for _, (pose, _) in received]),
             )
-            says = [surely for _, (_, surely) in told if surely is not None]
+            says = [covariances for _, (_, covariances) in received if covariances is not None]
             self._known[child] = Trajectory(child, time_s, poses, np.stack(says) if says else None)
         return self._known.get(child)
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from shapepose_fg.body.fitting.descent import STEP, BodyState, Sight
+from shapepose_fg.body.fitting.descent import STEP, BodyState, NetworkInputs
 from shapepose_fg.body.fitting.network import (
     NUM_PARAMETERS,
     NUM_ROTATIONS,
@@ -110,7 +110,7 @@ class State:
 
 
 def unroll(
-    see: Sight, network: TrainedNetwork, state: State, targets: DescentTargets
+    see: NetworkInputs, network: TrainedNetwork, state: State, targets: DescentTargets
 ) -> Iterator[State]:
     """Yield the state after each update, with network inputs from `see`; each starts from the last
     one detached.

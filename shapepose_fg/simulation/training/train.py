@@ -11,7 +11,7 @@ import torch
 from scipy.stats import chi2
 from torch import Tensor
 
-from shapepose_fg.body.fitting.descent import Sight
+from shapepose_fg.body.fitting.descent import NetworkInputs
 from shapepose_fg.body.fitting.fitter import BodyFitter, JointTargets
 from shapepose_fg.body.fitting.fitters import SmplFitter
 from shapepose_fg.body.fitting.network import NUM_ROTATIONS, NetworkConfig
@@ -169,7 +169,7 @@ class Trainer:
         people = self.source.draw(config.batch, generator)
         targets, state, truth, true_points = prepared(people, self.frame, config, generator)
         self.network.train()
-        see = Sight(self.source.model.points, _ALL, config.kernel_scale)
+        see = NetworkInputs(self.source.model.points, _ALL, config.kernel_scale)
         self.optimiser.zero_grad()
         errors = []
         for iterate in unroll(see, self.network, state, targets):

@@ -1,7 +1,6 @@
 """Writes a result's report.html, from a result in memory or in its folder."""
 
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 
@@ -90,8 +89,6 @@ def report_of(
     folder = results_folder(results)
     with Reconstruction.open(results) as opened:
         people, every = opened.thinned(MOST_ROWS)
-    if up is not None and up not in get_args(Axis):
-        raise InputError(f"--up {up}: must be one of x -x y -y z -z")
     cameras = folder / CAMERAS
     rig = read_rig(cameras) if cameras.is_file() else up
     return write_report(folder, people, rig, fps=fps, body=body, every=every)

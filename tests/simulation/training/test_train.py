@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from shapepose_fg.body.fitting.descent import BodyState, LearnedDescent, Sight, gradient_scale
+from shapepose_fg.body.fitting.descent import (
+    BodyState,
+    LearnedDescent,
+    NetworkInputs,
+    gradient_scale,
+)
 from shapepose_fg.body.fitting.network import NetworkConfig
 from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.fitting.priors import PosePrior
@@ -93,7 +98,7 @@ def error_mm(trainer: Trainer, network: TrainedNetwork) -> float:
     people = trainer.source.draw(100, generator)
     targets, start, _, truth = prepared(people, trainer.frame, SMALL, generator)
     points = trainer.source.model.points
-    see = Sight(points, ALL, SMALL.kernel_scale)
+    see = NetworkInputs(points, ALL, SMALL.kernel_scale)
     *_, arrived = unroll(see, network.eval(), start, targets)
     distance = torch.linalg.vector_norm(positions(points, arrived) - truth, dim=-1)
     return 1000 * float(distance.mean())
@@ -136,7 +141,8 @@ def test_training_and_fits_take_the_same_steps(frame):
     given = (value.double().numpy() for value in (targets.xyz, targets.information))
     plain = BodyState(*(value.double().numpy() for value in vars(start).values()))
     descent = LearnedDescent(points, ALL, trainer.network.finished(), SMALL.kernel_scale)
-    ours = unroll(Sight(points, ALL, SMALL.kernel_scale), trainer.network.eval(), start, targets)
+    inputs = NetworkInputs(points, ALL, SMALL.kernel_scale)
+    ours = unroll(inputs, trainer.network.eval(), start, targets)
     for one, other in zip(ours, descent.unroll(plain, *given), strict=True):
         for name, value in vars(other).items():
             np.testing.assert_allclose(
@@ -154,7 +160,7 @@ def test_gradients_reach_the_network_from_the_last_step_only_through_itself(fram
     trainer, generator = make_trainer(frame), torch.Generator().manual_seed(3)
     targets, start, *_ = prepared(trainer.source.draw(20, generator), frame, SMALL, generator)
     first, second = unroll(
-        Sight(trainer.source.model.points, ALL, 6.0), trainer.network.eval(), start, targets
+        NetworkInputs(trainer.source.model.points, ALL, 6.0), trainer.network.eval(), start, targets
     )
     (slope,) = torch.autograd.grad(
         second.transl.sum(), trainer.network.leave.bias, retain_graph=True

@@ -294,7 +294,7 @@ def test_the_command_makes_the_page_anew(saved, page, capsys, tmp_path):
     assert_closed(Page(page))
     for wrong, words in (
         (["report", str(tmp_path / "none")], "there is no such file"),
-        (["report", str(saved), "--up", "q"], "--up q"),
+        (["report", str(saved), "--up", "q"], "'--up': 'q' is not one of"),
         (["report", str(saved), "--fps", "0"], "--fps 0"),
     ):
         with pytest.raises(SystemExit) as end:
