@@ -67,7 +67,7 @@ def solve_bodies(
     assert fitter.model is not None
     # Gating of the initial estimate; what it rejects stays out, since bodies can be drawn to the
     # other leg's detections.
-    seen, ratio = observations.seen, config.noise.variances(observations.confidence)[0]
+    seen, ratio = observations.seen, config.noise.ratios(observations.confidence)
     noisy = max(1.0, float(np.sqrt(ratio[seen].mean()))) if seen.any() else 1.0
     rho_2d_m = noisy * min(GATE_M, config.observations.rho_2d_m)
     gates = replace(config.observations, rho_2d_m=rho_2d_m)

@@ -126,19 +126,6 @@ def inverses(A: Array) -> Array:
     return np.ascontiguousarray(np.moveaxis(whole, 0, -1).reshape(A.shape))
 
 
-def squared_distance(said: JointTargets, xyz: Array, covariance: Array) -> Array:
-    """Squared Mahalanobis distance (N, J) of estimates `said` of joints, with possibly singular
-    information, from Gaussians at `xyz` (N, J, 3) with `covariance` (N, J, 3, 3); NaN if these are
-    unknown.
-    """
-    known = np.asarray(np.isfinite(xyz).all(axis=-1) & np.isfinite(covariance).all(axis=(-2, -1)))
-    away = np.where(known[..., None], xyz - np.nan_to_num(said.xyz), 0.0)[..., None]
-    # (L^-1 + C)^-1 = (1 + L C)^-1 L, also valid for singular information L.
-    both = np.eye(3) + said.information @ np.where(known[..., None, None], covariance, 0.0)
-    squared = (away.mT @ np.linalg.solve(both, said.information @ away))[..., 0, 0]
-    return np.where(known, squared, np.nan)
-
-
 @dataclass(frozen=True)
 class ViewEvidence(Rows):
     """Linearised measurements of the views at joints `points`."""

@@ -6,7 +6,6 @@ import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.core.camera import Views, beside_segment
-from shapepose_fg.estimation.limbs import ARMS_AND_LEGS
 
 LEAST_VIEWS = 3
 """Minimum number of views with the joint in plain view but no detection; fewer often miss it by
@@ -25,6 +24,11 @@ SPEED_M_S = 2.0
 """Speed of a joint since a view last detected it, m/s: `factors.CONSTANT_VELOCITY.start`."""
 _BEHIND_M = 0.05
 """Minimum depth behind a limb for occlusion, m."""
+ARMS_AND_LEGS = {
+    ("Shoulder", "Elbow"): 0.06, ("Elbow", "Wrist"): 0.05, ("Hip", "Knee"): 0.09,
+    ("Knee", "Ankle"): 0.07,
+}  # fmt: skip
+"""Limbs on either side, from the trunk outwards, and half their widths, metres."""
 _TRUNK = {
     ("Neck", "MidHip"): 0.17,
     ("Neck", "Nose"): 0.11,

@@ -118,18 +118,12 @@ class NoiseLaw:
             **{name: list(getattr(self, name)) for name in self.COLUMNS},
         }
 
-    def variances(self, scores: Array) -> tuple[Array, Array]:
-        """Variances (...) of detections with these `scores` (...).
-
-        Returned are the variance of the core relative to the shipped law, and the variance added by
-        gross errors, m². Of gross errors, only the share above that of high scores counts, because
-        that of high scores is due to wrong associations, which are modelled separately.
+    def ratios(self, scores: Array) -> Array:
+        """Variances (...) of the cores of detections with these `scores` (...), relative to those
+        of the shipped law.
         """
-        score = np.digitize(scores, EDGES)
         core = np.square(np.divide(self.times, self.shipped().times))
-        good = np.array(_MIDDLES) > EDGES[3]
-        usual = np.average(np.array(self.gross)[good], weights=np.array(self.count)[good] + 1)
-        return core[score], np.maximum(np.array(self.gross) - usual, 0.0)[score] * GROSS_M**2
+        return core[np.digitize(scores, EDGES)]
 
 
 def core_sigma_m(scores: Array | float, config: ObservationConfig | None = None) -> Array:
@@ -254,32 +248,3 @@ class Residuals:
         return NoiseLaw(
             tuple(times.tolist()), tuple(gross.tolist()), tuple(count.astype(int).tolist())
         )
-
-
-def variance_ratio(
-    law: NoiseLaw, scores: Array, sigma_m: Array, by_view: Array, body: Array
-) -> Array:
-    """(N, J) variance of joints of single frames under this `law`, relative to the variance by Eq.
-    1's weights; at least 1.
-
-    `scores` (N, J, V) are those of the observations, and `sigma_m` (N, J, V) their standard
-    deviations by Eq. 1's weights, m. `by_view` (N, J, V, 3, 3) is the information of the used
-    observations, and `body` (N, J, 3, 3) that of the body constraint, 1/m². The variance of the
-    body is scaled by the mean ratio of the person's detections.
-    """
-    core, gross_m2 = law.variances(scores)
-    ratio = core + gross_m2 / sigma_m**2
-    if (ratio == 1.0).all():
-        return np.ones(scores.shape[:2])
-    used = by_view.any(axis=(-2, -1))
-    count = used.sum(axis=(1, 2))
-    total = np.where(used, ratio, 0.0).sum(axis=(1, 2))
-    mean = np.where(count > 0, total / np.maximum(count, 1), 1.0)
-    least = 1e-2 * np.eye(3)
-    covariance = inverses(by_view.sum(axis=2) + body + least)
-    errors = np.einsum("njv,njvik->njik", ratio, by_view) + least
-    errors += mean[:, None, None, None] * body
-    found = np.trace(covariance @ errors @ covariance, axis1=-2, axis2=-1) / np.trace(
-        covariance, axis1=-2, axis2=-1
-    )
-    return np.maximum(found, 1.0)

@@ -23,7 +23,6 @@ from shapepose_fg.estimation.noise_law import (
     NoiseLaw,
     Residuals,
     core_sigma_m,
-    variance_ratio,
 )
 from shapepose_fg.evaluation.metrics import covariance_calibration, match_people
 from shapepose_fg.pipeline import offsets
@@ -85,26 +84,14 @@ def test_few_detections_keep_what_ships(five_cameras):
     np.testing.assert_allclose(nothing.law().gross, shipped.gross, atol=1e-4)
 
 
-def ratio(law, *, views=2, body=0.0, score=0.85):
-    """Of a joint at 10 m that `views` see, each to 1 cm, and of which the body says `body` 1/m²."""
-    by_view = np.zeros((1, 1, 3, 3, 3))
-    by_view[0, 0, :views] = 1e4 * np.eye(3)
-    scores, sigma_m = np.full((1, 1, 3), score), np.full((1, 1, 3), 0.02)
-    of_body = body * np.eye(3)[None, None]
-    return variance_ratio(law, scores, sigma_m, by_view, of_body)[0, 0]
-
-
-def test_covariances_follow_the_law():
-    shipped = NoiseLaw.shipped()
+def test_weights_follow_the_law():
+    """Twice the errors of the shipped law are four times the variance, in each range of scores."""
+    shipped, scores = NoiseLaw.shipped(), np.array([0.05, 0.2, 0.95])
+    np.testing.assert_allclose(shipped.ratios(scores), 1.0)
     twice = replace(shipped, times=tuple(2 * np.array(shipped.times)))
-    half = replace(shipped, times=tuple(0.5 * np.array(shipped.times)))
-    assert ratio(shipped) == 1.0
-    assert ratio(twice) == pytest.approx(4.0, rel=1e-3)
-    assert ratio(half) == 1.0, "the graph of one frame is the least"
-    assert ratio(twice, body=1e5) == pytest.approx(4.0, rel=1e-3)
-    gross = (np.array(shipped.gross)[1] - np.array(shipped.gross)[4:].mean()) * GROSS_M**2 / 0.02**2
-    assert ratio(shipped, score=0.2) == pytest.approx(1 + gross, rel=0.05)
-    assert ratio(twice, views=0, body=1e4) == 1.0, "nothing of the person was seen"
+    np.testing.assert_allclose(twice.ratios(scores), 4.0)
+    one = (2 * shipped.times[0], *shipped.times[1:])
+    np.testing.assert_allclose(replace(shipped, times=one).ratios(scores), [4.0, 1.0, 1.0])
 
 
 def test_a_law_is_told_in_run_json(tmp_path, five_cameras):
