@@ -125,7 +125,7 @@ def fitted(
 
     numbers = minimize(loss, (0.0, 1.0, 1.0), method="Nelder-Mead").x
     off = squared / Doubt(1.0, *numbers[1:]).factors(sigma_m, rejected)
-    order = np.argsort(off)
+    order = np.argsort(off, kind="stable")
     at = np.searchsorted(np.cumsum(share[order]) / share.sum(), 0.95)
     scale = off[order][at] / chi2.ppf(0.95, 3)
     return Doubt(*(round(float(each), 2) for each in (scale, *numbers[1:])))
