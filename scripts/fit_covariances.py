@@ -44,8 +44,8 @@ FRAMES, FPS = 120, 30.0
 FAR = 30.0
 """Squared Mahalanobis distance beyond which the loss grows only logarithmically."""
 REJECTED_POWER = 1.5
-"""`Doubt.rejected`. It is not fitted: simulated people say 3.4, with which regions of recorded people
-(MVOR) are far too wide, since real detectors have more guesses that gates reject."""
+"""`Doubt.rejected`. It is not fitted: simulated people say 3.4, with which regions of recorded
+people (MVOR) are far too wide, since real detectors have more guesses that gates reject."""
 SHARES = (0.7, 1.0)
 """Shares in the log score of joints that are seen by one view, and by two or more."""
 

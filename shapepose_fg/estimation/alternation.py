@@ -67,7 +67,7 @@ def alternate(
     enough = placed.sum(axis=1) >= LEAST_JOINTS
     fit = BodyFit.failed(np.full(len(X), FitStatus.TOO_FEW_JOINTS), X.shape[1])
     for _ in range(config.refine.alternations if len(people) > 0 else 0):
-        fit = fitter.fit_whole(_targets(X, enough), fit)  # the Theta step
+        fit = fitter.fit(_targets(X, enough), fit)  # the Theta step
         evidence = linearise(observations, sigmas, X, views, config.observations)
         pulled = mean_confidence(observations, evidence.inlier) <= config.graph.rho_3d
         pulled |= evidence.sigma_m > config.refine.max_sigma_m

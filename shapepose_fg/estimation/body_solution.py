@@ -76,7 +76,7 @@ def solve_bodies(
     sigmas = sigmas * np.sqrt(ratio)
     evidence = linearise(observations, sigmas, X, views, gates)
     enough = (evidence.sigma_m <= config.refine.max_sigma_m).sum(axis=1) >= LEAST_JOINTS
-    start = fitter.fit_whole(joint_targets(evidence, enough))
+    start = fitter.fit(joint_targets(evidence, enough))
     # Where it rejects some detections of a joint, the others are less certain, too.
     kept = evidence.inlier.sum(axis=-1) / np.maximum(observations.seen.sum(axis=-1), 1)
     sigmas = np.where(evidence.inlier, sigmas / np.maximum(kept, 1e-9)[..., None], 0.0)

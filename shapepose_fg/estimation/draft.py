@@ -85,7 +85,7 @@ def draft(
         rows = rows[(reach_m == NARROWING_M[-1]) | ~near[rows]]
         if len(rows) == 0:
             continue
-        again = fitter.fit_whole(targets.rows(rows))
+        again = fitter.fit(targets.rows(rows))
         fitted.put(rows, targets.rows(rows))
         placed = np.flatnonzero(again.ok)
         body.put(rows[placed], again.rows(placed))

@@ -102,7 +102,7 @@ class Newest:
         covariance = joints.covariance[..., :3, :3].copy()
         information = np.zeros_like(covariance)
         information[known] = np.linalg.inv(covariance[known])
-        fit = self.fitter.fit_whole(
+        fit = self.fitter.fit(
             JointTargets(np.where(known[..., None], joints.position, 0.0), information)
         )
         of_body = fit.covariance + MODEL_SIGMA_M**2 * np.eye(3) + _FORGOTTEN * covariance

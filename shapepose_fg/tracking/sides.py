@@ -267,7 +267,7 @@ def _likeness(places: Array, sigma_m: Array, fitter: BodyFitter | None) -> Array
         return np.zeros((N, S))
     known = sigma_m < LOST_M
     information = (known / np.square(sigma_m))[..., None, None] * np.eye(3)
-    fit = fitter.fit_whole(JointTargets(places.reshape(-1, J, 3), information.reshape(-1, J, 3, 3)))
+    fit = fitter.fit(JointTargets(places.reshape(-1, J, 3), information.reshape(-1, J, 3, 3)))
     squared = np.square(fit.joints.reshape(places.shape) - places).sum(axis=-1)
     squared = np.nan_to_num(squared / (np.square(sigma_m) + MODEL_SIGMA_M**2), nan=_FARTHEST)
     return -np.where(known, np.minimum(squared, _FARTHEST), 0.0).sum(axis=-1) / 2

@@ -16,6 +16,7 @@ from shapepose_fg.body.fitting.fitter import (
     JointTargets,
     SequenceFit,
     Shapes,
+    check_groups,
 )
 from shapepose_fg.body.fitting.fitters import SmplFitter, make_fitter
 from shapepose_fg.body.fitting.priors import PosePrior
@@ -299,3 +300,11 @@ def test_misuse_is_told(fitter, targets):
         Shapes(np.zeros((2, 10)), np.eye(10))
     with pytest.raises(ValueError, match="gap_s must be positive"):
         BodyConfig(gap_s=0)
+
+
+@pytest.mark.parametrize(
+    "groups", [[0, 1], [[0], [1], [2]], [0.0, 1.0, 2.0], ["a", "b", "c"], [True] * 3]
+)
+def test_groups_that_are_not_one_number_a_row_are_refused(groups):
+    with pytest.raises(ValueError, match="groups must be 3 whole numbers"):
+        check_groups(np.array(groups), 3)

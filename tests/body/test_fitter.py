@@ -151,7 +151,7 @@ def test_degenerate_rows_get_a_name_and_no_nan_in_parameters(fitter, joints):
     assert fit.status.tolist() == [*expected, FitStatus.OK, FitStatus.OK]
     for name in ("betas", "global_orient", "body_pose", "transl"):
         assert not np.any(getattr(fit, name)[:8])
-    for name in ("joints", "covariance", "prior_xyz", "prior_covariance", "residual_m"):
+    for name in ("joints", "covariance", "residual_m"):
         assert np.isnan(getattr(fit, name)[:8]).all()
         assert np.isfinite(getattr(fit, name)[8:]).all()
     assert distance_mm(fit.joints[8:], fitter.fit(good).joints).max() < 1
@@ -221,12 +221,8 @@ def test_warm_start_is_quicker_and_ends_at_the_same_place(joints, monkeypatch):
     cold_evaluations = evaluations.copy()
     evaluations.clear()
     warm = fitter.fit(targets, initial=first)
-    # All 48 rows are solved at once; the passes that leave targets out come after, and always start
-    # cold.
-    assert evaluations[0] < 0.7 * cold_evaluations[0]
-    assert evaluations[1:] == cold_evaluations[1:]
+    assert sum(evaluations) < 0.7 * sum(cold_evaluations)
     assert np.quantile(distance_mm(warm.joints, cold.joints), 0.95) < 1
-    np.testing.assert_allclose(warm.prior_xyz, cold.prior_xyz, atol=1e-9)
 
 
 def test_rows_without_an_earlier_body_start_afresh(fitter, joints):

@@ -71,13 +71,11 @@ def test_where_it_is_held_it_is_not_pulled(energy, free):
 
 def test_settled_shapes_stay_and_poses_go_on(energy, targets, free, held):
     betas = draw(ROWS, 10, seed=5)
-    settled = held.at_shape(betas, np.array([True, True, False]))
+    settled = Held(betas, np.full(ROWS, SETTLED), held.angles)
     start = np.concatenate((betas, free[:, 10:]), 1)
     here = energy.linearise(start, targets, SCALE, settled)
-    step = -np.linalg.solve(here.hessian, here.gradient[..., None])[:2, :, 0]
+    step = -np.linalg.solve(here.hessian, here.gradient[..., None])[..., 0]
     assert np.abs(step[:, :10]).max() < 1e-3 < np.abs(step[:, 10:]).max()
-    np.testing.assert_array_equal(settled.stiffness, [SETTLED, SETTLED, held.stiffness[2]])
-    np.testing.assert_array_equal(settled.betas[2], held.betas[2])
 
 
 def test_a_step_moves_rows_and_keeps_their_linearisation(energy, targets, free, held):

@@ -1,4 +1,4 @@
-"""The learned fitter with the weights that ship: errors, independence, groups, offsets, bad input.
+"""The learned fitter with the weights that ship: errors, independence, offsets, bad input.
 
 Bounds on errors leave room for other weights: they say that the fitter works, `docs/evaluation.md`
 how well.
@@ -117,7 +117,6 @@ def test_a_world_turned_and_moved_has_the_same_bodies_turned_and_moved(fitter, u
     moved = fitter.fit(JointTargets(uneven.xyz @ R.T + t, R @ uneven.information @ R.T))
     # Single precision within a metre of each person, 1e-6 m, times a condition of 100 at most.
     np.testing.assert_allclose(moved.joints, fit.joints @ R.T + t, atol=1e-4)
-    np.testing.assert_allclose(moved.prior_xyz, fit.prior_xyz @ R.T + t, atol=1e-4)
     np.testing.assert_allclose(moved.betas, fit.betas, atol=1e-3)
     np.testing.assert_allclose(moved.body_pose, fit.body_pose, atol=1e-3)
     np.testing.assert_allclose(moved.covariance, R @ fit.covariance @ R.T, atol=1e-5)
@@ -151,7 +150,6 @@ def test_missing_joints_are_filled_in_and_known_to_be_guesses(fit, joints):
     sigma = np.sqrt(np.trace(fit.covariance, axis1=-2, axis2=-1) / 3)[::3]
     assert (sigma[:, WRIST] > 3 * sigma[:, BODY_25.index("LWrist")]).all()
     assert np.linalg.eigvalsh(fit.covariance).min() > 0
-    assert np.linalg.eigvalsh(fit.prior_covariance).min() > 0
 
 
 def test_beliefs_about_missing_joints_are_as_wide_as_the_weights_say(shipped_weights, uneven):
@@ -160,9 +158,6 @@ def test_beliefs_about_missing_joints_are_as_wide_as_the_weights_say(shipped_wei
     hidden = ~uneven.information.any(axis=(-1, -2))
     np.testing.assert_allclose(wide.covariance[hidden], 4 * narrow.covariance[hidden], rtol=1e-9)
     np.testing.assert_array_equal(wide.covariance[~hidden], narrow.covariance[~hidden])
-    model_error = 0.02**2 * np.eye(3)  # is no belief about the body
-    expected = 4 * (narrow.prior_covariance - model_error) + model_error
-    np.testing.assert_allclose(wide.prior_covariance, expected, rtol=1e-9, atol=1e-12)
     np.testing.assert_array_equal(wide.joints, narrow.joints)
 
 
@@ -214,52 +209,6 @@ def test_no_rows_give_no_bodies(fitter):
     assert len(fit) == 0 and fit.joints.shape == (0, 25, 3)
 
 
-def test_rows_of_one_person_share_a_shape_that_is_nearer_to_the_true_one(fitter):
-    people, rows = 8, 6
-    bodies = draw_bodies(people, rows)
-    truth = BodyModel.default().keypoints(bodies)
-    targets = known_to(truth + np.random.default_rng(1).normal(0, 0.01, truth.shape), 0.01)
-    alone = fitter.fit(targets)
-    order = np.random.default_rng(2).permutation(
-        people * rows
-    )  # rows of a person need not lie together
-    shuffled = JointTargets(targets.xyz[order], targets.information[order])
-    together = fitter.fit(shuffled, groups=order // rows * 7 - 3).rows(np.argsort(order))
-    shapes = together.betas.reshape(people, rows, 10)
-    ok = (alone.ok & together.ok).reshape(people, rows)
-    assert ok.mean() > 0.9
-    spread = np.array([np.ptp(shapes[p][ok[p]], axis=0).max() for p in range(people)])
-    # Held by a precision of 1e6, against some hundreds of what a row's joints say; alone they
-    # differ by ones.
-    assert spread.max() < 1e-3
-    error = [
-        np.linalg.norm(f.betas - bodies.betas, axis=1)[ok.ravel()].mean() for f in (alone, together)
-    ]
-    # 2.6 and 2.1: joints tell little of girth; those directions stay near zero, as they must.
-    assert error[1] < 0.9 * error[0]
-
-
-def test_groups_are_checked_even_where_nothing_can_be_fitted(fitter, joints):
-    nothing = JointTargets(joints[:3], np.zeros((3, 25, 3, 3)))
-    for groups in (np.zeros(2, dtype=int), np.zeros(3), np.zeros((3, 1), dtype=int)):
-        with pytest.raises(ValueError, match="groups must be 3 whole numbers"):
-            fitter.fit(nothing, groups=groups)
-
-
-def test_a_person_with_bad_rows_keeps_the_shape_of_the_good_ones(fitter, joints):
-    targets = known_to(joints[:4], 0.01)
-    information = targets.information.copy()
-    information[1] = 0
-    fit = fitter.fit(JointTargets(targets.xyz, information), groups=np.array([0, 0, 0, 1]))
-    assert fit.status.tolist() == [
-        FitStatus.OK,
-        FitStatus.TOO_FEW_JOINTS,
-        FitStatus.OK,
-        FitStatus.OK,
-    ]
-    np.testing.assert_allclose(fit.betas[0], fit.betas[2], atol=1e-3)
-
-
 def test_a_detector_that_puts_joints_elsewhere_is_followed(fitter, shipped_weights, joints):
     offsets = KeypointOffsets.symmetric({"LHip": (0.05, 0.06, 0.0), "LAnkle": (0.0, 0.0, -0.05)})
     elsewhere = fitter.with_keypoint_offsets(offsets)
@@ -296,12 +245,3 @@ def test_misuse_is_refused(fitter, joints):
         fitter.fit(known_to(joints[:, :17], 0.01))
     with pytest.raises(ValueError, match="polish_steps must not be negative"):
         BodyConfig(polish_steps=-1)
-
-
-def test_a_row_alone_in_its_group_is_as_unsure_as_without_groups(fitter, joints):
-    targets = known_to(joints[:4], 0.01)
-    alone, grouped = fitter.fit(targets), fitter.fit(targets, groups=np.arange(4))
-    np.testing.assert_allclose(grouped.joints, alone.joints, atol=2e-3)  # one more polishing step
-    # A settled shape would take 5 % off every joint; the extra step moves entries of (3 mm)² by a
-    # tenth of that.
-    np.testing.assert_allclose(grouped.covariance, alone.covariance, rtol=0.02, atol=2e-6)

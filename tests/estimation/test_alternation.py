@@ -51,7 +51,6 @@ class FakeFitter(BodyFitter):
         self,
         targets: JointTargets,
         initial: BodyFit | None = None,
-        groups: NDArray[np.intp] | None = None,
     ) -> BodyFit:
         self.targets.append(targets)
         self.initials.append(initial)

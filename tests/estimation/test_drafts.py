@@ -78,12 +78,9 @@ class Counting(BodyFitter):
     def __init__(self, fitter) -> None:
         self.fitter, self.rows = fitter, []
 
-    def fit(self, targets, initial=None, groups=None):
-        return self.fitter.fit(targets, initial, groups)
-
-    def fit_whole(self, targets, initial=None):
+    def fit(self, targets, initial=None):
         self.rows.append(len(targets))
-        return self.fitter.fit_whole(targets, initial)
+        return self.fitter.fit(targets, initial)
 
 
 def test_bodies_are_fitted_again_only_where_their_targets_have_changed(fitter, monkeypatch):

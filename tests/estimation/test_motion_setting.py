@@ -22,7 +22,7 @@ from shapepose_fg.simulation import built_in_scene, simulate
 class NoFitter(BodyFitter):
     """Nobody has a body."""
 
-    def fit(self, targets, initial=None, groups=None):
+    def fit(self, targets, initial=None):
         return BodyFit.failed(np.full(len(targets), FitStatus.TOO_FEW_JOINTS), targets.xyz.shape[1])
 
 

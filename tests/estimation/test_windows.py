@@ -29,21 +29,15 @@ WRIST, OTHER_WRIST, NOSE = (BODY_25.index(name) for name in ("RWrist", "LWrist",
 
 
 class BesideFitter(BodyFitter):
-    """Puts each row's body where the seen joints are, moved by `beside` (3,) metres; remembers what
-    it was asked.
-    """
+    """Puts each row's body where the seen joints are, moved by `beside` (3,) metres."""
 
     def __init__(
         self, shape: NDArray[np.float64], beside=(0.0, 0.0, 0.0), sigma_m: float = 0.1
     ) -> None:
         self.shape, self.beside, self.sigma_m = shape, np.array(beside), sigma_m
-        self.groups: list[NDArray[np.intp] | None] = []
-        self.without: list[set[int]] = []
 
-    def fit(self, targets, initial=None, groups=None) -> BodyFit:
-        self.groups.append(groups)
+    def fit(self, targets, initial=None) -> BodyFit:
         seen = targets.information.any(axis=(2, 3))
-        self.without.append(set(np.flatnonzero(~seen.any(axis=0)).tolist()))
         ok = seen.sum(axis=1) >= 4
         apart = np.where(seen[..., None], targets.xyz - self.shape, 0.0).sum(axis=1)
         moved = apart / np.maximum(seen.sum(axis=1), 1)[:, None]
@@ -62,7 +56,7 @@ class BesideFitter(BodyFitter):
 class NobodyFitter(BodyFitter):
     """Fits no body to anybody."""
 
-    def fit(self, targets, initial=None, groups=None) -> BodyFit:
+    def fit(self, targets, initial=None) -> BodyFit:
         return BodyFit.failed(np.full(len(targets), FitStatus.TOO_FEW_JOINTS), targets.xyz.shape[1])
 
 

@@ -32,7 +32,7 @@ class OneBody(BodyFitter):
     def __init__(self, joints, sigma_m=0.1):
         self.joints, self.sigma_m, self.targets = joints, sigma_m, []
 
-    def fit(self, targets, initial=None, groups=None) -> BodyFit:
+    def fit(self, targets, initial=None) -> BodyFit:
         self.targets.append(targets)
         N, J = targets.xyz.shape[:2]
         covariance = np.tile(self.sigma_m**2 * np.eye(3), (N, J, 1, 1))

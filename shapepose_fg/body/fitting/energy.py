@@ -52,13 +52,6 @@ class Held(FitRows):
     angles: Array
     """(B, A) centre of the pose prior in the free angles, rad."""
 
-    def at_shape(self, betas: Array, settled: Mask) -> "Held":
-        """Return these priors with shapes practically fixed at `betas` (B, 10) in `settled` rows
-        (B,).
-        """
-        stiffness = np.where(settled, SETTLED, self.stiffness)
-        return Held(np.where(settled[:, None], betas, self.betas), stiffness, self.angles)
-
 
 def robust_cost(squared: Array, scale: float) -> Array:
     """Geman-McClure cost c² s / (c² + s), bounded by c²."""

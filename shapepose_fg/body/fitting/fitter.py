@@ -162,11 +162,6 @@ class BodyFit(Rows):
     """(B, J, 3) the body's own joints in the detector's skeleton, world, metres."""
     covariance: Array
     """(B, J, 3, 3) covariance of `joints` given all targets, m² (Laplace)."""
-    prior_xyz: Array
-    """(B, J, 3) prediction of each joint by the body *without* that joint's own target, metres."""
-    prior_covariance: Array
-    """(B, J, 3, 3) covariance of this prediction of the detector's joint, including the model's
-    error, m²."""
     residual_m: Array
     """(B,) weighted root mean square distance of the joints to their targets, metres; NaN where not
     OK."""
@@ -182,7 +177,7 @@ class BodyFit(Rows):
     def failed(cls, status: NDArray[np.str_], num_joints: int) -> "BodyFit":
         """Rows without a body: zero parameters, NaN joints, a copy of the given `status` (B,)."""
         B, J = len(status), num_joints
-        zeros, unknown = ((10,), (3,), (23, 3), (3,)), ((J, 3), (J, 3, 3), (J, 3), (J, 3, 3), ())
+        zeros, unknown = ((10,), (3,), (23, 3), (3,)), ((J, 3), (J, 3, 3), ())
         columns = [np.zeros((B, *shape)) for shape in zeros] + [
             np.full((B, *shape), np.nan) for shape in unknown
         ]
@@ -227,8 +222,7 @@ class SequenceFit:
 
     fit: BodyFit
     """The bodies. `covariance` is from a row's own targets, given the shape of its group:
-    correlated errors are not averaged out. `prior_xyz` and `prior_covariance` are NaN; only `fit`
-    computes them."""
+    correlated errors are not averaged out."""
     groups: Index
     """(G,) the groups, in order."""
     shapes: Shapes
@@ -245,19 +239,11 @@ class BodyFitter(ABC):
     time."""
 
     @abstractmethod
-    def fit(
-        self, targets: JointTargets, initial: BodyFit | None = None, groups: Index | None = None
-    ) -> BodyFit:
-        """Fit a body to every row of `targets`.
+    def fit(self, targets: JointTargets, initial: BodyFit | None = None) -> BodyFit:
+        """Fit a body to every row of `targets`; rows must not influence each other.
 
-        `initial` has one row per target; the fit may start at its OK rows. `groups` (B,) are
-        integers: rows with the same number are one person and get one shape. Otherwise rows are
-        independent.
+        `initial` has one row per target; the fit may start at its OK rows.
         """
-
-    def fit_whole(self, targets: JointTargets, initial: BodyFit | None = None) -> BodyFit:
-        """Fit as `fit` does, but faster: `prior_xyz` and `prior_covariance` may be NaN."""
-        return self.fit(targets, initial)
 
     def with_keypoint_offsets(self, offsets: "KeypointOffsets") -> "BodyFitter":
         """Return a fitter for a detector whose joints have these offsets from the body's."""

@@ -1,7 +1,7 @@
 """Optimisers of single rows: network steps with a polish, or Levenberg-Marquardt.
 
-Both have `arrive`, which computes a solution, `evaluated`, which completes it cheaply, and `again`,
-which continues under other priors. Rows are independent.
+Both have `arrive`, which computes a solution, and `evaluated`, which completes it. Rows are
+independent.
 """
 
 import numpy as np
@@ -97,15 +97,8 @@ class NetworkDescent:
     def evaluated(
         self, free: Array, targets: EnergyTargets, held: Held, asked: Index | None = None
     ) -> Evaluated:
-        """The polished bodies of `arrive` (B, P), with the energy and the keypoints `asked`
-        (default: all).
-        """
-        return self.again(free, targets, held, asked)
-
-    def again(
-        self, free: Array, targets: EnergyTargets, held: Held, asked: Index | None = None
-    ) -> Evaluated:
-        """Gauss-Newton steps from `free` (B, P); a step that does not lower a row's energy is
+        """The bodies of `arrive` (B, P), polished by Gauss-Newton steps, with the energy and the
+        keypoints `asked` (default: all); a step that does not lower a row's energy is
         rejected.
 
         The energy is linearised before each step. After the last, it is linearised only for rows in
@@ -166,13 +159,6 @@ class LevenbergMarquardt:
         (default: all).
         """
         return self._energy.evaluate(free, targets, self._scale, held, asked)
-
-    def again(
-        self, free: Array, targets: EnergyTargets, held: Held, asked: Index | None = None
-    ) -> Evaluated:
-        """The optimum from `free` (B, P), under other priors."""
-        free = self.solve(free, targets, np.ones(len(free), dtype=bool), held)
-        return self.evaluated(free, targets, held, asked)
 
     def solve(self, free: Array, targets: EnergyTargets, warm: Mask, held: Held) -> Array:
         """Minimise from `free` (B, P); converged rows leave the batch. Returns (B, P)."""

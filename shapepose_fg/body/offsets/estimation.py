@@ -81,12 +81,12 @@ def learn_offsets(
     model, fit = model.with_keypoint_offsets(_made(np.zeros(75), precision, np.zeros(25))), None
     for _ in range(prior.rounds):
         fitter = SmplFitter(model, wide, config)
-        fit = fitter.fit_whole(targets, fit)
+        fit = fitter.fit(targets, fit)
         sizes = Sizes.of(model)
         far = sizes.far(fit.betas)
         if np.count_nonzero(far) > _MANY * len(far):
             targets = targets.larger(np.where(far, 1 / sizes.ratio(fit.betas), 1.0))
-            fit = fitter.fit_whole(targets)
+            fit = fitter.fit(targets)
         if not fit.ok.any():
             break
         energy = BodyEnergy(model, wide)
