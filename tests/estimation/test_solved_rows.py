@@ -27,7 +27,7 @@ def test_every_column_is_of_the_same_row(five_cameras, two_people):
     )
     fit = BodyFit(
         rng.normal(size=(N, 10)), rng.normal(size=(N, 3)), rng.normal(size=(N, 23, 3)),
-        rng.normal(size=(N, 3)), joints, spread(J), joints, spread(J), rng.random(N),
+        rng.normal(size=(N, 3)), joints, spread(J), rng.random(N),
         np.array([FitStatus.OK, FitStatus.TOO_FEW_JOINTS, FitStatus.OK, FitStatus.OK]),
     )  # fmt: skip
     known = rng.choice([Known.SEEN, Known.WEAK, Known.BODY, Known.MOTION], (N, J)).astype(np.uint8)
