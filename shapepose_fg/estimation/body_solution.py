@@ -93,6 +93,7 @@ def solve_bodies(
             continue
         given = observations.rows(rows), sigmas[rows], views.rows(rows)
         window = Model(*given, fitter.model, gates, motion, config.law)
+        window.variance /= config.graph.weight_shape
         free = window.energy.parameters(start.rows(rows), np.zeros((len(rows), 3)))
         free = _filled(free, start.ok[rows], window.times_s) if over_time else free
         try:

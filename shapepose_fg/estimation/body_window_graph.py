@@ -163,7 +163,7 @@ class BodyGraph(PersonWindow):
         """
         bodies = np.array([values.atVector(key) for key in self.body_keys.tolist()])
         others = bodies[:, 3:].copy()
-        others[:, -3:] -= self.window.origin
+        others[:, -3:] -= self.window.origin.reshape(-1, 3)
         zero = np.zeros((*self.keys.shape, 3))
         root = exp_so3(bodies[:, :3]) @ self._upright
         betas = values.atVector(self.shape_key).reshape(self.state.betas.shape)
@@ -200,7 +200,7 @@ class BodyGraph(PersonWindow):
     def _bodies(self) -> Array:
         """(T, N) values of the bodies."""
         turn, others = log_so3(self.state.root @ self._upright.mT), self.state.others.copy()
-        others[:, -3:] += self.window.origin
+        others[:, -3:] += self.window.origin.reshape(-1, 3)
         return np.concatenate([turn, others], axis=1)
 
     def turns(self) -> Array:

@@ -91,11 +91,13 @@ class WindowConfig(Settings):
 
 @dataclass(frozen=True)
 class SolvingConfig(Settings):
-    """How bodies and joints alternate (Algorithm 1), and the weight of the body."""
+    """The weight of the body, the motion model, and how bodies and joints alternate where they do
+    (Algorithm 1).
+    """
 
     alternations: Repeats = 3
-    """N of Algorithm 1 frame by frame: maximum number of times that the body is fitted and the
-    joints are solved. Most frames converge after one or two; the paper has 10."""
+    """N of Algorithm 1, for the paper's preset, which has 10, and fitters without a body model:
+    maximum number of times that the body is fitted and the joints are solved."""
     weight_shape: Factor = 1.0
     """w_shape of Eq. 5, multiplies the squared distances to the body model: decrease it for people
     whom it does not fit, in wide clothes or with a load."""
