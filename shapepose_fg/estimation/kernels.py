@@ -15,8 +15,6 @@ from shapepose_fg.core.kernel_geometry import ROBUST, add_view, project, robust_
 _GEMAN_MCCLURE = ROBUST["geman_mcclure"]
 _SINGULAR = 1e-11
 """Relative size of a pivot below which it is rounding: the state is undetermined."""
-_FARTHEST_M = 1e6
-"""Length of a step, m, above which it is rejected, as is NaN."""
 
 
 def ready(values: Array) -> Array:
@@ -24,23 +22,6 @@ def ready(values: Array) -> Array:
     compile them again.
     """
     return np.require(values, np.float64, ("C", "W"))
-
-
-@part
-def _add_velocity(camera, u, v, depth, to_u, to_v, weight, lead, information, gradient):
-    """Add the terms of velocity v that `add_view` omits, if the pixel is of x + lead v."""
-    for a in range(3):
-        ua, va = (
-            (camera[0, a] - u * camera[2, a]) / depth,
-            (camera[1, a] - v * camera[2, a]) / depth,
-        )
-        gradient[3 + a] += lead * weight * (ua * to_u + va * to_v)
-        for b in range(3):
-            ub, vb = camera[0, b] - u * camera[2, b], camera[1, b] - v * camera[2, b]
-            square = lead * weight * (ua * ub + va * vb) / depth
-            information[a, 3 + b] += square
-            information[3 + a, b] += square
-            information[3 + a, 3 + b] += lead * square
 
 
 @kernel("f4 f2 f4 f3 f0 f0 f0 f3")
@@ -136,39 +117,6 @@ def look(
 
 
 @part
-def _normal(state, joint, diagonal, right, cameras, xy, weight, lead, robust, width, H, g, at):
-    """Linearise one chain at `state` (T, d): diagonal blocks H (T, d, d), and right side g. `at`
-    (3,) is workspace.
-    """
-    T, d = state.shape
-    for t in range(T):
-        for a in range(d):
-            g[t, a] = right[t, a]
-            for b in range(d):
-                H[t, a, b] = diagonal[t, a, b]
-        for n in range(weight.shape[2]):
-            camera, w = cameras[t if cameras.shape[0] > 1 else 0, n], weight[t, joint, n]
-            if w > 0.0:
-                later = lead[t, joint, n]
-                for a in range(3):
-                    at[a] = state[t, a]
-                    if later != 0.0:
-                        at[a] += later * state[t, 3 + a]
-                u, v, depth = project(camera, at)
-                if depth > 0.0:
-                    off_u, off_v = u - xy[t, joint, n, 0], v - xy[t, joint, n, 1]
-                    w *= robust_weight(
-                        robust, (off_u * off_u + off_v * off_v) * w / (width * width)
-                    )
-                    # J x directly, as the derivative of a quotient.
-                    at_u = (u * camera[2, 3] - camera[0, 3]) / depth - off_u
-                    at_v = (v * camera[2, 3] - camera[1, 3]) / depth - off_v
-                    add_view(camera, u, v, depth, at_u, at_v, w, H[t], g[t])
-                    if later != 0.0:
-                        _add_velocity(camera, u, v, depth, at_u, at_v, w, later, H[t], g[t])
-
-
-@part
 def _factored(H, below, Z):
     """Block Cholesky of a chain, in place: H_t = L_t L_t^T, Z_t = L_t^-1 B_t^T. Returns False if it
     is singular.
@@ -208,7 +156,7 @@ def _factored(H, below, Z):
 @part
 def _solve(H, Z, g, x):
     """Solve with blocks of `_factored` and the right side `g` (T + 1, d), overwritten, and store
-    the solution in `x` (T, d) if it is close; returns the largest motion of a position, metres.
+    the solution in `x` (T, d).
     """
     T, d = x.shape
     for t in range(T):
@@ -219,7 +167,6 @@ def _solve(H, Z, g, x):
             for a in range(k):
                 total -= H[t, k, a] * g[t, a]
             g[t, k] = total / H[t, k, k]
-    farthest = 0.0
     for t in range(T - 1, -1, -1):
         for k in range(d - 1, -1, -1):
             total = g[t, k]
@@ -227,15 +174,7 @@ def _solve(H, Z, g, x):
                 total -= Z[t, k, a] * g[t + 1, a]
             for a in range(k + 1, d):
                 total -= H[t, a, k] * g[t, a]
-            g[t, k] = total / H[t, k, k]
-            if k < 3 and not abs(g[t, k] - x[t, k]) <= farthest:
-                farthest = abs(g[t, k] - x[t, k])
-    if not farthest < _FARTHEST_M:
-        return 0.0
-    for t in range(T):
-        for k in range(d):
-            x[t, k] = g[t, k]
-    return farthest
+            x[t, k] = g[t, k] = total / H[t, k, k]
 
 
 @part
@@ -273,65 +212,30 @@ def _marginals(H, Z, M, G, S, covariance):
                 covariance[t, a, b] = S[a, b]
 
 
-@kernel("f3 i1 f4 f4 f3 f4 f4 f3 f3 i0 f0 i0 f0 f4")
-def solve_chains(
-    states,
-    joints,
-    diagonal,
-    below,
-    right,
-    cameras,
-    xy,
-    weight,
-    lead,
-    robust,
-    width,
-    steps,
-    tolerance,
-    covariance,
-):
-    """Gauss-Newton of C independent chains, in place, and marginal `covariance` (C, T, d, d) at the
-    end, or for the first chains only (0, ...): NaN for singular chains, which are not moved.
+@kernel("f4 f4 f3 f3 f4")
+def solve_chains(diagonal, below, right, states, covariance):
+    """The `states` (C, T, d) of C independent chains, and their marginal `covariance` (C, T, d, d),
+    or of the first chains only (0, ...): NaN for singular chains.
 
     A chain's cost is x^T H x / 2 - right^T x, with H block tridiagonal of `diagonal` (C, T, d, d)
-    and `below` (C, T - 1, d, d), plus robust reprojection errors of its first three numbers: `xy`
-    (T, J, V, 2), `weight` (T, J, V) 1/sigma² or 0, `lead` (T, J, V) exposure times relative to the
-    state, seconds, with the velocity in its next three numbers. `states` (C, T, d) are of the
-    `joints` (C,). There are at most `steps`, until one moves no position by more than `tolerance`
-    metres; with 0 only covariances are computed. Robust weights are those of the step before, so
-    that steps do not increase the cost, except by the curvature of the projection.
+    and `below` (C, T - 1, d, d).
     """
     C, T, d = states.shape
     # Zeros at the end of Z and g stand for the missing neighbours of the first and last state.
     H, Z, g = np.empty((T, d, d)), np.zeros((T, d, d)), np.zeros((T + 1, d))
-    M, G, S, at = np.empty((d, d)), np.empty((2, d, d)), np.zeros((d, d)), np.empty(3)
+    M, G, S = np.empty((d, d)), np.empty((2, d, d)), np.zeros((d, d))
     for c in range(C):
-        x, linked = states[c], below[c]
-        moved, n, regular = 0.0, 0, True
-        while regular and n <= steps and (n == 0 or moved > tolerance):
-            _normal(
-                x,
-                joints[c],
-                diagonal[c],
-                right[c],
-                cameras,
-                xy,
-                weight,
-                lead,
-                robust,
-                width,
-                H,
-                g,
-                at,
-            )
-            regular = _factored(H, linked, Z)
-            if regular and n < steps:
-                moved = _solve(H, Z, g, x)
-            n += 1
+        for t in range(T):
+            for a in range(d):
+                g[t, a] = right[c, t, a]
+                for b in range(d):
+                    H[t, a, b] = diagonal[c, t, a, b]
+        regular = _factored(H, below[c], Z)
+        if regular:
+            _solve(H, Z, g, states[c])
+        else:
+            states[c, :, :] = np.nan
         if regular and c < len(covariance):
             _marginals(H, Z, M, G, S, covariance[c])
         elif c < len(covariance):
-            for t in range(T):
-                for a in range(d):
-                    for b in range(d):
-                        covariance[c, t, a, b] = np.nan
+            covariance[c, :, :, :] = np.nan

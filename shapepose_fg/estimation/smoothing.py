@@ -47,24 +47,14 @@ def smoothed(
     )
     density = motion.density(np.maximum(speed, SPEED_M_S), turning=turning).reshape(T - 1, C)
     moving, below = motion_information(motion.law, np.diff(times), density)
-    unseen = (
-        np.zeros((1, 0, 3, 4)),
-        np.zeros((T, 1, 0, 2)),
-        np.zeros((T, 1, 0)),
-        np.zeros((T, 1, 0)),
-        0,
-        1.0,
-    )
     n, weight, mean, of_mean = motion.law.order, information, place, 1.0 / information
     for _ in range(_ROUNDS):
         diagonal, right = moving.copy(), np.zeros((3, C, T, n))
         diagonal[..., 0, 0] += weight
         right[..., 0] = np.moveaxis(place * weight[..., None], -1, 0)
-        states, spread = np.zeros((3 * C, T, n)), np.empty((C, T, n, n))
-        solve_chains(
-            states, np.zeros(3 * C, dtype=np.intp), np.tile(diagonal, (3, 1, 1, 1)),
-            np.tile(below, (3, 1, 1, 1)), right.reshape(states.shape), *unseen, 1, np.inf, spread,
-        )  # fmt: skip
+        states, spread = np.empty((3 * C, T, n)), np.empty((C, T, n, n))
+        diagonal, below_each = np.tile(diagonal, (3, 1, 1, 1)), np.tile(below, (3, 1, 1, 1))
+        solve_chains(diagonal, below_each, right.reshape(states.shape), states, spread)
         mean, of_mean = np.moveaxis(states.reshape(right.shape)[..., 0], 0, -1), spread[..., 0, 0]
         apart = ((place - mean) ** 2).sum(axis=-1) / (of_mean + 1.0 / information)
         weight = information / (1 + apart / KERNEL)
