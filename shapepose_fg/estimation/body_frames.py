@@ -86,7 +86,9 @@ class BodyFrames(BodyWindow):
         for at in np.arange(len(self))[:, None]:
             names = ("poses", "steps", "shape", "across")
             parts = (getattr(marginals, name)[at] for name in names)
-            found.append((at, Marginals(self.rows(at), marginals.state.rows(at), *parts)))
+            one = Marginals(self.rows(at), marginals.state.rows(at), *parts)
+            vars(one).update(of_bodies=marginals.of_bodies[at])  # computed for all at once
+            found.append((at, one))
         return found
 
     def take(self, state: BodyState, shape: Array, pose: Array) -> BodyState:

@@ -2,6 +2,7 @@
 bodies.
 """
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -88,7 +89,9 @@ def solve_bodies(
     feet = feet_of(config.joints if config.motion.contact else ())
     over_time = len(np.unique(observations.track)) < len(observations)
     Model = BodyWindow if over_time else BodyFrames
-    for rows in window_rows(observations) if over_time else [np.flatnonzero(start.ok)]:
+    parts = deque(window_rows(observations) if over_time else [np.flatnonzero(start.ok)])
+    while parts:
+        rows = parts.popleft()
         if not start.ok[rows].any():
             continue
         given = observations.rows(rows), sigmas[rows], views.rows(rows)
@@ -103,9 +106,12 @@ def solve_bodies(
             state = window.take(state, *gtsam_step(window, state))
             marginals = window.covariances(state)
         except np.linalg.LinAlgError:
+            if not over_time and len(rows) > 1:  # one of them
+                parts.extend(rows[:, None])
             continue
         # All covariances of a graph grow by one factor, by which neither solution nor gates change:
-        # over time with the noise of the recording's detector and its lasting errors.
+        # over time with the noise of the recording's detector and its lasting errors, in single
+        # frames with doubt about whose detections they are.
         widen = [noisy * marginals.lasting()] if over_time else doubts(marginals)
         for (place, each), factor in zip(window.apart(marginals), widen, strict=True):
             own = rows[place]

@@ -5,11 +5,16 @@ import numpy as np
 import pytest
 
 from factors import CONSTANT_VELOCITY
+from shapepose_fg.core.reconstruction import Status
+from shapepose_fg.estimation import body_solution
 from shapepose_fg.estimation.body_frames import BodyFrames, Doubt, doubts, signs_of_doubt
 from shapepose_fg.estimation.body_window import BodyState, BodyWindow
 from shapepose_fg.estimation.body_window_graph import BodyGraph
 from shapepose_fg.estimation.condensed_graph import gtsam_step
 from shapepose_fg.estimation.motion_model import MotionModel
+from shapepose_fg.pipeline.config import PipelineConfig
+from shapepose_fg.pipeline.pipeline import reconstruct
+from shapepose_fg.simulation import built_in_scene, simulate
 from tests.estimation.test_body_window import T, _person
 
 WRIST = 4
@@ -106,3 +111,24 @@ def test_a_body_that_counts_less_leaves_joints_to_their_views() -> None:
         window.observations.xy[:, WRIST] += 8.0
         away.append(np.linalg.norm(solved(window, start).deviation[:, WRIST], axis=-1).mean())
     assert away[1] > 1.5 * away[0]
+
+
+def test_a_batch_that_cannot_be_solved_is_solved_row_by_row(monkeypatch) -> None:
+    """A singular system of one row takes nobody else's body away."""
+    scene = built_in_scene(2, people=2, frames=3, cameras=4)
+    detections = simulate(scene)
+
+    def reconstructed():
+        return reconstruct(detections, scene.rig, PipelineConfig(temporal=False))
+
+    usual = reconstructed()
+
+    def one_at_a_time(window, state):
+        if len(window) > 1:
+            raise np.linalg.LinAlgError("singular")
+        return gtsam_step(window, state)
+
+    monkeypatch.setattr(body_solution, "gtsam_step", one_at_a_time)
+    found = reconstructed()
+    assert (found.status == usual.status).all() and (found.status == Status.OK).all()
+    np.testing.assert_allclose(found.joints, usual.joints, atol=1e-4)
