@@ -164,8 +164,8 @@ def out_of_step(scene, sub: int, places: list[int]) -> tuple[Recording, Recordin
 
 @pytest.mark.slow
 def test_cameras_out_of_step_are_as_good_as_in_step():
-    """Dancers at 8 Hz by four cameras up to 94 ms apart: in four scenes 7 to 11 % more than in step,
-    and 7 to 15 % less than if it is ignored.
+    """Dancers at 8 Hz by four cameras up to 94 ms apart: in four scenes 7 to 11 % more than in
+    step, and 7 to 15 % less than if it is ignored.
     """
     sub, places = 8, [0, 6, 2, 4]
     scene = built_in_scene(seed=4, people=2, cameras=4, frames=24 * sub, fps=8.0 * sub)
