@@ -278,7 +278,7 @@ def test_the_command_writes_cameras_and_says_what_changed(
     )
     for more, said in (
         (["--reference", "x"], "no such camera"),
-        (["--off-degrees", 90], "above 0"),
+        (["--off-degrees", 90], "must be at most 20"),
     ):
         code, _, error = run([*base, *more, "--output", new], capsys)
         assert code == 2 and said in " ".join(error.split())

@@ -87,7 +87,7 @@ def test_the_command_finds_poses_and_times_from_people_alone(
             "--timestamps times.csv",
         ),
         (["--times", "times.csv", "--timestamps", "lenses.json"], 2, "give one of them"),
-        (["--times", "times.csv", "--most", "0"], 2, "must be above 0"),
+        (["--times", "times.csv", "--most", "0"], 2, "must be positive"),
     ):
         with pytest.raises(SystemExit) as ended:
             main([*base, "--output", "new.json", *more])
