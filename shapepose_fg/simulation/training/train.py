@@ -38,6 +38,8 @@ is calibrated."""
 _SKELETONS = ("SMPL_24", "HALPE_26", "BODY_25")
 """Skeletons for calibration; for a shared point the last one counts."""
 
+_APART = 5
+"""Of so many joints one is left out of a person in turn."""
 _ALL = tuple(range(len(BODY_POINTS)))
 
 
@@ -295,14 +297,16 @@ def left_out_squared(
     model = source.model.with_keypoints(tuple(BODY_POINTS[place] for place in places))
     fitter = SmplFitter(model, weights=weights)
     truth, targets = _corrupted(source, places, count, generator)
-    # Each person lacks one joint, whose prediction is tested.
-    rows, joint = np.arange(count), np.arange(count) % len(places)
-    targets.information[rows, joint] = 0.0
-    fit = fitter.fit(targets)
-    error = (fit.joints - truth)[rows, joint]
-    covariance = fit.covariance[rows, joint]
-    squared = (error * np.linalg.solve(covariance, error[..., None])[..., 0]).sum(axis=-1)
-    return {place: squared[(joint == row) & fit.ok] for row, place in enumerate(places)}
+    rows, found = np.arange(count), dict[int, list[Array]]()
+    for first in range(0, len(places), _APART):  # each person lacks one joint, which is predicted
+        joint, information = (rows + first) % len(places), targets.information.copy()
+        information[rows, joint] = 0.0
+        fit = fitter.fit(JointTargets(targets.xyz, information))
+        error, covariance = (fit.joints - truth)[rows, joint], fit.covariance[rows, joint]
+        squared = (error * np.linalg.solve(covariance, error[..., None])[..., 0]).sum(axis=-1)
+        for row, place in enumerate(places):
+            found.setdefault(place, []).append(squared[(joint == row) & fit.ok])
+    return {place: np.concatenate(parts) for place, parts in found.items()}
 
 
 def _corrupted(
