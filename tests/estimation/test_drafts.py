@@ -105,7 +105,7 @@ def test_bodies_are_fitted_again_only_where_their_targets_have_changed(fitter, m
             found = draft.draft(rows, Views.of(scene.rig), counting, EstimatorConfig())
             drafts.append(found.places)
             fitted.append(counting.rows)
-        assert fitted[1] == [2 * count] * len(draft.NARROWING_M)
+        assert fitted[1] == [2 * count] * (1 + len(draft.NARROWING_M))
         # At first every disturbed row, a clean one hardly ever; later those that have not settled.
         assert (
             fitted[0][0] == 2 * count
