@@ -39,7 +39,7 @@ _SKELETONS = ("SMPL_24", "HALPE_26", "BODY_25")
 """Skeletons for calibration; for a shared point the last one counts."""
 
 _APART = 5
-"""Of so many joints one is left out of a person in turn."""
+"""Number of joints of which one is left out of a person, in turn."""
 _ALL = tuple(range(len(BODY_POINTS)))
 
 
