@@ -212,30 +212,30 @@ def _marginals(H, Z, M, G, S, covariance):
                 covariance[t, a, b] = S[a, b]
 
 
-@kernel("f4 f4 f3 f3 f4")
+@kernel("f4 f4 f4 f4 f4")
 def solve_chains(diagonal, below, right, states, covariance):
-    """The `states` (C, T, d) of C independent chains, and their marginal `covariance` (C, T, d, d),
-    or of the first chains only (0, ...): NaN for singular chains.
+    """The `states` (A, C, T, d) of C independent chains, the same along each of A axes, and their
+    marginal `covariance` (C, T, d, d); NaN for singular chains.
 
     A chain's cost is x^T H x / 2 - right^T x, with H block tridiagonal of `diagonal` (C, T, d, d)
-    and `below` (C, T - 1, d, d).
+    and `below` (C, T - 1, d, d), and `right` (A, C, T, d).
     """
-    C, T, d = states.shape
+    A, C, T, d = states.shape
     # Zeros at the end of Z and g stand for the missing neighbours of the first and last state.
     H, Z, g = np.empty((T, d, d)), np.zeros((T, d, d)), np.zeros((T + 1, d))
     M, G, S = np.empty((d, d)), np.empty((2, d, d)), np.zeros((d, d))
     for c in range(C):
         for t in range(T):
             for a in range(d):
-                g[t, a] = right[c, t, a]
                 for b in range(d):
                     H[t, a, b] = diagonal[c, t, a, b]
-        regular = _factored(H, below[c], Z)
-        if regular:
-            _solve(H, Z, g, states[c])
-        else:
-            states[c, :, :] = np.nan
-        if regular and c < len(covariance):
-            _marginals(H, Z, M, G, S, covariance[c])
-        elif c < len(covariance):
+        if not _factored(H, below[c], Z):
+            states[:, c, :, :] = np.nan
             covariance[c, :, :, :] = np.nan
+            continue
+        for axis in range(A):
+            for t in range(T):
+                for a in range(d):
+                    g[t, a] = right[axis, c, t, a]
+            _solve(H, Z, g, states[axis, c])
+        _marginals(H, Z, M, G, S, covariance[c])

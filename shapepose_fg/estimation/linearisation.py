@@ -9,7 +9,6 @@ import numpy as np
 from annotated_types import Interval
 
 from factors import DEFAULT_WIDTH_SIGMA, KernelName, kernel_weight
-from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.core.bounds import Factor, Metres, MetresOrNone, Settings, Share
 from shapepose_fg.core.camera import Views
@@ -157,11 +156,6 @@ class ViewEvidence(Rows):
     def sigma_m(self) -> Array:
         """(N, J) standard deviation in the worst direction, metres; infinite for a ray."""
         return weakest_sigma(self.information)
-
-    @property
-    def message(self) -> JointTargets:
-        """The measurements in information form."""
-        return JointTargets(self.target, self.information)
 
 
 def weakest_sigma(information: Array) -> Array:

@@ -52,10 +52,9 @@ def smoothed(
         diagonal, right = moving.copy(), np.zeros((3, C, T, n))
         diagonal[..., 0, 0] += weight
         right[..., 0] = np.moveaxis(place * weight[..., None], -1, 0)
-        states, spread = np.empty((3 * C, T, n)), np.empty((C, T, n, n))
-        diagonal, below_each = np.tile(diagonal, (3, 1, 1, 1)), np.tile(below, (3, 1, 1, 1))
-        solve_chains(diagonal, below_each, right.reshape(states.shape), states, spread)
-        mean, of_mean = np.moveaxis(states.reshape(right.shape)[..., 0], 0, -1), spread[..., 0, 0]
+        states, spread = np.empty(right.shape), np.empty((C, T, n, n))
+        solve_chains(diagonal, below, right, states, spread)
+        mean, of_mean = np.moveaxis(states[..., 0], 0, -1), spread[..., 0, 0]
         apart = ((place - mean) ** 2).sum(axis=-1) / (of_mean + 1.0 / information)
         weight = information / (1 + apart / KERNEL)
     ever = np.asarray(known.any(axis=2))[who]
