@@ -1,3 +1,1 @@
-"""Stage II: estimates people's joints, in alternation with their bodies (section 3.2 of
-the paper).
-"""
+"""Stage II: estimates people's joints together with their bodies (section 3.2 of the paper)."""

@@ -43,13 +43,12 @@ class WindowGraphConfig(Settings):
 
 @dataclass(frozen=True)
 class RefineConfig(Settings):
-    """Settings of the alternation."""
+    """Whether bodies and joints alternate (Algorithm 1), and when that ends."""
 
     alternations: Repeats = 3
     """N of Algorithm 1: maximum number of body fits and joint solutions."""
     settled_m: MetresOrNone = 0.002
-    """Maximum motion of joints per round in a converged window, m: most frames take one or two
-    rounds. 0: never."""
+    """Motion of joints in a round below which the alternation ends, m; 0: it makes all rounds."""
     max_sigma_m: Metres = 0.5
     """Maximum standard deviation of a joint determined by its views, in the worst direction, m."""
     complete_start: bool = True
@@ -79,7 +78,7 @@ class EstimatorConfig:
     graph: WindowGraphConfig = field(default_factory=WindowGraphConfig)
     """Settings of the factor graph of a person."""
     refine: RefineConfig = field(default_factory=RefineConfig)
-    """Settings of the alternation of joints and bodies."""
+    """How bodies and joints are solved together."""
     motion: MotionConfig = field(default_factory=MotionConfig)
     """Settings of the links between frames."""
     law: Motion = CONSTANT_VELOCITY
@@ -87,4 +86,5 @@ class EstimatorConfig:
     joints: tuple[str, ...] = BODY_25.joints
     """Names of the detector's joints, for motion, sigmas and limbs."""
     noise: NoiseLaw = field(default_factory=NoiseLaw.shipped)
-    """The detector's noise law, for covariances only. Weights come from `observations`."""
+    """The detector's noise law, by which the standard deviations of `observations` are multiplied,
+    except in Algorithm 1."""

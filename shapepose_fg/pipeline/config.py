@@ -224,7 +224,7 @@ class PipelineConfig(Settings):
 
     @property
     def refine(self) -> RefineConfig:
-        """Stage II: the alternation."""
+        """Stage II: how bodies and joints are solved together."""
         return replace(self._rules(RefineConfig), alternations=self.solving.alternations)
 
     @property

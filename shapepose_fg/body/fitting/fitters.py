@@ -39,7 +39,7 @@ _ROUNDS = 2
 """Number of fits at an adult's size; the first estimate of the size is biased by the prior of
 adults."""
 _SPREAD = {"RWrist": 2.0, "LWrist": 2.0}
-"""Factors on the variance of joints without their own target. Elbows bend farther from their mean
+"""Factors on the variance of joints without a target. Elbows bend farther from their mean
 than a Gaussian predicts: without them, 85 % of the wrists of the validation subjects
 (training.motions) lie in their 90 % ellipsoids."""
 
