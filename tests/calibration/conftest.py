@@ -3,6 +3,7 @@
 import pickle
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Recording
+from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.io.calibration import write_rig
+from shapepose_fg.io.timestamps import write_timestamps
+from shapepose_fg.io.write_detections import write_association
 from shapepose_fg.simulation.scene import ring_of_cameras
 from tests.setup_check.conftest import seen_by, walkers
 
@@ -148,3 +153,26 @@ def merged(rig: Rig, parts: list[np.ndarray]) -> Recording:
             type(chosen[0])(*columns, pairs, np.concatenate([part.affinity for part in chosen]))
         )
     return Recording(seen[0].skeleton, frames)
+
+
+@pytest.fixture
+def as_detected(rig, late, tmp_path, monkeypatch) -> Path:
+    """What `detect` leaves of phones that were started and stopped by hand: detections under their
+    own numbers, and times that say which frames each has.
+    """
+    monkeypatch.chdir(tmp_path)
+    shown = np.arange(300)[:, None] < [300, 250, 300, 220]
+    own = Recording(
+        BODY_25, [frame.only(has[frame.view]) for frame, has in zip(late, shown, strict=True)]
+    )
+    write_rig(rig, tmp_path / "rig.json")
+    write_association(own, rig, tmp_path)
+    time_s = np.repeat(np.arange(300)[:, None] / FPS, 4, axis=1)
+    write_timestamps(
+        tmp_path / "detection" / "times.csv", rig.names, np.where(shown, time_s, np.nan)
+    )
+    return tmp_path
+
+
+COMMON = round((10.78 - 4.0) * FPS)
+"""Frames in which all four run: the last began at 4 s, the first ended at 10.78 s."""

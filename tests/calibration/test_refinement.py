@@ -50,7 +50,7 @@ def test_one_frame_is_one_look_and_a_minute_is_many():
 @pytest.mark.slow
 def test_disturbed_cameras_come_back(rig, recording, people):
     wrong = disturbed(rig, 0, focal=0.02)
-    found = refine(recording, wrong, TIMES, range(250), Freedom(focal=0.02))
+    found = refine(recording, wrong, TIMES, range(150), Freedom(focal=0.02))
     turn, move = off_by(found.rig, rig)
     assert found.better and found.after_px < 0.4 * found.before_px and found.notes == ()
     assert np.median(off_by(wrong, rig)[0]) > 0.6
@@ -124,7 +124,7 @@ def test_more_frames_of_the_same_biases_are_no_more_evidence(rig, recording, peo
 @pytest.mark.slow
 def test_a_bumped_camera_does_not_pull_the_others(rig, recording):
     bumped = replace(rig, cameras=(disturbed(rig, 1, degrees=2.5).cameras[0], *rig.cameras[1:]))
-    footage, now = Footage.of(recording, rig, TIMES, range(250)), bumped
+    footage, now = Footage.of(recording, rig, TIMES, range(125)), bumped
     for _ in range(3):
         people = footage.people(now)
         now = adjust(bumped, now, people, Freedom(), 12.0, misfit(people, now)).rig

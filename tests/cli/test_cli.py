@@ -539,28 +539,6 @@ def test_the_scene_is_what_the_demo_says_it_is():
     )
 
 
-LIGHT = """
-import sys
-import shapepose_fg, shapepose_fg.cli.main
-from shapepose_fg import InputError, Reconstruction, read_detections, read_rig
-assert "torch" not in sys.modules, "torch is loaded"
-try:
-    shapepose_fg.cli.main.main(["--help"])
-except SystemExit as end:
-    assert end.code == 0
-assert "torch" not in sys.modules, "help loads torch"
-"""
-
-
-@pytest.mark.slow
-def test_importing_and_help_load_no_torch():
-    result = subprocess.run(
-        [sys.executable, "-c", LIGHT], check=False, timeout=60, capture_output=True, text=True
-    )
-    assert result.returncode == 0, result.stderr
-    assert "reconstruct" in result.stdout
-
-
 def test_train_fitter_without_torch_names_the_command(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "torch", None)
     assert run("train-fitter", "--body", tmp_path / "SMPL_NEUTRAL.pkl") == 2

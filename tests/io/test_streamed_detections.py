@@ -119,11 +119,11 @@ def test_people_in_files_give_the_same_and_scores_are_judged_over_all(rig, tmp_p
 
 @pytest.mark.slow
 def test_a_file_of_all_frames_takes_the_memory_of_its_numbers(tmp_path):
-    """10,000 people of COCO, in any order: 4 MB as arrays, 5 MB of text, and 40 as Python's
+    """5,000 people of COCO, in any order: 2 MB as arrays, 3 MB of text, and 20 as Python's
     objects.
     """
     rng = np.random.default_rng(0)
-    frames, keypoints = rng.permutation(10_000) // 2, rng.uniform(1, 900, (10_000, 17, 3)).round(2)
+    frames, keypoints = rng.permutation(5_000) // 2, rng.uniform(1, 900, (5_000, 17, 3)).round(2)
     people = zip(frames.tolist(), keypoints.reshape(-1, 51).tolist(), strict=True)
     file = tmp_path / "camera.json"
     file.write_text(json.dumps([{"image_id": frame, "keypoints": each} for frame, each in people]))
@@ -195,10 +195,10 @@ def test_text_is_utf_8_and_may_have_a_mark_and_other_ends_of_lines(
 
 @pytest.mark.slow
 def test_memory_does_not_grow_with_the_recording(scene, once, tmp_path, monkeypatch):
-    """Three times the frames in as much memory."""
+    """More than twice the frames in as much memory."""
     monkeypatch.setattr(files, "PIECE", 2**15)  # a tenth of a block
     peaks = []
-    for blocks in (2, 6):
+    for blocks in (2, 5):
         folder = tmp_path / str(blocks)
         write_association(repeated(once, blocks * BLOCK_FRAMES), scene.rig, folder)
         tracemalloc.start()
@@ -234,9 +234,7 @@ def test_numbers_are_read_as_python_reads_them(other, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("lead", "end"), [(0, 3), (1, 0), (BLOCK_FRAMES, 3), (BLOCK_FRAMES + 7, 0)]
-)
+@pytest.mark.parametrize(("lead", "end"), [(1, 3), (BLOCK_FRAMES + 7, 0)])
 def test_files_of_which_some_frames_are_common(scene, once, tmp_path, lead, end):
     """Camera 1 has `lead` frames less at the beginning and `end` less at the end: by number, block
     by block.

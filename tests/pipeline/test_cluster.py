@@ -50,17 +50,12 @@ def installed():
 
 
 @pytest.mark.slow
-def test_results_come_in_order_whoever_does_them_and_an_error_of_the_work_is_that_error():
-    with cluster(None, 2, "") as pool:
+def test_results_come_in_order_and_an_error_or_a_kill_costs_only_its_own_work(tmp_path):
+    with cluster(None, 2, str(tmp_path / "killed")) as pool:
         assert list(pool.map(late, range(6))) == list(range(6))
         assert list(pool.map(late, [])) == []
         with pytest.raises(ArithmeticError, match="item 0"):
             list(pool.map(fails, range(3)))
-
-
-@pytest.mark.slow
-def test_a_killed_process_costs_only_its_own_work(tmp_path):
-    with cluster(None, 2, str(tmp_path / "killed")) as pool:
         assert list(pool.map(once_killed, range(6))) == [0, 10, 20, 30, 40, 50]
     assert (tmp_path / "killed").exists()
 

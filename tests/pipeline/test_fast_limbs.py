@@ -53,11 +53,11 @@ def errors(found: Reconstruction, people: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("fps", "frequency_hz"), [(30, 3.0), (60, 3.0), (10, 2.5)])
+@pytest.mark.parametrize(("fps", "frequency_hz"), [(60, 3.0), (10, 2.5)])
 def test_limbs_that_swing_are_where_they_are_frame_by_frame(five_cameras, fps, frequency_hz):
     """At 3 Hz a wrist turns by 200 m/s² and more; at 10 frames a second 2.5 Hz are 140."""
     rig = Rig(five_cameras.cameras[:4], five_cameras.up)
-    times = np.arange(2 * fps) / fps
+    times = np.arange(15 + fps) / fps
     people = swinging(times, frequency_hz)
     recording = seen(rig, people, np.random.default_rng(0))
     clock = FrameTimes.from_fps(fps, len(people))

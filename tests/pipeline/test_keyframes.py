@@ -13,7 +13,6 @@ from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.reconstruction import Known, Reconstruction, Status
 from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.evaluation.metrics import covariance_calibration, joint_metrics, match_people
-from shapepose_fg.pipeline.execution import Execution
 from shapepose_fg.pipeline.keyframes import (
     bodies_between,
     keyframes,
@@ -170,19 +169,6 @@ def test_fast_finds_the_same_people_as_surely(scene, results):
     # Of this one scene, whose errors last.
     assert inside[0.95] > 0.85
     assert inside[0.5] < 0.8
-
-
-@pytest.mark.slow
-def test_fast_is_the_same_with_processes(scene, results):
-    again = reconstruct(
-        simulate(scene),
-        scene.rig,
-        FAST,
-        times=FrameTimes.from_fps(scene.fps, len(scene)),
-        execution=Execution(workers=2),
-    )
-    for name in Reconstruction.ROWS:
-        np.testing.assert_array_equal(getattr(again, name), getattr(results[1], name))
 
 
 @pytest.mark.slow

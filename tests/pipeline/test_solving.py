@@ -219,7 +219,7 @@ def test_any_damaged_file_of_a_result_is_one_sentence(scene, people, tmp_path, c
     kept = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     refused = 0
     for name in ("run.json", "corrections.json", CAMERAS, "observations.npz", "people.npz"):
-        for _ in range(12):
+        for _ in range(4):
             for path, content in kept.items():
                 path.parent.mkdir(exist_ok=True)
                 path.write_bytes(content)
@@ -236,4 +236,4 @@ def test_any_damaged_file_of_a_result_is_one_sentence(scene, people, tmp_path, c
                 error = capsys.readouterr().err
                 assert code in (0, 2) and error.count("\n") == (code == 2), error
                 refused += code == 2
-    assert refused > 60
+    assert refused > 15

@@ -24,7 +24,7 @@ def fitted_m(scene: Scene) -> np.ndarray:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stature_m", [1.10, 1.25, 1.80, 2.00])
+@pytest.mark.parametrize("stature_m", [1.10, 2.00])
 def test_people_are_as_tall_as_they_are_to_5_cm(stature_m):
     """Two people of adults' proportions; of 1.10 m they came out with 1.18 and 1.19."""
     scene = built_in_scene(1, people=2, cameras=6, frames=24, fps=25.0)
@@ -36,6 +36,6 @@ def test_people_are_as_tall_as_they_are_to_5_cm(stature_m):
 @pytest.mark.slow
 def test_adults_are_as_tall_as_before():
     """Four people of the model's own shapes, 1.49 to 1.88 m."""
-    scene = built_in_scene(1, people=4, cameras=6, frames=60, fps=25.0)
+    scene = built_in_scene(1, people=4, cameras=6, frames=40, fps=25.0)
     true = np.sort(statures_m(scene.motion.betas, read_body()))
     np.testing.assert_allclose(fitted_m(scene), true, atol=0.02)

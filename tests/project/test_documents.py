@@ -136,25 +136,6 @@ def wrists_apart(people: Reconstruction) -> float:
     return float(np.median(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)))
 
 
-@pytest.mark.slow
-def test_readme_in_the_shell(recording, tmp_path, capsys):
-    lines = [
-        line.split("  #")[0]
-        for block in blocks(ROOT / "README.md", "bash")
-        for line in block.splitlines()
-    ]
-    commands = [line for line in lines if line.startswith("shapepose-fg") and "SMPL" not in line]
-    assert [command.split()[1] for command in commands] == ["reconstruct", "export"]
-    for command in commands:
-        with pytest.raises(SystemExit) as end:
-            main(shlex.split(command)[1:])
-        assert end.value.code == 0
-    found = joint_metrics(Reconstruction.load(tmp_path / "results"), recording.keypoints)
-    assert found.people_missed == found.false_positives == 0
-    kinds = {path.suffix for path in (tmp_path / "results" / "export").iterdir()}
-    assert kinds == {".npz", ".trc", ".c3d", ".bvh", ".glb", ".csv", ".parquet"}
-
-
 def moving(scene: Scene) -> dict:
     """The names of docs/moving_cameras.md: the first camera is on a carrier, which stands still."""
     first, *others = scene.rig.cameras

@@ -228,6 +228,7 @@ LIGHT = {
     "stage I": "import shapepose_fg.proposal.association",
     "stage II": "import shapepose_fg.pipeline.solve_window",
     "fits": "from shapepose_fg.body.fitting.fitters import make_fitter; make_fitter()",
+    "exports": "from shapepose_fg.io.export import glb, markers, motion_files, opensim, tables",
     "processes that look": "import shapepose_fg.simulation.visibility",
     "help": (
         "from shapepose_fg.cli.main import main\n"

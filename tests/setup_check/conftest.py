@@ -8,6 +8,7 @@ import pytest
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections, Recording
 from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.setup_check.report import SetupReport, check_setup
 from shapepose_fg.simulation.scene import ring_of_cameras
 
 FRAMES = 60
@@ -75,3 +76,9 @@ def look_at():
 def recording(room, people) -> Recording:
     """What the five cameras see of the three."""
     return seen_by(room, people)
+
+
+@pytest.fixture(scope="session")
+def sound(recording, room) -> SetupReport:
+    """The check of that recording, in which nothing is wrong."""
+    return check_setup(recording, room)

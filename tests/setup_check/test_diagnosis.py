@@ -354,11 +354,6 @@ def test_children_are_no_mistake_of_the_calibration(people, room, look_at, part)
 
 
 @pytest.mark.slow
-def test_adults_are_not_taken_for_children(recording, room):
-    assert check_setup(recording, room).notes == ()
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.1, 2.0])
 def test_lengths_of_nobody_are_the_calibration_s(recording, room, factor):
     assert only_finding(recording, scaled(room, factor)).kind == Kind.UNIT

@@ -55,8 +55,7 @@ def test_a_camera_that_drifts_is_named(recording, room):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("degrees", [0.8])
-def test_a_small_drift_is_told_from_a_turn_that_lasts(recording, room, degrees):
+def test_a_small_drift_is_told_from_a_turn_that_lasts(recording, room, degrees=0.8):
     found = only_finding(check_setup(turning(recording, room, 1, lambda t: degrees * t / 59), room))
     assert (found.kind, found.cameras) == (Kind.DRIFTING, (1,)) and found.sure > 0.5
     assert found.amount == pytest.approx(degrees, rel=0.3)  # the usual size of a turn pulls it to 0
@@ -113,12 +112,11 @@ def test_rows_that_rest_on_doubted_cameras_are_not_ok(recording, room):
 
 
 @pytest.mark.slow
-def test_people_who_move_as_nobody_does_are_named_with_the_rate(recording, room):
+def test_people_who_move_as_nobody_does_are_named_with_the_rate(recording, room, sound):
     people = reconstruct(recording, room, times=FrameTimes.from_fps(25, len(recording)))
-    report = check_setup(recording, room)
-    assert result_check(report, people, recording, room, range(60)).warnings == ()
+    assert result_check(sound, people, recording, room, range(60)).warnings == ()
     fast = replace(people, time_s=people.time_s * 25 / 1000)
-    (said,) = result_check(report, fast, recording, room, range(60)).warnings
+    (said,) = result_check(sound, fast, recording, room, range(60)).warnings
     assert "m/s" in said and "--fps is probably wrong (1000 Hz" in said
     assert np.isfinite(people.time_s).all()
     none = np.zeros((0, 2), dtype=np.intp), np.zeros(0)
@@ -130,7 +128,7 @@ def test_people_who_move_as_nobody_does_are_named_with_the_rate(recording, room)
     ]
     crowd = Recording(recording.skeleton, crowd)
     (said,) = result_check(
-        report, people, crowd, room, range(60)
+        sound, people, crowd, room, range(60)
     ).warnings  # detections beside those of people
     assert "people explain only 8" in said and "higher confidence threshold" in said
 
@@ -164,7 +162,7 @@ def test_a_camera_that_is_mostly_left_out_is_named_with_the_reason(recording, ro
 
 
 @pytest.mark.slow
-def test_people_whom_two_cameras_see_and_who_are_not_found_are_counted(recording, room):
+def test_people_whom_two_cameras_see_and_who_are_not_found_are_counted(recording, room, sound):
     """Somebody is left out of the result: the sentence is among the warnings, which run.json and
     stderr have.
     """
@@ -173,12 +171,11 @@ def test_people_whom_two_cameras_see_and_who_are_not_found_are_counted(recording
     )
     first = np.unique(people.person)[0]
     fewer = people.rows(people.person != first)
-    report = check_setup(recording, room)
-    warned = result_check(report, fewer, recording, room, range(20)).warnings
+    warned = result_check(sound, fewer, recording, room, range(20)).warnings
     words = [each for each in warned if "two cameras" in each]
     seen, found = len(np.unique(people.person)), len(np.unique(fewer.person))
     assert len(words) == 1 and f"but {found:.1f} are found" in words[0] and found == seen - 1
-    everybody = result_check(report, people, recording, room, range(20))
+    everybody = result_check(sound, people, recording, room, range(20))
     assert not any("two cameras" in each for each in everybody.warnings)
 
 

@@ -38,18 +38,17 @@ def run(arguments, capsys):
 
 
 @pytest.mark.slow
-def test_figures_of_a_good_set_up(recording, room):
-    report = check_setup(recording, room)
-    assert report.findings == () and report.warnings == ()
-    for each in report.cameras:
+def test_figures_of_a_good_set_up(sound):
+    assert sound.findings == () and sound.warnings == () and sound.notes == ()
+    for each in sound.cameras:
         # 2 px along each axis are 2.35 px in the median; triangulation takes a part, leaving out
         # adds one.
         assert 1.5 < each.median_px < 2.4 < each.left_out_px < 4.5
         # At 4 to 5 m and 900 px a pixel is 4 to 6 mm.
         assert 4 < each.median_mm / each.median_px < 6.5
         assert each.left_out_matched > 0.95 and each.late_frames == 0
-    assert all(pair.matched > 0.95 and pair.miss_px < 3 for pair in report.pairs)
-    assert len(report.pairs) == 10
+    assert all(pair.matched > 0.95 and pair.miss_px < 3 for pair in sound.pairs)
+    assert len(sound.pairs) == 10
 
 
 @pytest.mark.slow
@@ -183,7 +182,7 @@ def test_frames_as_spans():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("temporal", [True, False])
-def test_speeds_need_identities(recording, room, temporal):
+def test_speeds_need_identities(recording, room, sound, temporal):
     """Frame by frame numbers of people are no identities: whoever is number 0 next may stand
     anywhere.
     """
@@ -206,7 +205,5 @@ def test_speeds_need_identities(recording, room, temporal):
         time_s=np.arange(N) / 30,
         run={"configuration": {"temporal": temporal}, "time": FrameTimes.from_fps(30, N).as_dict()},
     )
-    warnings = result_check(
-        check_setup(recording, room), people, recording, room, range(len(recording))
-    ).warnings
+    warnings = result_check(sound, people, recording, room, range(len(recording))).warnings
     assert any("people move at 39 m/s" in each for each in warnings) == temporal

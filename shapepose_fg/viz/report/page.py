@@ -3,7 +3,9 @@
 import base64
 import hashlib
 from collections.abc import Mapping, Sequence
+from functools import cache
 from importlib.resources import files
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,6 +16,9 @@ from shapepose_fg.tracking.listing import TrackSummary
 from shapepose_fg.viz.report.facts import told_by
 from shapepose_fg.viz.report.figures import KINDS, Curve, camera_figures, known_counts, overall
 from shapepose_fg.viz.report.scene import Scene
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
 
 _SCRIPTS = ("geometry.js", "skin.js", "drawing.js", "page.js")
 """Scripts in the order in which they are loaded."""
@@ -64,23 +69,6 @@ def filled(name: str, scene: Scene | None, **values: object) -> str:
     Texts of the input are escaped, and the page's Content-Security-Policy forbids all scripts
     except its own.
     """
-    from jinja2 import Environment, FunctionLoader, StrictUndefined
-
-    page = Environment(
-        loader=FunctionLoader(_asset),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        extensions=["jinja2.ext.do"],
-    )
-    page.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
-    page.filters |= {
-        "dash": _dash,
-        "share": _share,
-        "percent": _percent,
-        "count": _count,
-        "path": _path,
-    }
     scripts = [_asset(name) for name in _SCRIPTS] if scene is not None else []
     digests = (
         base64.b64encode(hashlib.sha256(text.encode("utf-8")).digest()).decode("ascii")
@@ -88,9 +76,34 @@ def filled(name: str, scene: Scene | None, **values: object) -> str:
     )
     hashes = " ".join(f"'sha256-{digest}'" for digest in digests) or "'none'"
     policy = f"default-src 'none'; style-src 'unsafe-inline'; script-src {hashes}; img-src data:"
-    return page.get_template(name).render(
-        policy=policy, style=_asset("report.css"), scripts=scripts, scene=scene, **values
+    return (
+        _pages()
+        .get_template(name)
+        .render(policy=policy, style=_asset("report.css"), scripts=scripts, scene=scene, **values)
     )
+
+
+@cache
+def _pages() -> "Environment":
+    """The compiled pages; to compile them takes longer than to fill them in."""
+    from jinja2 import Environment, FunctionLoader, StrictUndefined
+
+    pages = Environment(
+        loader=FunctionLoader(_asset),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        extensions=["jinja2.ext.do"],
+    )
+    pages.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
+    pages.filters |= {
+        "dash": _dash,
+        "share": _share,
+        "percent": _percent,
+        "count": _count,
+        "path": _path,
+    }
+    return pages
 
 
 def _dash(value: float | None, text: str, none: str = "–") -> str:

@@ -225,15 +225,6 @@ def test_view_without_rerun_names_the_command(copied, capsys, monkeypatch):
     assert 'rerun is not installed; pip install "shapepose-fg[view]"' in capsys.readouterr().err
 
 
-@pytest.mark.slow
-def test_commands_load_no_torch(copied):
-    call = f"main(['export', {str(copied)!r}, 'trc', 'bvh', 'glb'])"
-    code = f"import sys; from shapepose_fg.cli.main import main\ntry:\n    {call}\n"
-    code += "except SystemExit as end:\n    assert not end.code and 'torch' not in sys.modules"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr
-
-
 def test_mcap_has_a_message_of_each_frame_and_every_person(copied, result):
     reader = pytest.importorskip("mcap.reader")
     decoder = pytest.importorskip(
