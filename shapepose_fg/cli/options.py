@@ -411,7 +411,7 @@ def refuse_missing(places: Mapping[str, Path | None]) -> None:
             [", ".join(missing[:-1]), missing[-1]] if len(missing) > 1 else missing
         )
         raise InputError(
-            f"{listed}: missing; give them, or --project with the folder of a Pose2Sim project"
+            f"{listed}: missing; give {'it' if len(missing) == 1 else 'them'}, or --project with the folder of a Pose2Sim project"
         )
 
 
