@@ -398,7 +398,10 @@ class TakeOptions(ResultOptions):
 def next_reconstruct(options: Mapping[str, object]) -> str:
     """A command line to copy: `reconstruct` with those `options` that have values."""
     words = [
-        word for name, value in options.items() if value is not None for word in (name, str(value))
+        word
+        for name, value in options.items()
+        if value is not None
+        for word in (name, f"{value:g}" if isinstance(value, float) else str(value))
     ]
     return f"next: {shlex.join(['shapepose-fg', 'reconstruct', *words])}"
 

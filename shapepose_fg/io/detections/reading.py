@@ -122,7 +122,7 @@ def read_detections(
     else:
         skeleton, how = (
             _skeleton_of_streams(streams, wanted),
-            ("they are between the two joints that one neighbour connects"),
+            ("they are midpoints of the two joints that their limbs connect"),
         )
     made = [skeleton.joints[joint] for joint, _, _ in skeleton.middles]
     notes += [f"{skeleton.name} has no {' and no '.join(made)}: {how}"] if made else []
