@@ -413,8 +413,9 @@ def refuse_missing(places: Mapping[str, Path | None]) -> None:
         listed = " and ".join(
             [", ".join(missing[:-1]), missing[-1]] if len(missing) > 1 else missing
         )
+        them = "it" if len(missing) == 1 else "them"
         raise InputError(
-            f"{listed}: missing; give {'it' if len(missing) == 1 else 'them'}, or --project with the folder of a Pose2Sim project"
+            f"{listed}: missing; give {them}, or --project with the folder of a Pose2Sim project"
         )
 
 

@@ -109,7 +109,8 @@ def table(
 
     cells = [list(row) for row in rows]
     columns = (" ".join(map(str, column)).split() for column in zip(heads, *cells, strict=True))
-    widths = [max(map(len, words), default=0) for words in columns]  # narrower ones would break words
+    # Narrower columns would break words.
+    widths = [max(map(len, words), default=0) for words in columns]
     gap = 2 if sum(widths) + 2 * len(heads) <= console().width else 1
     made = Table(box=None, pad_edge=False, padding=(0, gap, 0, 0), header_style="dim")
     for n, head in enumerate(heads):

@@ -180,10 +180,10 @@ def find_places(path: Path, rig: Rig) -> tuple[Format, list[Path], list[str]]:
         if each.is_file() and (known := what_it_is(each)) is not None:
             raise InputError(f"{each}: this is {known}")
     raise InputError(
-        f"{folder}: there are no detections of the cameras {' '.join(rig.names)}; it contains {holds}; "
-        "give the folder with <camera>.txt (4D Association), <camera>/ or <camera>_json/ with a "
-        "JSON file per frame (OpenPose, Pose2Sim, MMPose), or <camera>.json (COCO's results, "
-        "AlphaPose, MMPose)"
+        f"{folder}: there are no detections of the cameras {' '.join(rig.names)}; it contains "
+        f"{holds}; give the folder with <camera>.txt (4D Association), <camera>/ or <camera>_json/ "
+        "with a JSON file per frame (OpenPose, Pose2Sim, MMPose), or <camera>.json (COCO's "
+        "results, AlphaPose, MMPose)"
     )
 
 
