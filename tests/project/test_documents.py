@@ -138,25 +138,6 @@ def wrists_apart(people: Reconstruction) -> float:
     return float(np.median(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)))
 
 
-@pytest.mark.slow
-def test_readme_in_the_shell(recording, tmp_path, capsys):
-    lines = [
-        line.split("  #")[0]
-        for block in blocks(ROOT / "README.md", "bash")
-        for line in block.splitlines()
-    ]
-    commands = [line for line in lines if line.startswith("shapepose-fg") and "SMPL" not in line]
-    assert [command.split()[1] for command in commands] == ["reconstruct", "export"]
-    for command in commands:
-        with pytest.raises(SystemExit) as end:
-            main(shlex.split(command)[1:])
-        assert end.value.code == 0
-    found = joint_metrics(Reconstruction.load(tmp_path / "results"), recording.keypoints)
-    assert found.people_missed == found.false_positives == 0
-    kinds = {path.suffix for path in (tmp_path / "results" / "export").iterdir()}
-    assert kinds == {".npz", ".trc", ".c3d", ".bvh", ".glb", ".csv", ".parquet"}
-
-
 def moving(scene: Scene) -> dict:
     """The names of docs/moving_cameras.md: the first camera is on a carrier, which stands still."""
     first, *others = scene.rig.cameras
@@ -283,30 +264,41 @@ def test_blocks_that_simulate_their_recording_run(page, tmp_path, monkeypatch, c
         type_commands(block, capsys)
 
 
-OF_THE_READER = ("...", "calibration.toml", "mcap", "--resume", "shelf", "theirs")
-"""Words in commands that need more than the recording of `a_reader_s_folder`, or an extra."""
+OF_THE_READER = ("...", "calibration.toml", "mcap", "--resume", "shelf", "theirs", "SMPL_NEUTRAL")
+"""Words in commands that need more than the recording of a reader's folder, or an extra."""
 
 
 @pytest.mark.slow
-def test_commands_on_a_finished_result_run(tmp_path, monkeypatch, capsys):
-    """Those of all pages, after one another, in a folder with a recording, its result and truth."""
+def test_commands_of_pages_run_in_a_reader_s_folder(tmp_path, monkeypatch, capsys):
+    """The README's, then those of all other pages that need a recording, its result or its truth;
+    those that reconstruct it in another way last.
+    """
     monkeypatch.chdir(tmp_path)
-    truth_of(a_reader_s_folder(built_in_scene(frames=20))).save("truth")
+    scene = a_reader_s_folder(built_in_scene(frames=20))
+    truth_of(scene).save("truth")
     known = ("reconstruct", "report", "explain", "tracks", "evaluate", "export")
+
+    def commands(page: Path) -> list[str]:
+        shell = [block for block in blocks(page, "bash") if block not in simulating(page)]
+        return [
+            command
+            for command in commands_in("".join(shell))
+            if command.split()[1] in known and not any(word in command for word in OF_THE_READER)
+        ]
+
+    readme = commands(ROOT / "README.md")
+    assert [command.split()[1] for command in readme] == ["reconstruct", "export"]
+    type_commands("\n".join(readme), capsys)
+    found = joint_metrics(Reconstruction.load("results"), scene.keypoints)
+    assert found.people_missed == found.false_positives == 0
+    kinds = {path.suffix for path in Path("results", "export").iterdir()}
+    assert kinds == {".npz", ".trc", ".c3d", ".bvh", ".glb", ".csv", ".parquet"}
+
     pages = [page for page in PAGES if page not in GUIDES and page != ROOT / "README.md"]
-    commands = [
-        command
-        for page in (ROOT / "README.md", *pages)
-        for block in blocks(page, "bash")
-        for command in commands_in(block)
-        if command.split()[1] in known
-        and block not in simulating(page)
-        and not any(word in command for word in OF_THE_READER)
-    ]
-    assert {command.split()[1] for command in commands} == set(known)
-    for command in commands:
-        again = " --overwrite" if Path("results").exists() and " reconstruct " in command else ""
-        type_commands(command + again, capsys)
+    others = dict.fromkeys(command for page in pages for command in commands(page))
+    assert {command.split()[1] for command in others} == set(known)
+    for command in sorted(others, key=lambda each: " reconstruct " in each):
+        type_commands(command + " --overwrite" * (" reconstruct " in command), capsys)
 
 
 def steps(result: Reconstruction, feet: np.ndarray) -> np.ndarray:
