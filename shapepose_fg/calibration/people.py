@@ -21,7 +21,7 @@ LEAST_PEOPLE = 10
 """Minimum number of people, one per frame, from which a camera is adjusted."""
 _LEAST_STEP_S = 0.1
 """Minimum time between used frames, s: errors of nearer ones are correlated (0.8)."""
-_MOST_FRAMES = 100
+MOST_FRAMES = 100
 _MOST_SIGHTINGS = 5_000
 """Maximum number of sightings; more of them, or of frames, cost time and add little information,
 because errors within a second are correlated."""
@@ -66,7 +66,7 @@ class Footage:
         """Sightings in frames spread over the recording, as many as add information."""
         taken = times.frame_s[frames.start : frames.stop]
         lasts = float(taken[-1] - taken[0])
-        count = max(2, min(_MOST_FRAMES, len(taken), 1 + int(lasts / _LEAST_STEP_S)))
+        count = max(2, min(MOST_FRAMES, len(taken), 1 + int(lasts / _LEAST_STEP_S)))
         wanted = np.searchsorted(taken, taken[0] + np.linspace(0.0, lasts, count)).clip(
             0, len(taken) - 1
         )

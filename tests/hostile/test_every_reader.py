@@ -36,7 +36,7 @@ def test_changed_files_are_read_or_refused(tmp_path, name):
     refused = []
 
     @settings(
-        max_examples=10 if name.startswith(("result", "run")) else 25,
+        max_examples=6 if name.startswith(("result", "run")) else 16,
         derandomize=True,
         database=None,
         deadline=None,
