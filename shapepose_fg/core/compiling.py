@@ -19,8 +19,8 @@ _BYTES_S = 1300
 _is_said = False
 """Whether a message of `saying` covers what runs now."""
 
-spent_s = 0.0
-"""Time that `compile_beside` took in this process, seconds."""
+_spent_s = 0.0
+"""Time that `compile_beside` took in this process, s."""
 
 _tried = False
 """Whether this process has compiled the missing kernels; kernels that are missing later are
@@ -33,7 +33,7 @@ def compile_beside(kernels: Sequence[Any]) -> None:
 
     If another process is compiling, waits for it.
     """
-    global _tried, spent_s
+    global _tried, _spent_s
     if _tried:
         return
     _tried, start = True, time.monotonic()
@@ -59,7 +59,12 @@ def compile_beside(kernels: Sequence[Any]) -> None:
             else:
                 for each in missing:
                     each.load()
-    spent_s = time.monotonic() - start
+    _spent_s = time.monotonic() - start
+
+
+def compiled_for_s() -> float:
+    """Time that this process has spent on compiling, seconds."""
+    return _spent_s
 
 
 def _share_out(kernels: Sequence[Any], count: int) -> None:

@@ -100,7 +100,7 @@ def pipeline(monkeypatch) -> dict:
         return Assembly(parts, BODY_25.joints, rig.names, run=run)
 
     monkeypatch.setattr(shapepose_fg.cli.reconstruct.run, "reconstruct_parts", fake)
-    monkeypatch.setattr("shapepose_fg.core.compiling.spent_s", 0.0)  # by tests that went before
+    monkeypatch.setattr("shapepose_fg.core.compiling._spent_s", 0.0)  # by tests that went before
     return called
 
 
