@@ -146,7 +146,7 @@ class _Compared:
 
 @dataclass(frozen=True)
 class _Look:
-    """State of a person in a frame in which some view had sides exchanged."""
+    """State of a person in one frame."""
 
     frame: int
     """Index of the frame."""
