@@ -499,7 +499,7 @@ def short_scene(monkeypatch):
     """The demo on five frames of its scene."""
     from shapepose_fg.simulation import built_in_scene
 
-    monkeypatch.setattr("shapepose_fg.cli.demo.built_in_scene", lambda: built_in_scene(frames=5))
+    monkeypatch.setattr("shapepose_fg.simulation.built_in_scene", lambda: built_in_scene(frames=5))
 
 
 def test_demo_compares_with_the_truth_and_leaves_a_report(
