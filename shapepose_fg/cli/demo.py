@@ -7,7 +7,7 @@ from shapepose_fg.cli.options import RESULT, grouped, option
 from shapepose_fg.cli.terminal import progress as progress_bar
 from shapepose_fg.core.storage.output_folder import prepare_output
 
-_SCENE = """\
+SCENE = """\
 Built-in scene: 4 people in close motion, 6 cameras, 60 frames. A simulated
 detector sees them with noise, misses, false candidates and occlusion; from what
 it saw the people are reconstructed, over time."""
@@ -28,7 +28,7 @@ def demo(
 ) -> None:
     """Reconstruct a built-in scene of four people and compare it with the truth."""
     prepare_output(output)
-    print(_SCENE, flush=True)
+    print(SCENE, flush=True)
     from shapepose_fg.core.frame_times import FrameTimes
     from shapepose_fg.evaluation.score import score
     from shapepose_fg.evaluation.truth import people_of
