@@ -40,7 +40,7 @@ LEVELS = (
     "estimation",
     "tracking",
     "pipeline.solve_window pipeline.keyframes",
-    "pipeline.config pipeline.cluster pipeline.bodies_over_time",
+    "pipeline.config pipeline.cluster pipeline.person_shapes",
     "pipeline.windows",
     "pipeline.runs",
     "pipeline.setup pipeline.execution",

@@ -104,7 +104,7 @@ def carry_out(
         fitter = None
         if asked.body is not None:
             model = BodyModel.load(asked.body).with_keypoints(recording.skeleton.joints)
-            fitter = make_fitter(settings.body, model, settings.law)
+            fitter = make_fitter(settings.body, model)
             if fitter.weights is None and settings.body.method != "plain":
                 cure = f"shapepose-fg train-fitter {shlex.join(['--body', str(asked.body)])}"
                 note(

@@ -28,7 +28,7 @@ from shapepose_fg.core.storage.npz import Pieces
 from shapepose_fg.core.storage.schema import Table
 from shapepose_fg.estimation.contact import feet_of
 from shapepose_fg.estimation.floor import LOOK_S, Floor, find_floor
-from shapepose_fg.pipeline.bodies_over_time import BodiesOverTime, Person
+from shapepose_fg.pipeline.person_shapes import WindowBodies
 from shapepose_fg.pipeline.runs.parts import OBSERVED, Parts
 
 _STANDS_M_S = 0.1
@@ -48,18 +48,14 @@ class Assembly:
     """(V,) names of the cameras."""
     names: Mapping[int, int] = field(default_factory=dict)
     """Identities of tracks in the result; tracks not listed keep their number."""
-    bodies: BodiesOverTime | None = None
-    """Bodies that replace those of the windows."""
+    shapes: SubjectShapes | None = None
+    """The shapes of all people. With them, stored bodies (`keep_bodies`) replace those of the
+    windows."""
     run: dict[str, Any] = field(default_factory=dict)
     """Origin of the result (`Reconstruction.run`)."""
 
     def __len__(self) -> int:
         return self.parts.rows
-
-    @property
-    def shapes(self) -> SubjectShapes | None:
-        """The shapes of all people."""
-        return None if self.bodies is None else self.bodies.shapes
 
     @cached_property
     def persons(self) -> list[NDArray[np.int64]]:
@@ -99,18 +95,19 @@ class Assembly:
                 mine = np.flatnonzero(self.persons[n] == number)[first:last]
                 yield tuple(self.parts.column(n, name)[mine] for name in columns)
 
-    def person(self, number: int, rows: Sequence[range]) -> Person:
-        """Data for fitting a person's bodies, in ranges of the person's own rows, in order."""
-        columns = ("joints", "covariance", "time_s")
-        pieces = [piece for part in rows for piece in self.own_pieces(number, columns, part)]
-        return Person.of(number, *(np.concatenate(column) for column in zip(*pieces, strict=True)))
+    def bodies(self, n: int) -> WindowBodies:
+        """The bodies of a part, as they were solved."""
+        _, *names = WindowBodies.__dataclass_fields__
+        return WindowBodies(self.persons[n], *(self.parts.column(n, name) for name in names))
+
+    def keep_bodies(self, n: int, columns: Mapping[str, Array]) -> None:
+        """Store bodies of a part, by column."""
+        self.parts.kept.keep(_bodies(n), columns)
 
     def pieces(self, name: str) -> Iterator[NDArray[Any]]:
         """A column of people.npz, or of observations.npz (`OBSERVED`), by part."""
-        before: Counter[int] = Counter()
-        for n, person in enumerate(self.persons):
-            yield self._piece(n, name, before)
-            before.update(person.tolist())
+        for n in range(len(self.parts)):
+            yield self._piece(n, name)
 
     def counts(self) -> dict[str, Any]:
         """The entry of run.json about the rows (`Reconstruction.counts`)."""
@@ -142,15 +139,14 @@ class Assembly:
         rows = {
             name: np.empty((count, *each.shape[1:]), each.dtype) for name, each in columns.items()
         }
-        before: Counter[int] = Counter()
         stop = 0
-        for n, (mine, person) in enumerate(zip(chosen, self.persons, strict=True)):
+        for n, mine in enumerate(chosen):
             start, stop = stop, stop + len(mine)
             for name, all_rows in rows.items():
-                all_rows[start:stop] = self._piece(n, name, before)[mine]
-            before.update(person.tolist())
+                all_rows[start:stop] = self._piece(n, name)[mine]
             if consume:
                 self.parts.drop(n)
+                self.parts.kept.drop(_bodies(n))
         table = None
         if len(self) > 0:
             table = ObservationTable.empty(self.joint_names, self.view_names)
@@ -165,16 +161,13 @@ class Assembly:
         """Return a copy with further entries in run.json."""
         return replace(self, run=self.run | entries)
 
-    def _piece(self, n: int, name: str, before: Mapping[int, int]) -> NDArray[Any]:
-        """A column of a part; `before` is the number of rows of each person in earlier parts."""
+    def _piece(self, n: int, name: str) -> NDArray[Any]:
+        """A column of a part."""
         if name.removeprefix(OBSERVED) == "person":
             return self.persons[n]
-        values = self.parts.column(n, name)
-        return (
-            values
-            if self.bodies is None
-            else self.bodies.filled(name, values, self.persons[n], before)
-        )
+        if name in BODY and self.shapes is not None:
+            return self.parts.kept.array(_bodies(n), name)
+        return self.parts.column(n, name)
 
     def _columns(self, empty: Table, prefix: str) -> dict[str, Pieces]:
         """The columns of an `empty` table with the rows of all parts."""
@@ -218,3 +211,8 @@ class Assembly:
             looks.append(np.stack([parts.column(n, "person")[rows], side, look], axis=1))
         whose = np.unique(np.concatenate(looks), axis=0, return_inverse=True)[1]
         return find_floor(np.concatenate(points), whose.ravel(), up)
+
+
+def _bodies(n: int) -> str:
+    """Name under which the bodies of a part are stored."""
+    return f"bodies-{n:06d}"
