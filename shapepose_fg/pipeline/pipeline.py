@@ -277,7 +277,7 @@ def _with_person_shapes(
     pool: Pool[Setup],
 ) -> Assembly:
     """The result with one shape per person, and bodies with these shapes."""
-    parts, found = range(len(result.parts)), {number: ShapeEvidence() for number in result.rows_of}
+    parts, found = range(len(result.parts)), {number: ShapeEvidence() for number in result.parts_of}
     for of_part in pool.map(_evidence, map(result.bodies, parts)):
         for number, each in of_part.items():
             found[number].add(each)
@@ -315,7 +315,7 @@ def _names(tracks: Assembly, setup: Setup, cuts_s: Sequence[float]) -> dict[int,
             [Trace.of(track, time_s, joints, setup.skeleton) for time_s, joints in pieces]
         )
 
-    return stitch(Ends.of(map(trace, tracks.rows_of)), setup.config.stitching, cuts_s)
+    return stitch(Ends.of(map(trace, tracks.parts_of)), setup.config.stitching, cuts_s)
 
 
 def _summary(

@@ -329,7 +329,7 @@ class _Run:
         show(summary)
         if checked is not None:
             show_check(checked)
-        count = len(result.rows_of) if self.task.config.temporal else None
+        count = len(result.parts_of) if self.task.config.temporal else None
         return Ended(
             len(self.task.whole()[0]),
             len(result),

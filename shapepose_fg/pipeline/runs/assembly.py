@@ -1,6 +1,5 @@
 """Assembles the result of a run from its parts, by column: in memory, or directly into files."""
 
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -67,33 +66,19 @@ class Assembly:
         ]
 
     @cached_property
-    def rows_of(self) -> dict[int, int]:
-        """Number of rows of each person."""
-        return {number: sum(places.values()) for number, places in sorted(self._places.items())}
-
-    @cached_property
-    def _places(self) -> dict[int, dict[int, int]]:
-        """For each person the parts with rows of that person, and their number in each."""
-        places: dict[int, dict[int, int]] = {}
+    def parts_of(self) -> dict[int, list[int]]:
+        """For each person, by number, the parts with rows of the person."""
+        found: dict[int, list[int]] = {}
         for n, person in enumerate(self.persons):
-            for number, count in Counter(person.tolist()).items():
-                places.setdefault(number, {})[n] = count
-        return places
+            for number in np.unique(person).tolist():
+                found.setdefault(number, []).append(n)
+        return dict(sorted(found.items()))
 
-    def own_pieces(
-        self, number: int, columns: Sequence[str], rows: range | None = None
-    ) -> Iterator[tuple[NDArray[Any], ...]]:
-        """`columns` of one person's rows, by part; `rows` is a range among the person's own, None
-        for all.
-        """
-        wanted = range(self.rows_of[number]) if rows is None else rows
-        before = 0
-        for n, count in self._places[number].items():
-            first, last = max(wanted.start - before, 0), min(wanted.stop - before, count)
-            before += count
-            if first < last:
-                mine = np.flatnonzero(self.persons[n] == number)[first:last]
-                yield tuple(self.parts.column(n, name)[mine] for name in columns)
+    def own_pieces(self, number: int, columns: Sequence[str]) -> Iterator[tuple[NDArray[Any], ...]]:
+        """`columns` of one person's rows, by part."""
+        for n in self.parts_of[number]:
+            mine = self.persons[n] == number
+            yield tuple(self.parts.column(n, name)[mine] for name in columns)
 
     def bodies(self, n: int) -> WindowBodies:
         """The bodies of a part, as they were solved."""
