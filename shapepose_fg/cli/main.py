@@ -85,7 +85,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
             sys.stdout.flush()
     except _UsageProblem as error:
         message = cast(Any, error).format_message().rstrip(".").replace("Value error, ", "")
-        code = _fail(f"{message}; see shapepose-fg --help")
+        words, context = ["--help"], getattr(error, "ctx", None)
+        while context is not None and context.parent is not None:
+            words.insert(0, context.info_name)
+            context = context.parent
+        code = _fail(f"{message}; see shapepose-fg {' '.join(words)}")
     except InputError as error:
         code = _fail(str(error))
     except BrokenPipeError:  # the reader of our output, such as `head`, has ended

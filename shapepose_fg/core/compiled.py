@@ -114,7 +114,7 @@ class Kernel:
         return None
 
     def _compile(self, function: Any) -> Any:
-        with saying("" if self.is_kept else f"compiling {self.name} for this machine"):
+        with saying("" if self.is_kept else "compiling a function for this machine"):
             function.compile(signature(self))
         return function
 
