@@ -147,7 +147,8 @@ def triangulated_joints(chosen: Index, frame: Frame) -> Array:
     that fewer than two views see.
     """
     places, views = np.full((*chosen.shape[:2], 3), np.nan), chosen.shape[2]
-    _triangulate(chosen, frame.arrays, np.empty((views, 2)), *np.empty((2, views)), places)
+    uv, sure, room = np.empty((views, 2)), np.empty(views), np.empty(views)
+    _triangulate(chosen, frame.arrays, uv, sure, room, places)
     return places
 
 
