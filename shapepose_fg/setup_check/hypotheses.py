@@ -32,7 +32,7 @@ from shapepose_fg.setup_check.matching import (
     miss_px,
     same_frame,
 )
-from shapepose_fg.setup_check.over_time import stories
+from shapepose_fg.setup_check.over_time import motions
 from shapepose_fg.setup_check.small_errors import ONE, Problem, named, probable
 
 _AGREEMENT, _LEAST_GAIN, _LIKELY_LAG, _SMALL = 0.12, 0.004, 12.0, 8
@@ -285,7 +285,7 @@ def mistake_of_cameras(look: Look, rng: np.random.Generator) -> Change | None:
     found = [(gain, change) for gain, change in found if gain > GAIN / look.view_count]
     for view in range(look.view_count if look.cameras_used > 2 else 0):
         changes = [
-            Change(finding, after, freedom) for finding, after, freedom in stories(look, view, rng)
+            Change(finding, after, freedom) for finding, after, freedom in motions(look, view, rng)
         ]
         found += [(judged(look, change), change) for change in changes]
     return _likeliest(look, found)

@@ -12,12 +12,15 @@ from shapepose_fg.core.detections import Detections, Recording
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
+from shapepose_fg.setup_check.biases import COMMON
 from shapepose_fg.setup_check.diagnosis import diagnose
+from shapepose_fg.setup_check.evidence import Look, gather
 from shapepose_fg.setup_check.findings import Kind, sentence
 from shapepose_fg.setup_check.fit import FOCAL, Q, changed
 from shapepose_fg.setup_check.hypotheses import Lag
 from shapepose_fg.setup_check.matching import Sightings, least_of_each
 from shapepose_fg.setup_check.report import check_setup
+from shapepose_fg.setup_check.small_errors import Problem
 from tests.marks import slow
 from tests.setup_check.spoiled_setups import (
     biased,
@@ -129,6 +132,22 @@ def test_a_detector_s_biases_accuse_no_camera(recording, room, people, of, large
     else:
         larger = rng.uniform(-largest, largest, larger.shape)
     assert diagnose(biased(recording, room, people, bias, larger), room).findings == ()
+
+
+@pytest.mark.parametrize("of", ["one view", "every view"])
+def test_a_view_may_have_larger_biases_than_the_others(recording, room, people, of):
+    bias = lasting(np.random.default_rng(1), 0.06, 0.12, 3, 25, 5)
+    bias[:] = bias[:1]
+    if of == "one view":
+        bias[:, :, 1:] = 0
+    seen = gather(biased(recording, room, people, bias), range(len(recording)), len(room))
+    problem = Problem.of(Look.given(seen, room))
+    alike, also = (
+        np.logaddexp.reduce([each.log for each in problem.residuals.marginals(problem.given, **by)])
+        for by in ({"common": COMMON}, {})
+    )
+    # Odds of one biased view against equal biases in all views.
+    assert also - alike > 30 if of == "one view" else also - alike < 3
 
 
 @pytest.mark.slow
