@@ -22,9 +22,10 @@ from shapepose_fg.setup_check.evidence import Evidence, Look, gather
 from shapepose_fg.setup_check.exclusion import trust_of
 from shapepose_fg.setup_check.findings import SURE, Finding, Kind, one_of
 from shapepose_fg.setup_check.fit import difference
-from shapepose_fg.setup_check.hypotheses import GOOD_PAIR, Lag, lag_of, lags, mistake_of_cameras
+from shapepose_fg.setup_check.hypotheses import GOOD_PAIR, mistake_of_cameras
 from shapepose_fg.setup_check.joint_order import order_of_joints
 from shapepose_fg.setup_check.matching import MIN_SIGHTINGS, same_frame
+from shapepose_fg.setup_check.offset_scan import Lag, lag_of, lags
 from shapepose_fg.setup_check.over_time import parted, parting_of
 from shapepose_fg.setup_check.small_errors import LEAST_DEG, Problem
 
@@ -366,7 +367,7 @@ def _settled(look: Look, view: int, frames: int) -> tuple[Look, Problem]:
         problem = Problem.of(look)
         more = lag_of(replace(look, views=problem.relaxed()), view, _LAG_NEAR)
         frames = more.frames
-        if frames == 0 or more.agreement < 0:
+        if frames == 0 or more.gain < 0:
             break
     return look, problem
 

@@ -17,7 +17,6 @@ from shapepose_fg.setup_check.diagnosis import diagnose
 from shapepose_fg.setup_check.evidence import Look, gather
 from shapepose_fg.setup_check.findings import Kind, sentence
 from shapepose_fg.setup_check.fit import FOCAL, Q, changed
-from shapepose_fg.setup_check.hypotheses import Lag
 from shapepose_fg.setup_check.matching import Sightings, least_of_each
 from shapepose_fg.setup_check.report import check_setup
 from shapepose_fg.setup_check.small_errors import Problem
@@ -209,14 +208,6 @@ def test_of_one_person_alone_a_camera_is_not_accused_but_said_beside_the_detecto
     assert noted.sure + sum(camera.values()) == pytest.approx(
         1, abs=0.06
     )  # those under 0.05 are not said
-
-
-def test_who_is_near_by_chance_at_an_offset_makes_no_camera_late():
-    """As in a simulated crowd before three cameras in time, and in one whose camera was late by 7
-    frames.
-    """
-    assert not Lag(frames=2, gain=0.0068, likely=21.4, agreement=0.164, followed=-0.008).is_offset
-    assert Lag(frames=7, gain=0.0224, likely=59.0, agreement=0.261, followed=0.351).is_offset
 
 
 def test_no_step_of_a_focal_length_leaves_the_numbers(room):
