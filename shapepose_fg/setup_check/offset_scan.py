@@ -67,11 +67,11 @@ def lag_of(look: Look, view: int, most: int | None = None) -> Lag:
         for other in np.unique(rows.view).tolist()
         if other != view
     ]
-    known = np.isfinite(of_pairs)
-    if not known.any(axis=0)[most]:
+    known = np.isfinite(np.reshape(of_pairs, (-1, len(offsets))))
+    count = known.sum(axis=0)
+    if count[most] == 0:
         return Lag()
-    total = np.where(known, of_pairs, 0.0).sum(axis=0)
-    curve = total / np.where(known.any(axis=0), known.sum(axis=0), np.nan)
+    curve = np.where(known, of_pairs, 0.0).sum(axis=0) / np.where(count > 0, count, np.nan)
     best = int(np.nanargmin(curve))
     depth = float(np.nanmedian(curve) - curve[best])
     return Lag(int(offsets[best]), float(curve[most] - curve[best]) / max(depth, LEAST_MISS))

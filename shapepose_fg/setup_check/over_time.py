@@ -95,7 +95,8 @@ def parted(look: Look) -> tuple[int | None, int | None] | None:
     if len(views) != 2:
         return None
     groups, error, _ = look.pair(*views)
-    found = parting(*(look.seen_by(view).frame for view in views), groups.frame, error)
+    one, other = (look.seen_by(view).frame for view in views)
+    found = parting(one, other, groups.frame, error)
     if found is None or found.drop < _PARTED or min(found.before, found.after) > _POOR:
         return None
     return found.frames
@@ -181,7 +182,7 @@ def _turn(
     """(3,) the rotation, starting at `turn` or at that of single people, of which the camera has a
     share in each frame.
     """
-    near, far = (each.rows(share(each.frame) > 0.5) for each in (others, seen))
+    near, far = others.rows(share(others.frame) > 0.5), seen.rows(share(seen.frame) > 0.5)
     if min(len(near), len(far)) == 0:
         return turn
     shares = share(far.frame)
