@@ -409,4 +409,4 @@ def _pose(matrix: Array) -> gtsam.Pose3:
 
 
 def _refuse(text: str) -> Iterator[None]:
-    raise ValueError(f"{text} is no number")
+    raise ValueError(f"{text} is not a number")

@@ -128,7 +128,7 @@ class JointAngles:
     degrees: Array
     """(N, A) angles, degrees, -180 to 180."""
     covariance: Array
-    """(N, A, A) their covariance, square degrees; NaN where the result has no covariances."""
+    """(N, A, A) covariance of the angles, square degrees; NaN if the result has no covariances."""
 
     @property
     def sigma(self) -> Array:

@@ -607,8 +607,10 @@ class _Spectrum:
         return cls(mask, moved, square, centre)
 
     def over(self, other: "_Spectrum") -> tuple[Index, Array, Array]:
-        """Registrations of `other` at all lags (L,), in moments: (L, 4, 4) this frame from the
-        other, and scores (L,): the number of joints, nearer ones counting more.
+        """Rigid registrations of the track `other` to this one, at all lags.
+
+        Returns the lags (L,) in steps of the grid, poses (L, 4, 4) of the other's frame in this
+        one, and scores (L,): the number of joints, in which nearer joints count more.
         """
 
         def correlated(of: str, a: NDArray[np.complex128], b: NDArray[np.complex128]) -> Array:

@@ -209,7 +209,7 @@ def calibrate(
                 guessed if seen.calibration is None else set(whole.names) if focal else set(),
             )
         except Undetermined as error:
-            note(*error.problems)
+            note(*error.problems, f"{output} is not written: the cameras are not determined")
             raise typer.Exit(1) from None
     note(*found.notes)
     refused = [each for name, start in starts.items() if (each := start.refusal(name, *within))]
@@ -404,7 +404,7 @@ def _distances(given: list[str], names: Sequence[str]) -> tuple[tuple[int, int, 
         if len(cameras) != 2 or cameras[0] == cameras[1] or not set(cameras) <= set(names):
             raise InputError(
                 f"--distance {text}: give two cameras and metres, such as "
-                f"{names[0]},{names[1]}=3.42"
+                f"{names[0]},{names[1]}=3.42; there are {' '.join(names)}"
             )
         try:
             metres = float(number)

@@ -1,5 +1,6 @@
 """The command `live`: online reconstruction from detections as they arrive."""
 
+import os
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -85,6 +86,8 @@ def live(
                 of_cameras(f"the times of all cameras jumped to {view[2]:.2f} s")
             said = _say(people, said, of_cameras)
 
+        if os.isatty(0) if detections is None else detections.startswith("tcp:"):
+            note(f"reads from {detections or 'this terminal'} until Ctrl-C")
         try:
             feed(detections, rig, joints, of_lines, push)
         except InputError:

@@ -398,7 +398,10 @@ class TakeOptions(ResultOptions):
 def next_reconstruct(options: Mapping[str, object]) -> str:
     """A command line to copy: `reconstruct` with those `options` that have values."""
     words = [
-        word for name, value in options.items() if value is not None for word in (name, str(value))
+        word
+        for name, value in options.items()
+        if value is not None
+        for word in (name, f"{value:g}" if isinstance(value, float) else str(value))
     ]
     return f"next: {shlex.join(['shapepose-fg', 'reconstruct', *words])}"
 
@@ -410,8 +413,9 @@ def refuse_missing(places: Mapping[str, Path | None]) -> None:
         listed = " and ".join(
             [", ".join(missing[:-1]), missing[-1]] if len(missing) > 1 else missing
         )
+        them = "it" if len(missing) == 1 else "them"
         raise InputError(
-            f"{listed}: missing; give them, or --project with the folder of a Pose2Sim project"
+            f"{listed}: missing; give {them}, or --project with the folder of a Pose2Sim project"
         )
 
 

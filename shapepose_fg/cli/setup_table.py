@@ -46,7 +46,7 @@ def use_table(uses: Sequence[CameraUse]) -> RenderableType:
             for each in uses
         ),
         caption=(
-            "error: median / 90 % of all detections assigned to people; used: the same after "
+            "error: median/90 % of all detections assigned to people; used: the same after "
             "gating; left out: median distance from where the other cameras alone place the joint"
         ),
     )
@@ -73,8 +73,8 @@ def _cameras(cameras: Sequence[CameraFigures]) -> RenderableType:
                 _short(each.camera),
                 str(each.people),
                 f"{100 * each.matched:.0f} %",
-                f"{_two(each.median_px)} / {_two(each.high_px)}",
-                f"{_two(each.median_mm)} / {_two(each.high_mm)}",
+                _both(each.median_px, each.high_px),
+                _both(each.median_mm, each.high_mm),
                 _two(each.left_out_px),
                 _two(each.left_out_mm),
                 _share(each.left_out_matched),
@@ -84,7 +84,7 @@ def _cameras(cameras: Sequence[CameraFigures]) -> RenderableType:
         ),
         caption=(
             "people: seen in the checked frames; shared: seen by another camera, too; error: "
-            "median / 90 % of the distance from where all cameras place the joints; left out: "
+            "median/90 % of the distance from where all cameras place the joints; left out: "
             "median distance from where the other cameras alone place them; fits: people of the "
             "others who match; late: offset in frames."
         ),
@@ -133,7 +133,7 @@ def _short(name: str) -> str:
 
 
 def _both(median: float | None, high: float | None) -> str:
-    return f"{_two(median)} / {_two(high)}" if median is not None else "-"
+    return f"{_two(median)}/{_two(high)}" if median is not None else "-"
 
 
 def _two(value: float | None) -> str:

@@ -91,7 +91,7 @@ def show(content: "RenderableType") -> None:
     """Print on stdout; colours only on a terminal. Text is not parsed as markup, because it
     contains names and paths.
     """
-    console().print(content)
+    console().print(content, crop=False)
 
 
 def show_json(value: Any) -> None:
@@ -107,10 +107,16 @@ def table(
     from rich.table import Table
     from rich.text import Text
 
-    made = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="dim")
+    cells = [list(row) for row in rows]
+    columns = (" ".join(map(str, column)).split() for column in zip(heads, *cells, strict=True))
+    # Narrower columns would break words.
+    widths = [max(map(len, words), default=0) for words in columns]
+    gap = 2 if sum(widths) + 2 * len(heads) <= console().width else 1
+    made = Table(box=None, pad_edge=False, padding=(0, gap, 0, 0), header_style="dim")
     for n, head in enumerate(heads):
-        made.add_column(head, justify="left" if n < left else "right", overflow="fold")
-    for row in rows:
+        side = "left" if n < left else "right"
+        made.add_column(head, justify=side, min_width=widths[n], overflow="fold")
+    for row in cells:
         made.add_row(*row)
     return Group(made, Text(caption, style="dim")) if caption else made
 

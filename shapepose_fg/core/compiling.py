@@ -16,6 +16,9 @@ from shapepose_fg.core.kept_kernels import kept_folder, wanted_folder
 _BYTES_S = 1300
 """Bytes of Python bytecode that an average machine compiles in a second."""
 
+_spent_s = 0.0
+"""Time that `compile_beside` took in this process, s."""
+
 _tried = False
 """Whether this process has compiled the missing kernels; kernels that are missing later are
 compiled when they are called."""
@@ -27,10 +30,10 @@ def compile_beside(kernels: Sequence[Any]) -> None:
 
     If another process is compiling, waits for it.
     """
-    global _tried
+    global _tried, _spent_s
     if _tried:
         return
-    _tried = True
+    _tried, start = True, time.monotonic()
     place = kept_folder()
     with _alone():
         missing = [each for each in kernels if not each.is_kept]
@@ -41,8 +44,8 @@ def compile_beside(kernels: Sequence[Any]) -> None:
         # time, so more processes give no speed-up.
         count = min(cores(), 8, len(missing)) if lasts_s > 3.0 and place is not None else 1
         what = (
-            f"compiling {len(missing)} functions for this machine, which takes about"
-            f" {max(lasts_s / count, 1):.0f} s"
+            f"compiling {len(missing)} function{'s' * (len(missing) > 1)} for this machine, which"
+            f" takes about {max(lasts_s / count, 1):.0f} s"
         )
         if place != wanted_folder():
             cure = "set NUMBA_CACHE_DIR to a writable folder"
@@ -53,6 +56,12 @@ def compile_beside(kernels: Sequence[Any]) -> None:
             else:
                 for each in missing:
                     each.load()
+    _spent_s = time.monotonic() - start
+
+
+def compiled_for_s() -> float:
+    """Time that this process has spent on compiling, seconds."""
+    return _spent_s
 
 
 def _share_out(kernels: Sequence[Any], count: int) -> None:
@@ -115,8 +124,7 @@ def saying(what: str) -> Iterator[None]:
     """
     timer = Timer(1.0, logging.getLogger(__name__).warning, [what])
     timer.daemon = True
-    if what:
-        timer.start()
+    timer.start()
     try:
         yield
     finally:

@@ -367,8 +367,8 @@ class BodyWindow:
         return np.asarray(whole - prior)
 
     def deviation(self, bodies: Array) -> Array:
-        """(T, J, 3) X - J that is best for bodies (T, J, 3) that have moved from the last solution,
-        metres around the origin.
+        """Most probable deviations (T, J, 3) of the joints from the joints of given `bodies`
+        (T, J, 3), metres, with gates and weights as at the last solution.
         """
         return self._deviation(self.last, bodies)
 

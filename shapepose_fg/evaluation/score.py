@@ -214,7 +214,7 @@ def _joints(people: PlainPeople, index: list[int], names: tuple[str, ...]) -> Pl
 
 
 def _rows(people: PlainPeople, index: Mask) -> PlainPeople:
-    """The rows of a mask (N,)."""
+    """The rows of people that a mask (N,) selects."""
     covariance = None if people.covariance is None else people.covariance[index]
     columns = {name: getattr(people, name)[index] for name in ("frame", "person", "joints")}
     return replace(people, **columns, covariance=covariance)

@@ -247,7 +247,7 @@ def _calibration(session: Path, folder: Path) -> Path:
         there = listing(sorted(each.name for each in rooms[0].iterdir()))
         cure = "run Pose2Sim's calibration, or put a format of docs/calibration_files.md there"
         raise InputError(
-            f"{rooms[0]}: there is no calibration in a known format, only {there}; {cure}"
+            f"{rooms[0]}: there is no calibration in a known format; it contains {there}; {cure}"
         )
     return found
 

@@ -56,7 +56,7 @@ class ViewReason:
     probability: float
     """Probability that the detection is this person's, from the assignment."""
     sigma_px: float | None
-    """Standard deviation of such a detection per axis, pixels."""
+    """Standard deviation of a detection with this score per axis, pixels."""
     residual_px: tuple[float, float] | None
     """The projection of the joint as reported minus the detection, pixels."""
     off_px: float | None

@@ -100,6 +100,7 @@ def pipeline(monkeypatch) -> dict:
         return Assembly(parts, BODY_25.joints, rig.names, run=run)
 
     monkeypatch.setattr(shapepose_fg.cli.reconstruct.run, "reconstruct_parts", fake)
+    monkeypatch.setattr("shapepose_fg.core.compiling._spent_s", 0.0)  # by tests that went before
     return called
 
 
@@ -133,7 +134,6 @@ def test_reconstruct_writes_results_and_says_what_it_found(recording, pipeline, 
     for part in (
         "100.0 % seen by two views; median sigma 20 mm",
         "5.0 ms a frame",
-        "vote 5.0",
         "out/people.npz",
         "out/run.json",
     ):

@@ -10,7 +10,7 @@ from rich.table import Table
 
 from shapepose_fg.cli.main import main
 from shapepose_fg.cli.setup_table import use_table
-from shapepose_fg.cli.terminal import bars, note, progress, show, use_any_streams
+from shapepose_fg.cli.terminal import bars, note, progress, show, table, use_any_streams
 from shapepose_fg.setup_check.report import CameraUse, Distances
 
 
@@ -60,6 +60,18 @@ def test_what_is_said_has_no_escapes(capsys, monkeypatch):
     monkeypatch.delenv("NO_COLOR", raising=False)
     note(ESCAPES)
     assert capsys.readouterr().err.startswith("\x1b[1mnote: \x1b[0m"), "colours of our own stay"
+
+
+@pytest.mark.parametrize("columns", [30, 42, 60, 100])
+def test_words_of_a_table_stay_whole_on_a_narrow_terminal(columns, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", str(columns))
+    heads = ("camera", "detected", "left out px", "probability")
+    show(table(heads, [("cam01", "1234", "12/340", "0.99"), ("cam02", "7", "3.1/9", "1.00")]))
+    lines = capsys.readouterr().out.splitlines()
+    assert {"camera", "detected", "left", "out", "px", "probability", "12/340"} <= set(
+        " ".join(lines).split()
+    )
+    assert max(map(len, lines)) <= max(columns, 37)  # the longest words, with a gap of one
 
 
 def test_names_and_keys_of_files_reach_no_terminal_as_they_are(tmp_path, capsys):

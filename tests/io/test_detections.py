@@ -230,13 +230,13 @@ def test_no_detections(tmp_path, text_folder, rig):
         tmp_path,
         rig,
         tmp_path,
-        "no detections of the cameras left right, only empty readme.md recording",
+        "no detections of the cameras left right; it contains empty readme.md recording",
     )
     refuses(
         tmp_path / "empty",
         rig,
         tmp_path / "empty",
-        "only nothing; give the folder with <camera>.txt",
+        "it contains nothing; give the folder with <camera>.txt",
     )
     refuses(tmp_path / "nowhere", rig, tmp_path / "nowhere", "there is no such folder")
     left = text_folder / "left.txt"

@@ -138,7 +138,7 @@ def test_what_is_missing_is_named_with_the_cure(project):
     said = refusal(project)
     assert f"shapepose-fg detect --project {project} --network NETWORK" in said
     (project / "calibration" / "rig.json").unlink()
-    assert "no calibration in a known format, only nothing" in refusal(project)
+    assert "no calibration in a known format; it contains nothing" in refusal(project)
     (project / "calibration").rmdir()
     assert "there is no calibration folder" in refusal(project)
     (project / "Config.toml").unlink()

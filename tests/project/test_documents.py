@@ -96,18 +96,20 @@ def matrix_text(frame: Detections, first: np.ndarray, second: np.ndarray) -> str
 
 @pytest.fixture
 def recording(tmp_path, monkeypatch) -> Scene:
-    """A reader's folder with calibration.json, detections/ of six frames of the scene, and
-    settings.toml.
-    """
+    """A reader's folder with six frames of the scene."""
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "settings.toml").write_text(toml_text(PipelineConfig()))
-    scene = built_in_scene(frames=6)
+    return a_reader_s_folder(built_in_scene(frames=6))
+
+
+def a_reader_s_folder(scene: Scene) -> Scene:
+    """Write calibration.json, detections/ and settings.toml here; returns the scene."""
+    Path("settings.toml").write_text(toml_text(PipelineConfig()))
     seen = simulate(scene)
-    write_rig(scene.rig, tmp_path / "calibration.json")
-    (tmp_path / "detections").mkdir()
+    write_rig(scene.rig, "calibration.json")
+    Path("detections").mkdir()
     for view, camera in enumerate(scene.rig.cameras):
         text = association_text(seen, view, camera.image_size)
-        (tmp_path / "detections" / f"{camera.name}.txt").write_text(text)
+        Path("detections", f"{camera.name}.txt").write_text(text)
     return scene
 
 
@@ -134,25 +136,6 @@ def wrists_apart(people: Reconstruction) -> float:
     """Median over people of the distance between the wrists, metres."""
     ends = people.joints[:, [BODY_25.index("RWrist"), BODY_25.index("LWrist")]]
     return float(np.median(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)))
-
-
-@pytest.mark.slow
-def test_readme_in_the_shell(recording, tmp_path, capsys):
-    lines = [
-        line.split("  #")[0]
-        for block in blocks(ROOT / "README.md", "bash")
-        for line in block.splitlines()
-    ]
-    commands = [line for line in lines if line.startswith("shapepose-fg") and "SMPL" not in line]
-    assert [command.split()[1] for command in commands] == ["reconstruct", "export"]
-    for command in commands:
-        with pytest.raises(SystemExit) as end:
-            main(shlex.split(command)[1:])
-        assert end.value.code == 0
-    found = joint_metrics(Reconstruction.load(tmp_path / "results"), recording.keypoints)
-    assert found.people_missed == found.false_positives == 0
-    kinds = {path.suffix for path in (tmp_path / "results" / "export").iterdir()}
-    assert kinds == {".npz", ".trc", ".c3d", ".bvh", ".glb", ".csv", ".parquet"}
 
 
 def moving(scene: Scene) -> dict:
@@ -211,39 +194,37 @@ def known_truth(scene: Scene) -> dict:
 
 
 PREPARED = {
-    "body_fitting": measured,
-    "body_model": lambda scene: {"detections": simulate(scene), "rig": scene.rig},
-    "angles": known_truth,
-    "calibration_files": two_pickled_cameras,
-    "conventions": lambda scene: {},
-    "export": exported,
-    "live": lambda scene: {},
-    "joints": lambda scene: {},
-    "moving_cameras": moving,
-    "results": known_truth,
-    "simulation": lambda scene: {},
+    "docs/body_fitting.md": measured,
+    "docs/body_model.md": lambda scene: {"detections": simulate(scene), "rig": scene.rig},
+    "docs/evaluation/angles.md": known_truth,
+    "docs/calibration_files.md": two_pickled_cameras,
+    "docs/conventions.md": lambda scene: {},
+    "docs/export.md": exported,
+    "docs/live.md": lambda scene: {},
+    "docs/joints.md": lambda scene: {},
+    "docs/moving_cameras.md": moving,
+    "docs/results.md": known_truth,
+    "docs/simulation.md": lambda scene: {},
 }
 """Functions that prepare what the code of a page expects, and return names that it does not make,
 by page."""
-ELSEWHERE = {"README", "using", "extending", "factors", "ros", "research", "robots"}
+ELSEWHERE = {"README.md", "docs/using.md", "docs/extending.md", "docs/factors.md", "docs/ros.md"}
 """Pages whose code other tests run; that of ros.md needs an installation of ROS."""
+GUIDES = [page for page in PAGES if page.parent.name == "guides"]
 
 
 def test_the_code_of_every_page_is_run():
-    with_code = {page.stem for page in PAGES if blocks(page, "python")}
-    assert with_code <= PREPARED.keys() | ELSEWHERE | {page.stem for page in GUIDES}
+    with_code = {page.relative_to(ROOT).as_posix() for page in PAGES if blocks(page, "python")}
+    guides = {page.relative_to(ROOT).as_posix() for page in GUIDES}
+    assert with_code - guides == PREPARED.keys() | ELSEWHERE
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", PREPARED)
 def test_the_python_of_a_page_runs(page, recording):
-    if page == "export":
+    if page == "docs/export.md":
         pytest.importorskip("pyarrow", reason="needs the extra archive")
-    there = min((each for each in PAGES if each.stem == page), key=lambda each: len(each.parts))
-    run(there, names=PREPARED[page](recording))
-
-
-GUIDES = [page for page in PAGES if page.parent.name == "guides"]
+    run(ROOT / page, names=PREPARED[page](recording))
 
 
 @pytest.mark.slow
@@ -281,6 +262,43 @@ def test_blocks_that_simulate_their_recording_run(page, tmp_path, monkeypatch, c
     monkeypatch.chdir(tmp_path)
     for block in simulating(page):
         type_commands(block, capsys)
+
+
+OF_THE_READER = ("...", "calibration.toml", "mcap", "--resume", "shelf", "theirs", "SMPL_NEUTRAL")
+"""Words in commands that need more than the recording of a reader's folder, or an extra."""
+
+
+@pytest.mark.slow
+def test_commands_of_pages_run_in_a_reader_s_folder(tmp_path, monkeypatch, capsys):
+    """The README's, then those of all other pages that need a recording, its result or its truth;
+    those that reconstruct it in another way last.
+    """
+    monkeypatch.chdir(tmp_path)
+    scene = a_reader_s_folder(built_in_scene(frames=20))
+    truth_of(scene).save("truth")
+    known = ("reconstruct", "report", "explain", "tracks", "evaluate", "export")
+
+    def commands(page: Path) -> list[str]:
+        shell = [block for block in blocks(page, "bash") if block not in simulating(page)]
+        return [
+            command
+            for command in commands_in("".join(shell))
+            if command.split()[1] in known and not any(word in command for word in OF_THE_READER)
+        ]
+
+    readme = commands(ROOT / "README.md")
+    assert [command.split()[1] for command in readme] == ["reconstruct", "export"]
+    type_commands("\n".join(readme), capsys)
+    found = joint_metrics(Reconstruction.load("results"), scene.keypoints)
+    assert found.people_missed == found.false_positives == 0
+    kinds = {path.suffix for path in Path("results", "export").iterdir()}
+    assert kinds == {".npz", ".trc", ".c3d", ".bvh", ".glb", ".csv", ".parquet"}
+
+    pages = [page for page in PAGES if page not in GUIDES and page != ROOT / "README.md"]
+    others = dict.fromkeys(command for page in pages for command in commands(page))
+    assert {command.split()[1] for command in others} == set(known)
+    for command in sorted(others, key=lambda each: " reconstruct " in each):
+        type_commands(command + " --overwrite" * (" reconstruct " in command), capsys)
 
 
 def steps(result: Reconstruction, feet: np.ndarray) -> np.ndarray:

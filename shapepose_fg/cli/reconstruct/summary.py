@@ -8,6 +8,7 @@ from rich.table import Table
 from shapepose_fg.cli.reconstruct.request import Prepared
 from shapepose_fg.cli.setup_table import use_table
 from shapepose_fg.cli.terminal import note, show, warn
+from shapepose_fg.core.compiling import compiled_for_s
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import rate_words
 from shapepose_fg.core.reconstruction import Reconstruction
@@ -117,12 +118,13 @@ def summary_table(
         table.add_row("joints", _joints(counts["joints"], people))
     # Loading the body and the set-up check are done once, and not part of the time per frame.
     once, spent = ("load", "set-up check"), run.get("seconds", {})
-    stages = {name: each for name, each in spent.items() if name not in once}
-    table.add_row(
-        "time", f"{1e3 * sum(stages.values()) / len(span):.1f} ms a frame, {seconds:.1f} s in all"
-    )
-    words = (f"{name} {1e3 * each / len(span):.1f}" for name, each in stages.items())
-    table.add_row("", "  ".join(words), style="dim")
+    ms = sum(1e3 * each / len(span) for name, each in spent.items() if name not in once)
+    words = f"{seconds:.1f} s in all"
+    if (compiled_s := compiled_for_s()) > 1:
+        words += f", {compiled_s:.0f} s of it to compile, only at the first run"
+    else:
+        words = f"{ms:.1f} ms a frame, {words}"
+    table.add_row("time", words)
     return table
 
 

@@ -122,7 +122,7 @@ def read_detections(
     else:
         skeleton, how = (
             _skeleton_of_streams(streams, wanted),
-            ("they are between the two joints that one neighbour connects"),
+            ("they are midpoints of the two joints that their limbs connect"),
         )
     made = [skeleton.joints[joint] for joint, _, _ in skeleton.middles]
     notes += [f"{skeleton.name} has no {' and no '.join(made)}: {how}"] if made else []
@@ -180,10 +180,10 @@ def find_places(path: Path, rig: Rig) -> tuple[Format, list[Path], list[str]]:
         if each.is_file() and (known := what_it_is(each)) is not None:
             raise InputError(f"{each}: this is {known}")
     raise InputError(
-        f"{folder}: there are no detections of the cameras {' '.join(rig.names)}, only {holds}; "
-        "give the folder with <camera>.txt (4D Association), <camera>/ or <camera>_json/ with a "
-        "JSON file per frame (OpenPose, Pose2Sim, MMPose), or <camera>.json (COCO's results, "
-        "AlphaPose, MMPose)"
+        f"{folder}: there are no detections of the cameras {' '.join(rig.names)}; it contains "
+        f"{holds}; give the folder with <camera>.txt (4D Association), <camera>/ or <camera>_json/ "
+        "with a JSON file per frame (OpenPose, Pose2Sim, MMPose), or <camera>.json (COCO's "
+        "results, AlphaPose, MMPose)"
     )
 
 
@@ -213,7 +213,7 @@ def camera_names(path: Path) -> list[str]:
                 return [name for name, there in zip(names, holds, strict=True) if there]
     holds = listing([each.name for each in entries])
     cure = "give the folder with a file or folder for each camera"
-    raise InputError(f"{folder}: there are no detections, only {holds}; {cure}")
+    raise InputError(f"{folder}: there are no detections; it contains {holds}; {cure}")
 
 
 def _entries(path: Path) -> tuple[Path, list[Path]]:
@@ -293,7 +293,8 @@ def _skeleton_of_streams(streams: Sequence[ViewStream], wanted: Skeleton | None)
             )
     if wanted is not None and wanted.joints != skeleton.joints:
         raise InputError(
-            f"{first.source}: these are joints of {skeleton.name}, not of {wanted.name}"
+            f"{first.source}: these are joints of {skeleton.name}, not of {wanted.name}; give "
+            "that as the skeleton, or none"
         )
     return skeleton
 

@@ -142,11 +142,10 @@ class Parts:
     def checkpoint(
         self, read: Callable[[int], Input], frames: range, nobody: Tracks
     ) -> Checkpoint | None:
-        """State for continuing tracking; None at the beginning. `read` returns the input of a
-        frame.
+        """The tracker's state from which an interrupted run continues; None at the beginning.
 
-        Raises InputError if it is not of a run with these `frames`, and tracks in the form of
-        `nobody`.
+        `read` returns the input of a frame; `nobody` has the tracker's joints and state size, but
+        no tracks. Raises InputError if the state belongs to other `frames` or other joints.
         """
         name = self._followed
         if name is None:
