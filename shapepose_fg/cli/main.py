@@ -43,8 +43,9 @@ from shapepose_fg.core.storage.output_folder import prepare_output
 # All other modules are imported inside the commands, so that `--help` does not wait for GTSAM and
 # Numba.
 
+_NAME = "shapepose-fg"
 app = typer.Typer(
-    name="shapepose-fg",
+    name=_NAME,
     help="Reconstruct several people in 3D, with bodies, from several calibrated cameras.",
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -81,15 +82,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         arguments = ["version"]
     try:
         with stoppable():
-            code = app(arguments or ["--help"], standalone_mode=False)
+            code = app(arguments or ["--help"], standalone_mode=False, prog_name=_NAME)
             sys.stdout.flush()
     except _UsageProblem as error:
         message = cast(Any, error).format_message().rstrip(".").replace("Value error, ", "")
-        words, context = ["--help"], getattr(error, "ctx", None)
-        while context is not None and context.parent is not None:
-            words.insert(0, context.info_name)
-            context = context.parent
-        code = _fail(f"{message}; see shapepose-fg {' '.join(words)}")
+        path = getattr(getattr(error, "ctx", None), "command_path", _NAME)
+        code = _fail(f"{message}; see {path} --help")
     except InputError as error:
         code = _fail(str(error))
     except BrokenPipeError:  # the reader of our output, such as `head`, has ended
