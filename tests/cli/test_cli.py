@@ -22,9 +22,8 @@ from shapepose_fg.core.errors import WorkLost
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.notes import Notes
 from shapepose_fg.core.observation_table import ObservationTable
-from shapepose_fg.core.reconstruction import Known, Reconstruction, Status
+from shapepose_fg.core.reconstruction import BODY, Known, Reconstruction, Status
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.pipeline.bodies_over_time import BodiesOverTime
 from shapepose_fg.pipeline.runs.assembly import Assembly
 from shapepose_fg.pipeline.runs.parts import Part, Parts
 
@@ -192,18 +191,9 @@ def test_shapes_are_kept_from_one_recording_to_the_next(
     def with_shapes(kept, task, execution):
         result, shapes = fake(kept, task, execution), task.shapes
         found = SubjectShapes(np.array(["0"]), np.full((1, 10), 0.5), np.eye(10)[None], shapes.body)
-        rows = result.rows_of
-        nobody = {
-            "ok": np.zeros(1, dtype=bool),
-            "betas": np.zeros((1, 10)),
-            "transl": np.zeros((1, 3)),
-        }
-        nobody |= {"global_orient": np.zeros((1, 3)), "body_pose": np.zeros((1, 23, 3))}
-        for number in rows:
-            result.parts.kept.keep(f"bodies-{number}", nobody)
-        places = {number: {f"bodies-{number}": range(count)} for number, count in rows.items()}
-        bodies = BodiesOverTime(result.parts.kept, places, found)
-        return replace(result, bodies=bodies)
+        for n in range(len(result.parts)):
+            result.keep_bodies(n, {name: result.parts.column(n, name) for name in BODY})
+        return replace(result, shapes=found)
 
     monkeypatch.setattr(shapepose_fg.cli.reconstruct.run, "reconstruct_parts", with_shapes)
     assert run(*recording, "--shapes", str(file)) == 0
