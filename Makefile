@@ -50,15 +50,16 @@ benchmark: $(VENV)/installed
 PIP := install -q --disable-pip-version-check --no-compile $(PIP_ARGS)
 UV := $(BIN)/uv pip install -q --python $(BIN)/python $(PIP_ARGS)
 
+# uv needs a quarter of pip's time. It does not know pip's settings: where they are needed, pip installs.
+# What is compiled here would be compiled at the first start, or at every one where nothing can be written.
 $(VENV)/installed: pyproject.toml constraints.txt
-	test -x $(BIN)/python || $(PYTHON) -m venv --without-pip $(VENV)
-	# uv needs a quarter of pip's time. It does not know pip's settings: where they are needed, pip installs.
-	$(PYTHON) -m pip --python $(BIN)/python $(PIP) uv && $(UV) -c constraints.txt -e ".[dev]" || \
+	@echo "installing into $(VENV), then compiling: some minutes, once"
+	@test -x $(BIN)/python || $(PYTHON) -m venv --without-pip $(VENV)
+	@$(PYTHON) -m pip --python $(BIN)/python $(PIP) uv && $(UV) -c constraints.txt -e ".[dev]" || \
 		$(MAKE) --no-print-directory EXTRA=dev install
-	# Done at the first start otherwise, or at every one where nothing can be written.
-	$(BIN)/python -m compileall -q -j $(JOBS) shapepose_fg factors
-	-$(BIN)/shapepose-fg compile
-	touch $@
+	@$(BIN)/python -m compileall -q -j $(JOBS) shapepose_fg factors
+	-@$(BIN)/shapepose-fg compile
+	@touch $@
 
 $(VENV)/installed-docs: $(VENV)/installed
 	$(MAKE) --no-print-directory EXTRA=docs install

@@ -36,7 +36,7 @@ def main() -> None:
     problem = Problem.of(Look.given(gather(detections, range(len(detections)), len(rig)), rig))
     found = []
     for shift, larger in product(RATIOS, RATIOS):
-        marginals = problem.residuals.marginals(problem.given, LEVELS, shift, larger)
+        marginals = problem.residuals.marginals(problem.given, LEVELS, shift, larger, COMMON)
         for (level, common), each in zip(product(LEVELS, COMMON), marginals, strict=True):
             found.append((each.log, level, shift * level, larger * level, common * level))
     best = max(found)[0]

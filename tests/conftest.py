@@ -25,6 +25,7 @@ from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25, Skeleton
 from shapepose_fg.pipeline.pipeline import reconstruct
 from shapepose_fg.simulation import Scene, built_in_scene, simulate
+from shapepose_fg.simulation.mocap import Mocap
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # A shell that starts the tests in the background has programs ignore Ctrl-C, which tests send.
@@ -118,6 +119,15 @@ def shared_data() -> Path:
             f"no real recordings at {root}: set SHAPEPOSE_DATA to their folder to run this test"
         )
     return root / "data"
+
+
+@pytest.fixture(scope="session")
+def real_mocap(shared_data: Path) -> Mocap:
+    """The recordings of CMU; skips where they are not."""
+    path = shared_data / "cmu_mocap" / "cmu_smpl24.npz"
+    if not path.is_file():
+        pytest.skip(f"no recorded motions at {path}")
+    return Mocap.load(path)
 
 
 @pytest.fixture(scope="session")

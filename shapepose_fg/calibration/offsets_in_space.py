@@ -8,7 +8,7 @@ from itertools import combinations
 import numpy as np
 
 from shapepose_fg.calibration.pairwise import Pairwise, fast_part
-from shapepose_fg.calibration.tracks import FAST_S, FASTEST, LEAST_MISS, Tracks, block_frames
+from shapepose_fg.calibration.tracks import FAST_S, FASTEST, Tracks, block_frames
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Views
 from shapepose_fg.setup_check.evidence import triangulate
@@ -20,6 +20,7 @@ from shapepose_fg.setup_check.matching import (
     centres_of,
     median_of,
 )
+from shapepose_fg.setup_check.offset_scan import LEAST_MISS
 
 _MOST_PLACED = 20_000
 """Maximum number of rows of tracks that are triangulated, over all cameras."""

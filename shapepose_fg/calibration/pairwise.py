@@ -9,12 +9,12 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from shapepose_fg.body.model.rotation import hat
-from shapepose_fg.calibration.offset_scan import normals
 from shapepose_fg.calibration.relative import Together
 from shapepose_fg.calibration.tracks import FAST_S, Tracks, block_frames
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Views
 from shapepose_fg.setup_check.matching import centres_of
+from shapepose_fg.setup_check.offset_scan import normals
 
 _MOST_SAMPLES = 3000
 """Maximum number of frames of tracks that are compared for a pair of cameras."""

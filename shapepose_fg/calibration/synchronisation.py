@@ -12,15 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from shapepose_fg.calibration.offset_scan import chosen, scan
 from shapepose_fg.calibration.offsets_in_space import InSpace
 from shapepose_fg.calibration.pairwise import Pairwise
 from shapepose_fg.calibration.tracks import Tracks, at_regular_times
-from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.setup_check.matching import Sightings
+from shapepose_fg.setup_check.offset_scan import LEAST_MISS, scan
 
 _STEP_S = 0.1
 """Step of the first scan of offsets, s: people's joints move by 10 cm."""
@@ -167,3 +167,55 @@ def offsets(
     offset = -(shift + start)
     offset = offset - offset[0]
     return offset / fps, _WIDER * np.sqrt(np.diag(covariance)) / fps, sure
+
+
+def chosen(
+    curves: dict[tuple[int, int], Array], lags: Index, views: int, around: int
+) -> tuple[Array, Array]:
+    """(V,) shifts relative to the first camera, and their prominence (V,).
+
+    Cameras are added one by one in order of prominence, each at the offset that fits all those
+    before it: frame f of the first camera is frame f + shift of another.
+    """
+    step = int(lags[1] - lags[0]) if len(lags) > 1 else 1
+    half = len(lags) // 2
+
+    def fit(one: int, other: int, apart: Index) -> Array:
+        """Fit of two cameras at offsets `apart`: standard deviations below the median over all
+        offsets.
+        """
+        curve = curves[one, other] if one < other else curves[other, one][::-1]
+        known = np.isfinite(curve)
+        if known.sum() < 3:
+            return np.zeros(len(apart))
+        middle = np.median(curve[known])
+        spread = max(1.5 * float(np.median(np.abs(curve[known] - middle))), LEAST_MISS)
+        place = np.clip(apart + half, 0, len(lags) - 1)
+        inside = (np.abs(apart) <= half) & known[place]
+        return np.where(inside, (middle - curve[place]) / spread, 0.0)
+
+    def best(view: int, placed: dict[int, int]) -> tuple[float, int]:
+        low, high = min(placed.values()) - half, max(placed.values()) + half
+        tried = np.arange(low, high + 1)
+        worth = np.sum(
+            [fit(one, view, tried - at) for one, at in placed.items()], axis=0
+        ) / np.sqrt(len(placed))
+        top = int(np.argmax(worth))
+        far = np.abs(tried - tried[top]) * step > around
+        return float(worth[top] - worth[far].max(initial=0.0)), int(tried[top])
+
+    margins = {pair: best(pair[1], {pair[0]: 0})[0] for pair in curves}
+    root = max(margins, key=lambda pair: margins[pair])[0]
+    placed = {root: 0}
+    while len(placed) < views:
+        offers = {view: best(view, placed) for view in range(views) if view not in placed}
+        view = max(offers, key=lambda each: offers[each][0])
+        placed[view] = offers[view][1]
+    for _ in range(2):
+        for view in range(views):
+            placed[view] = best(view, {one: at for one, at in placed.items() if one != view})[1]
+    sure = np.array(
+        [best(view, {o: at for o, at in placed.items() if o != view})[0] for view in range(views)]
+    )
+    shift = np.array([placed[view] for view in range(views)]) * step
+    return shift - shift[0], sure

@@ -24,9 +24,6 @@ FAST_S = 1.0
 count as one: errors of detectors and cameras are correlated."""
 FASTEST = 2.0
 """Maximum speed of a joint, statures per second; faster ones are identity switches."""
-LEAST_MISS = 0.004
-"""Minimum error of a detector as a share of a person's size: 7 mm."""
-
 _SAME_TIME = 1e-3
 """Difference of times that is ignored, frames."""
 _LEAST_AROUND, _LEAST_SPREAD = 0.6, 0.25

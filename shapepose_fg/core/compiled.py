@@ -18,7 +18,7 @@ from typing import Any, TypeVar, cast
 import numba
 from numba.extending import typeof_impl
 
-from shapepose_fg.core.compiling import compile_beside, saying
+from shapepose_fg.core.compiling import compile_beside
 from shapepose_fg.core.kept_kernels import NUMBA, OPTIONS, kept_in, module_folder
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -114,8 +114,7 @@ class Kernel:
         return None
 
     def _compile(self, function: Any) -> Any:
-        with saying("" if self.is_kept else "compiling a function for this machine"):
-            function.compile(signature(self))
+        function.compile(signature(self))
         return function
 
 

@@ -16,11 +16,8 @@ from shapepose_fg.core.kept_kernels import kept_folder, wanted_folder
 _BYTES_S = 1300
 """Bytes of Python bytecode that an average machine compiles in a second."""
 
-_is_said = False
-"""Whether a message of `saying` covers what runs now."""
-
-spent_s = 0.0
-"""Time that `compile_beside` took in this process, seconds."""
+_spent_s = 0.0
+"""Time that `compile_beside` took in this process, s."""
 
 _tried = False
 """Whether this process has compiled the missing kernels; kernels that are missing later are
@@ -33,7 +30,7 @@ def compile_beside(kernels: Sequence[Any]) -> None:
 
     If another process is compiling, waits for it.
     """
-    global _tried, spent_s
+    global _tried, _spent_s
     if _tried:
         return
     _tried, start = True, time.monotonic()
@@ -59,7 +56,12 @@ def compile_beside(kernels: Sequence[Any]) -> None:
             else:
                 for each in missing:
                     each.load()
-    spent_s = time.monotonic() - start
+    _spent_s = time.monotonic() - start
+
+
+def compiled_for_s() -> float:
+    """Time that this process has spent on compiling, seconds."""
+    return _spent_s
 
 
 def _share_out(kernels: Sequence[Any], count: int) -> None:
@@ -117,21 +119,16 @@ def _load(names: Sequence[str]) -> None:
 
 @contextmanager
 def saying(what: str) -> Iterator[None]:
-    """Log `what` if the block takes more than a second, unless an outer block says its own; as a
-    warning, which Python prints even if logging is not configured.
+    """Log `what` if the block takes more than a second; as a warning, which Python prints even if
+    logging is not configured.
     """
-    global _is_said
-    if _is_said or not what:
-        yield
-        return
     timer = Timer(1.0, logging.getLogger(__name__).warning, [what])
-    timer.daemon, _is_said = True, True
+    timer.daemon = True
     timer.start()
     try:
         yield
     finally:
         timer.cancel()
-        _is_said = False
 
 
 @contextmanager

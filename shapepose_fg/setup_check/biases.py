@@ -21,7 +21,8 @@ LEVELS = (0.005, 0.01, 0.02, 0.04, 0.08)
 """Standard deviations of a persistent bias of a person's joint in a view, as shares of the person's
 size. On four recordings real detectors have 0.0025 to 0.02 (scripts/measure_biases.py)."""
 COMMON = (0.1, 1.0, 10.0)
-"""Standard deviation of the bias common to all people, relative to that of one person."""
+"""Standard deviation of the bias common to all people, relative to that of one person. In one of
+the views it may have the largest of these ratios, and 1 in the others."""
 SHIFT, LARGER = 1.0, 3.0
 """Standard deviations of the shift of a whole person, and of the relative scaling, over that of a
 joint; real ones are 0.3 to 3."""
@@ -120,13 +121,18 @@ class Residuals:
         levels: Sequence[float] = LEVELS,
         shift: float = SHIFT,
         larger: float = LARGER,
+        common: Sequence[float | Array] | None = None,
     ) -> list[Marginal]:
         """Marginal likelihoods around the cameras `views` for each size of biases: `levels`, each
-        with all of `COMMON`.
+        with all ratios `common`, of all views or of each (V,), by default those of `COMMON`.
         """
         information = self._information(views)
+        if common is None:
+            common = [*COMMON, *np.where(np.eye(len(views)) > 0, COMMON[-1], 1.0)]
         return [
-            each for n in levels for each in self._marginals(information, n, shift * n, larger * n)
+            each
+            for n in levels
+            for each in self._marginals(information, n, shift * n, larger * n, common)
         ]
 
     def _rows(self, views: Views) -> Array:
@@ -179,9 +185,16 @@ class Residuals:
         return found
 
     def _marginals(
-        self, information: Array, level: float, shift: float, larger: float
+        self,
+        information: Array,
+        level: float,
+        shift: float,
+        larger: float,
+        ratios: Sequence[float | Array],
     ) -> list[Marginal]:
-        """Marginals for each of `COMMON`, with biases of these standard deviations."""
+        """Marginals for each of the common biases' `ratios`, with biases of these standard
+        deviations.
+        """
         P, J, _, V = *information.shape[:3], self.size_px.shape[1]
         C = V * (Q - 3 + 3 * self.parts)
         # Order: common biases, cameras, individual people's shifts and scalings, residual.
@@ -210,13 +223,14 @@ class Residuals:
             at = np.concatenate([np.arange(common + C), begin + np.arange(3 * V), [len(total) - 1]])
             total[at[:, None], at] += whole
         found = []
-        for ratio in COMMON:
-            known = total[:common, :common] + np.eye(common) / (ratio * level) ** 2
+        for ratio in ratios:
+            size = level * np.tile(np.repeat(np.broadcast_to(ratio, V), 2), J)
+            known = total[:common, :common] + np.diag(size**-2)
             rest = total[common:, common:] - total[common:, :common] @ np.linalg.solve(
                 known, total[:common, common:]
             )
             likely = log - 0.5 * float(
-                np.linalg.slogdet(known * (ratio * level) ** 2)[1] + rest[-1, -1]
+                np.linalg.slogdet(known * size[:, None] * size)[1] + rest[-1, -1]
             )
             found.append(Marginal(rest[:-1, :-1], rest[:-1, -1], likely))
         return found

@@ -22,10 +22,11 @@ from shapepose_fg.setup_check.evidence import Evidence, Look, gather
 from shapepose_fg.setup_check.exclusion import trust_of
 from shapepose_fg.setup_check.findings import SURE, Finding, Kind, one_of
 from shapepose_fg.setup_check.fit import difference
-from shapepose_fg.setup_check.hypotheses import GOOD_PAIR, Lag, lag_of, lags, mistake_of_cameras
+from shapepose_fg.setup_check.hypotheses import GOOD_PAIR, mistake_of_cameras
 from shapepose_fg.setup_check.joint_order import order_of_joints
 from shapepose_fg.setup_check.matching import MIN_SIGHTINGS, same_frame
-from shapepose_fg.setup_check.over_time import in_pieces, parted, restlessness
+from shapepose_fg.setup_check.offset_scan import Lag, lag_of, lags
+from shapepose_fg.setup_check.over_time import parted, parting_of
 from shapepose_fg.setup_check.small_errors import LEAST_DEG, Problem
 
 _SAME_PX = 0.6
@@ -170,10 +171,8 @@ _FEW_FRAMES, _FEW_SIGHTINGS = 16, 300
 """Frames, and sightings of people in them, that are enough if nothing in them is odd."""
 _FITTING, _STEADY, _UNLIKELY, _NEARLY = 0.5, 0.3, 0.1, 0.5
 """Signs of a mistake in them: a camera's score below the first, a difference of its scores between
-pieces of the recording above the second, a probability of small mistakes above the third, or an
+parts of the recording above the second, a probability of small mistakes above the third, or an
 offset in time with more than this share of what makes it significant."""
-_SHORT = 5
-"""Minimum frames in such a piece, of which there are up to four."""
 _MOST_FINDINGS, _MOST_BIASED = 4, 3
 """Maximum number of findings, and of biased people, that are distinguished."""
 _UNFIT = 0.15
@@ -251,13 +250,13 @@ def _sound(look: Look, detections: DetectionSequence, rig: Rig) -> Diagnosis | N
     """The diagnosis of cameras and detections without any sign of a mistake; None if there is one,
     or if too little is seen.
     """
-    piece = max(_SHORT, len(look.evidence.anchors) // 4)
+    partings = [parting_of(look, view) for view in range(len(rig))]
     if (
         len(look.sightings) < MIN_SIGHTINGS
         or len(look.groups()) < MIN_SIGHTINGS
         or min(look.scores) < (_FITTING if look.cameras_used > 2 else GOOD_PAIR)
         or [*duplicates(rig, look.evidence), *_blind(look), *_stopped(look), *_unfit(look, set())]
-        or any(restlessness(in_pieces(look, v, piece)[2]) > _STEADY for v in range(len(rig)))
+        or any(each is not None and each.drop > _STEADY for each in partings)
     ):
         return None
     problem = Problem.of(look)
@@ -368,7 +367,7 @@ def _settled(look: Look, view: int, frames: int) -> tuple[Look, Problem]:
         problem = Problem.of(look)
         more = lag_of(replace(look, views=problem.relaxed()), view, _LAG_NEAR)
         frames = more.frames
-        if frames == 0 or more.agreement < 0:
+        if frames == 0 or more.gain < 0:
             break
     return look, problem
 

@@ -54,6 +54,8 @@ class Evidence:
     """(F,) frames used."""
     sightings: Sightings
     """Sightings in the checked frames and their neighbours."""
+    around: Index
+    """(G,) the frames used whose neighbours are there, too."""
     most_lag: int
     """Maximum time offset that can be detected, frames."""
     other_side: Index
@@ -63,14 +65,15 @@ class Evidence:
 
     def thinned(self, frames: int) -> "Evidence":
         """Return the evidence with about `frames` of the frames used."""
-        return replace(self, anchors=self.anchors[:: max(1, len(self.anchors) // frames)])
+        few, near = (each[:: max(1, len(each) // frames)] for each in (self.anchors, self.around))
+        return replace(self, anchors=few, around=near)
 
 
 def gather(detections: DetectionSequence, frames: range, views: int) -> Evidence:
     """Sightings of V cameras, `views`, in frames spread over a recording, without repeated
     pictures.
     """
-    count = len(frames)
+    count, every = len(frames), 1
     if count <= _WHOLE:
         wanted = np.arange(frames.start, frames.stop)
         most = min(MOST_LAG, count // 4)
@@ -89,11 +92,11 @@ def gather(detections: DetectionSequence, frames: range, views: int) -> Evidence
                 [t for t in frames if len(detections[t]) > 0] or [frames.start], dtype=np.intp
             )
             spread = there[np.unique(np.linspace(0, len(there) - 1, ANCHORS).astype(np.intp))]
-        around = spread[:: max(1, ANCHORS // _LAG_ANCHORS)]
-        wanted = np.unique(
-            np.concatenate([spread, *(np.arange(t - most, t + most + 1) for t in around)])
-        )
+        every = max(1, ANCHORS // _LAG_ANCHORS)
+        near = [np.arange(t - most, t + most + 1) for t in spread[::every]]
+        wanted = np.unique(np.concatenate([spread, *near]))
         wanted = wanted[(wanted >= frames.start) & (wanted < frames.stop)]
+    around = spread[::every]
     pictures, stopped = WithoutRepeats(detections, views), np.zeros(views)
     sightings = Sightings.of(pictures, wanted.tolist())
     for frame in wanted.tolist():
@@ -103,7 +106,7 @@ def gather(detections: DetectionSequence, frames: range, views: int) -> Evidence
     pairs = int((each * (each - 1) // 2).sum())
     if pairs > _MOST_PAIRS:
         spread = spread[:: -(-pairs // _MOST_PAIRS)]
-    return Evidence(spread, sightings, most, _other_side(detections.skeleton), stopped)
+    return Evidence(spread, sightings, around, most, _other_side(detections.skeleton), stopped)
 
 
 def _other_side(skeleton: Skeleton) -> Index:

@@ -1,6 +1,4 @@
-"""Hypotheses on mistakes of a set-up, each tested as a correction: time offsets, and gross
-mistakes.
-"""
+"""Hypotheses on gross mistakes of a set-up, each tested as a correction."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -9,7 +7,7 @@ from itertools import combinations
 
 import numpy as np
 
-from shapepose_fg.core.arrays import Array, Index, Mask, Whole
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.setup_check import fit
 from shapepose_fg.setup_check.evidence import Look
 from shapepose_fg.setup_check.findings import SURE, Finding, Kind, one_of
@@ -18,180 +16,18 @@ from shapepose_fg.setup_check.fit import (
     FOCAL,
     POSE,
     TURN,
-    Others,
     independent,
     likelihood,
     match,
 )
 from shapepose_fg.setup_check.matching import (
     GATE,
-    MIN_JOINTS,
     Pinhole,
     Sightings,
-    least_of_each,
-    miss_px,
-    same_frame,
 )
-from shapepose_fg.setup_check.over_time import stories
+from shapepose_fg.setup_check.offset_scan import lag_of
+from shapepose_fg.setup_check.over_time import motions
 from shapepose_fg.setup_check.small_errors import ONE, Problem, named, probable
-
-_AGREEMENT, _LEAST_GAIN, _LIKELY_LAG, _SMALL = 0.12, 0.004, 12.0, 8
-"""Criteria for a time offset: sufficient agreement, and a gain of 7 mm on average; or the third as
-a gain in log-likelihood with at most as many frames as the fourth. Correct simulated recordings of
-25 rigs reached 8. At larger offsets, standing people come by chance to where they were."""
-_FOLLOWED = 0.05
-"""Minimum agreement of people near with and without the offset: -0.02 to 0.02 in correct simulated
-recordings with a chance offset, 0.12 and more in late ones."""
-_HALF = 0.2
-"""Minimum share of all motion in a half of the recording for that half to count."""
-_STRIDE = 4
-"""Step of the first search of offsets, frames."""
-_MOST_PEOPLE = 400
-"""Number of people sufficient for estimating an offset."""
-_LEAST_FRAMES = 40
-"""Minimum number of frames for time offsets, and number sufficient for mistakes of all cameras. In
-fewer, people hardly move enough to separate a small time offset from chance: in 20 frames of the
-built-in scene a correct camera looked 4 frames early."""
-
-
-@dataclass(frozen=True)
-class Lag:
-    """Time offset of a camera."""
-
-    frames: int = 0
-    """The camera shows at t + frames what the others show at frame t; positive is late."""
-    gain: float = 0.0
-    """Mean decrease of the joints' errors, as a share of people's size."""
-    likely: float = 0.0
-    """Gain in log-likelihood."""
-    agreement: float = 0.0
-    """The gain relative to the motion of the joints within the offset: near 1 for a true offset,
-    near -1 without any, 0 without motion. The minimum over both halves of the frames: a true offset
-    is in both, while in one of them people may come by chance to where they were."""
-    followed: float = 0.0
-    """Agreement of people seen near enough both with and without the offset; when people occlude
-    each other, others are near by chance at some offset."""
-
-    def exceeds(self, share: float) -> bool:
-        """Whether the offset exceeds a `share` of what makes it significant."""
-        plain = self.agreement > share * _AGREEMENT and self.gain > share * _LEAST_GAIN
-        small = abs(self.frames) <= _SMALL and self.likely > share * _LIKELY_LAG
-        there = self.followed > share * _FOLLOWED
-        return there and (plain or (self.agreement > 0 and small))
-
-    @property
-    def is_offset(self) -> bool:
-        """Whether the offset is significant."""
-        return self.exceeds(1.0)
-
-
-NONE = Lag()
-
-
-def lags(look: Look) -> list[Lag]:
-    """Time offset of each camera against the others; none in a short recording."""
-    if len(np.unique(look.evidence.sightings.frame)) < _LEAST_FRAMES:
-        return [NONE] * look.view_count
-    return [lag_of(look, view) for view in range(look.view_count)]
-
-
-def lag_of(look: Look, view: int, most: int | None = None) -> Lag:
-    """Time offset of a camera against the others, up to `most` frames, at which its sightings fit
-    people best.
-    """
-    most = look.evidence.most_lag if most is None else min(most, look.evidence.most_lag)
-    others, seen, camera = (
-        look.others(view),
-        look.seen_by(view, every_frame=True),
-        look.camera(view),
-    )
-    worth, step = independent(others), max(1, len(others) // _MOST_PEOPLE)
-    others = others.rows(slice(None, None, step))
-    still = _nearest(others, seen, camera, 0)
-
-    def tried(lag: int) -> Lag:
-        return _compare(lag, others.frame, seen, worth, still, _nearest(others, seen, camera, lag))
-
-    first = [tried(lag) for lag in range(-(most // _STRIDE) * _STRIDE, most + 1, _STRIDE)]
-    best = max(first, key=_worth)
-    near = [
-        tried(best.frames + d)
-        for d in range(1 - _STRIDE, _STRIDE)
-        if d != 0 and abs(best.frames + d) <= most
-    ]
-    best = max([best, *near], key=_worth)
-    return best if best.gain > 0 else NONE
-
-
-def _worth(lag: Lag) -> float:
-    """Gain of an offset that is consistent in both halves of the frames, else -inf."""
-    return lag.gain if lag.agreement >= 0 else -np.inf
-
-
-@dataclass(frozen=True)
-class _Nearest:
-    """Nearest sighting of each person at one offset."""
-
-    there: Mask
-    """(P,) whether the camera has sightings in the frame of each person."""
-    sighting: Index
-    """(P,) row of the sighting; -1 if none is within the gate."""
-    error: Array
-    """(P, J) distance of each joint as a share of the size, at most GATE; NaN if the joint is not
-    seen."""
-
-
-def _nearest(others: Others, seen: Sightings, camera: Pinhole, lag: int) -> _Nearest:
-    person, sighting = same_frame(others.frame, seen.frame - lag)
-    error = miss_px(others.points[person], seen.xy[sighting], camera)
-    error /= seen.size_px[sighting][:, None]
-    both = ~np.isnan(error)
-    mean = np.where(both, np.minimum(error, GATE), 0).sum(axis=1) / np.maximum(both.sum(axis=1), 1)
-    mean = np.where(both.sum(axis=1) >= MIN_JOINTS, mean, GATE)
-    best = least_of_each(person, mean)
-    near = best[mean[best] < 0.9 * GATE]
-    found = np.full(len(others), -1, dtype=np.intp)
-    found[person[near]] = sighting[near]
-    errors = np.full(others.points.shape[:2], np.nan)
-    errors[person[near]] = np.minimum(error[near], GATE)
-    return _Nearest(np.isin(others.frame + lag, seen.frame), found, errors)
-
-
-def _compare(
-    lag: int, frame: Whole, seen: Sightings, worth: float, still: _Nearest, moved: _Nearest
-) -> Lag:
-    """Compare the fit with and without an offset, on joints of people seen in either case."""
-    usable = still.there & moved.there & ((still.sighting >= 0) | (moved.sighting >= 0))
-    a, b = still.sighting[usable], moved.sighting[usable]
-    error_a, error_b = still.error[usable], moved.error[usable]
-    # People outside the gate at one of the offsets have moved at least by the gate.
-    error_a = np.where((a < 0)[:, None] & ~np.isnan(error_b), GATE, error_a)
-    error_b = np.where((b < 0)[:, None] & ~np.isnan(error_a), GATE, error_b)
-    xy = np.concatenate(
-        [seen.xy, np.full((1, *seen.xy.shape[1:]), np.inf)]
-    )  # the last row is for no sighting
-    size = np.append(seen.size_px, np.inf)
-    with np.errstate(invalid="ignore"):
-        way = np.linalg.norm(xy[a] - xy[b], axis=-1) / np.minimum(size[a], size[b])[:, None]
-    way = np.where(np.isnan(way), GATE, np.minimum(way, GATE))
-    both = ~np.isnan(error_a) & ~np.isnan(error_b)
-    if both.sum() < 10 * MIN_JOINTS:
-        return Lag(lag)
-    better, way = np.where(both, error_a - error_b, 0.0), np.where(both, way, 0.0)
-    late = frame[usable] > np.median(frame[usable])
-    halves = [(float(better[half].sum()), float(way[half].sum())) for half in (late, ~late)]
-    whole = max(sum(moves for _, moves in halves), 1e-9)
-    agreement = (
-        min(gain / moves for gain, moves in halves if moves >= _HALF * whole)
-        if whole > 1e-9
-        else 0.0
-    )
-    gain = float(better[both].mean())
-    near = (a >= 0) & (b >= 0)
-    moves = float(way[near].sum())
-    followed = float(better[near].sum()) / moves if moves > _HALF * whole else agreement
-    return Lag(lag, gain, gain / ERROR * worth, agreement, followed)
-
 
 _MISREAD: dict[Kind, Callable[[Array, Array], tuple[Array, Array]]] = {
     Kind.INVERTED: lambda R, t: (R.T, -R.T @ t),
@@ -223,6 +59,8 @@ correct pairs had 0.67 and more, and most pairs with a mirrored camera, or one r
 half-way, less."""
 GAIN, _LIKELY = 0.12, 10.0
 """Minimum gain of a change in a camera's score, and in log-likelihood."""
+_FEW_FRAMES = 40
+"""Number of frames that are sufficient for mistakes of all cameras."""
 _EXPLAINED = 0.65
 """Total score above which no other explanation than detector errors is searched for."""
 _PRICE = 0.02
@@ -274,7 +112,7 @@ def mistake_of_cameras(look: Look, rng: np.random.Generator) -> Change | None:
     best = max((gain for gain, _ in found), default=0.0) + look.total
     poor = [view for view in weak if look.beside_biases(view) < GOOD]
     if len(poor) > look.view_count / 2 and best < _EXPLAINED:
-        few = replace(look, evidence=look.evidence.thinned(_LEAST_FRAMES))
+        few = replace(look, evidence=look.evidence.thinned(_FEW_FRAMES))
         found += [
             (
                 judged(few, change),
@@ -285,7 +123,7 @@ def mistake_of_cameras(look: Look, rng: np.random.Generator) -> Change | None:
     found = [(gain, change) for gain, change in found if gain > GAIN / look.view_count]
     for view in range(look.view_count if look.cameras_used > 2 else 0):
         changes = [
-            Change(finding, after, freedom) for finding, after, freedom in stories(look, view, rng)
+            Change(finding, after, freedom) for finding, after, freedom in motions(look, view, rng)
         ]
         found += [(judged(look, change), change) for change in changes]
     return _likeliest(look, found)

@@ -146,7 +146,7 @@ class _Compared:
 
 @dataclass(frozen=True)
 class _Look:
-    """State of a person in a frame in which some view had sides exchanged."""
+    """State of a person in one frame."""
 
     frame: int
     """Index of the frame."""
@@ -187,7 +187,7 @@ def correct_swaps(tracker: Tracker, frames: Sequence[Input], people: Tracks) -> 
         compared.append(seen)
         for row, number in enumerate(tracks.ids.tolist()):
             views, before = seen.of_person(number), looks.get(number, [])
-            if views.argmax(axis=1).any() and (not before or time_s - before[-1].time_s >= _LOOK_S):
+            if not before or time_s - before[-1].time_s >= _LOOK_S:
                 looks[number] = [
                     *before,
                     _Look(n, time_s, tracks.joints.rows(np.array([row])), views),
@@ -195,6 +195,7 @@ def correct_swaps(tracker: Tracker, frames: Sequence[Input], people: Tracks) -> 
     own = {
         name: _own_sides(tracker, found, followed=name < len(people))
         for name, found in looks.items()
+        if any(look.views.argmax(axis=1).any() for look in found)
     }
     held = list[Input]()
     for n, (each, seen) in enumerate(zip(frames, compared, strict=True)):

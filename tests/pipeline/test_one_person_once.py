@@ -12,11 +12,12 @@ from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections, Recording
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.evaluation.metrics import joint_metrics
+from shapepose_fg.evaluation.metrics import joint_metrics, match_people
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.simulation import built_in_scene, simulate
+from shapepose_fg.simulation.sequences import SEQUENCES, sequence
 
 
 @pytest.fixture(scope="module")
@@ -127,6 +128,26 @@ def test_left_and_right_exchanged_in_two_of_three_cameras(shared_data):
     found, figures = solved(shared_data, "flip2of3", range(120))
     assert len(found) == 240
     assert figures.mpjpe_mm < 26
+
+
+@pytest.mark.slow
+def test_sides_of_a_crowd_are_those_that_the_detector_saw(real_mocap):
+    """Eight people before three cameras: a moment in which a track is a mixture of two people, and
+    a mirrored body fits better, exchanges nobody's sides for the rest of the time.
+    """
+    crowd = replace(SEQUENCES["crowd"], seed=6711)
+    scene = sequence("crowd", "report", real_mocap, cameras=3, until=40, config=crowd)
+    scene = scene.part(range(40))
+    found = reconstruct(simulate(scene, seed=6711), scene.rig, times=FrameTimes.from_fps(30.0, 40))
+    same = match_people(found.frame, found.joints, scene.keypoints)
+    joints, truth = found.joints[same.row], scene.keypoints[same.frame, same.person]
+    sides = np.array([joint[0] in "LR" for joint in BODY_25.joints])
+    own, other = (
+        np.nanmedian(np.linalg.norm(joints - each, axis=-1)[:, sides], axis=1)
+        for each in (truth, truth[:, BODY_25.mirror])
+    )
+    assert (other < own).mean() < 0.05
+    assert len(same.row) > 0.9 * 8 * 40
 
 
 @pytest.mark.slow

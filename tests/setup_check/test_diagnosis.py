@@ -12,12 +12,14 @@ from shapepose_fg.core.detections import Detections, Recording
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
+from shapepose_fg.setup_check.biases import COMMON
 from shapepose_fg.setup_check.diagnosis import diagnose
+from shapepose_fg.setup_check.evidence import Look, gather
 from shapepose_fg.setup_check.findings import Kind, sentence
 from shapepose_fg.setup_check.fit import FOCAL, Q, changed
-from shapepose_fg.setup_check.hypotheses import Lag
 from shapepose_fg.setup_check.matching import Sightings, least_of_each
 from shapepose_fg.setup_check.report import check_setup
+from shapepose_fg.setup_check.small_errors import Problem
 from tests.marks import slow
 from tests.setup_check.spoiled_setups import (
     biased,
@@ -131,6 +133,24 @@ def test_a_detector_s_biases_accuse_no_camera(recording, room, people, of, large
     assert diagnose(biased(recording, room, people, bias, larger), room).findings == ()
 
 
+@pytest.mark.parametrize("of", ["one view", "every view"])
+def test_a_view_may_have_larger_biases_than_the_others(recording, room, people, of):
+    bias = lasting(np.random.default_rng(1), 0.06, 0.12, 3, 25, 5)
+    bias[:] = bias[:1]
+    if of == "one view":
+        bias[:, :, 1:] = 0
+    seen = gather(biased(recording, room, people, bias), range(len(recording)), len(room))
+    problem = Problem.of(Look.given(seen, room))
+    marginals = problem.residuals.marginals
+    alike = marginals(problem.given, common=COMMON)
+    also = marginals(problem.given)
+    gain = np.logaddexp.reduce([each.log for each in also]) - np.logaddexp.reduce(
+        [each.log for each in alike]
+    )
+    # Odds of one biased view against equal biases in all views.
+    assert gain > 30 if of == "one view" else gain < 3
+
+
 @pytest.mark.slow
 def test_real_detectors_accuse_no_camera(shared_data, shared_cases):
     """Cameras that a board, or their own program, calibrated well."""
@@ -190,14 +210,6 @@ def test_of_one_person_alone_a_camera_is_not_accused_but_said_beside_the_detecto
     assert noted.sure + sum(camera.values()) == pytest.approx(
         1, abs=0.06
     )  # those under 0.05 are not said
-
-
-def test_who_is_near_by_chance_at_an_offset_makes_no_camera_late():
-    """As in a simulated crowd before three cameras in time, and in one whose camera was late by 7
-    frames.
-    """
-    assert not Lag(frames=2, gain=0.0068, likely=21.4, agreement=0.164, followed=-0.008).is_offset
-    assert Lag(frames=7, gain=0.0224, likely=59.0, agreement=0.261, followed=0.351).is_offset
 
 
 def test_no_step_of_a_focal_length_leaves_the_numbers(room):

@@ -14,15 +14,6 @@ LEG_M = 0.8
 
 
 @pytest.fixture(scope="session")
-def real_mocap(shared_data: Path) -> Mocap:
-    """The recordings of CMU; skips where they are not."""
-    path = shared_data / "cmu_mocap" / "cmu_smpl24.npz"
-    if not path.is_file():
-        pytest.skip(f"no recorded motions at {path}")
-    return Mocap.load(path)
-
-
-@pytest.fixture(scope="session")
 def tiny_arrays() -> dict[str, NDArray]:
     """Two pairs who hold hands and sway (takes 1 and 9), one who walks 3.4 m, one who stands and
     waves.

@@ -147,7 +147,7 @@ class BodyEnergy:
         pose[:, self._hidden] = angles @ self.priors.gain.T + self.priors.at_zero
         return BodyParameters(free[:, :10], free[:, 10:13], pose.reshape(-1, 23, 3), free[:, -3:])
 
-    def parameters(self, fit: BodyFit, origin: Array) -> Array:
+    def parameters(self, fit: BodyFit | BodyParameters, origin: Array) -> Array:
         """Free parameters (B, P) of fitted bodies relative to their origins (B, 3)."""
         angles = fit.body_pose.reshape(len(fit), -1)[:, self.angles]
         return np.concatenate((fit.betas, fit.global_orient, angles, fit.transl - origin), axis=1)

@@ -8,7 +8,7 @@ from rich.table import Table
 from shapepose_fg.cli.reconstruct.request import Prepared
 from shapepose_fg.cli.setup_table import use_table
 from shapepose_fg.cli.terminal import note, show, warn
-from shapepose_fg.core import compiling
+from shapepose_fg.core.compiling import compiled_for_s
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import rate_words
 from shapepose_fg.core.reconstruction import Reconstruction
@@ -73,7 +73,7 @@ def summary_table(
             else f"{each['way_m']:.1f} m, as given"
         )
         table.add_row("moving", f"{' '.join(each['cameras'])}: {words}")
-    count = f"{len(result.rows_of)} people over time" if over_time else "without identities"
+    count = f"{len(result.parts_of)} people over time" if over_time else "without identities"
     table.add_row(
         "people",
         f"{count}, {per_frame.mean():.1f} a frame ({per_frame.min()} to {per_frame.max()})",
@@ -120,8 +120,8 @@ def summary_table(
     once, spent = ("load", "set-up check"), run.get("seconds", {})
     ms = sum(1e3 * each / len(span) for name, each in spent.items() if name not in once)
     words = f"{seconds:.1f} s in all"
-    if compiling.spent_s > 1:
-        words += f", {compiling.spent_s:.0f} s of it to compile, only at the first run"
+    if (compiled_s := compiled_for_s()) > 1:
+        words += f", {compiled_s:.0f} s of it to compile, only at the first run"
     else:
         words = f"{ms:.1f} ms a frame, {words}"
     table.add_row("time", words)

@@ -117,8 +117,6 @@ class Format:
 
     name: str
     """Name on the command line."""
-    about: str
-    """Content, and programs that read it, in a few words."""
     writer: str
     """Module and function that writes it: `write(job: Job) -> Written`. With `rows` it is
     `write(opened, rows, folder) -> Written` of an `OpenedReconstruction` and row numbers (R,), None
@@ -144,24 +142,19 @@ _ANYBODY = {"identities": False}
 FORMATS = {
     each.name: each
     for each in (
-        Format("amass", "poses and shape of a body, for learning code (npz)",
-               "motion_files:write_amass"),
-        Format("trc", "markers, for OpenSim and Pose2Sim", "markers:write_trc"),
-        Format("c3d", "markers, for biomechanics", "markers:write_c3d"),
-        Format("bvh", "a moving skeleton, for animation", "motion_files:write_bvh"),
-        Format("glb", "moving bodies with their skin, for Blender and the web", "glb:write_glb"),
-        Format("angles", "joint angles as a table", "tables:write_angles", **_ANYBODY),
-        Format("opensim", "scaling and inverse kinematics in OpenSim", "opensim:write_opensim"),
-        Format("csv", "joints as a table", "tables:write_csv", **_ANYBODY),
-        Format("parquet", "all columns, for archives", "tables:write_parquet", **_ANYBODY,
-               rows=True),
-        Format("mcap", "ROS 2 messages, for rosbag2, RViz and Foxglove", "mcap:write_mcap"),
-        Format(
-            "rrd", "everything on a timeline, for the rerun viewer", "rerun_app:write_rrd",
-            **_ANYBODY, observations=True,
-        ),
+        Format("amass", "motion_files:write_amass"),
+        Format("trc", "markers:write_trc"),
+        Format("c3d", "markers:write_c3d"),
+        Format("bvh", "motion_files:write_bvh"),
+        Format("glb", "glb:write_glb"),
+        Format("angles", "tables:write_angles", **_ANYBODY),
+        Format("opensim", "opensim:write_opensim"),
+        Format("csv", "tables:write_csv", **_ANYBODY),
+        Format("parquet", "tables:write_parquet", **_ANYBODY, rows=True),
+        Format("mcap", "mcap:write_mcap"),
+        Format("rrd", "rerun_app:write_rrd", **_ANYBODY, observations=True),
     )
-}  # fmt: skip
+}
 """Formats by name. To add one, write a module beside this one, and an entry here."""
 
 

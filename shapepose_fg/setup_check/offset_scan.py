@@ -1,26 +1,97 @@
-"""Compares two cameras at all time offsets, without association of people.
+"""Compares cameras at all time offsets, without association of people.
 
 Two rays to a joint at the same time are coplanar with both cameras. For each person of one camera,
 the best fitting person of the other is used, so that no association is needed.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 
-from shapepose_fg.calibration.tracks import LEAST_MISS
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.compiled import kernel
+from shapepose_fg.setup_check.evidence import Look
 from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS, Sightings, centres_of, rays_of
 
 _ANCHORS = 150
 """Number of frames of one camera that are compared with those of another, at every offset."""
+_LEAST_FRAMES = 40
+"""Minimum number of frames for time offsets. In fewer, people hardly move enough to separate a
+small time offset from chance."""
+_NEAR = GATE / 3
+"""Distance of people above which they count as missed by a camera, as a share of the size; other
+people come that near seldom."""
+_CLEAR = 0.25
+"""Minimum gain of a time offset. Sound cameras have up to 0.2, late ones 0.3 to 1."""
+LEAST_MISS = 0.004
+"""Minimum error of a detector as a share of a person's size: 7 mm."""
 
 
-def scan(sightings: Sightings, views: Views, a: int, b: int, lags: Index, common: float) -> Array:
+@dataclass(frozen=True)
+class Lag:
+    """Time offset of a camera."""
+
+    frames: int = 0
+    """The camera shows at t + frames what the others show at frame t; positive is late."""
+    gain: float = 0.0
+    """Decrease of the mean residual by the offset, relative to the depth of its minimum under the
+    median of all offsets."""
+
+    def exceeds(self, share: float) -> bool:
+        """Whether the offset exceeds a `share` of what makes it significant."""
+        return self.gain > share * _CLEAR
+
+    @property
+    def is_offset(self) -> bool:
+        """Whether the offset is significant."""
+        return self.exceeds(1.0)
+
+
+def lags(look: Look) -> list[Lag]:
+    """Time offset of each camera against the others; none in a short recording."""
+    if len(np.unique(look.evidence.sightings.frame)) < _LEAST_FRAMES:
+        return [Lag()] * look.view_count
+    return [lag_of(look, view) for view in range(look.view_count)]
+
+
+def lag_of(look: Look, view: int, most: int | None = None) -> Lag:
+    """Time offset of a camera against the others, up to `most` frames, with the smallest mean
+    residual.
+    """
+    most = look.evidence.most_lag if most is None else min(most, look.evidence.most_lag)
+    offsets, seen, around = np.arange(-most, most + 1), look.shifted, look.evidence.around
+    rows = seen.rows((seen.view == view) | np.isin(seen.frame, around))
+    of_pairs = [
+        scan(rows, look.views, other, view, offsets, np.ptp(around) / 4, _NEAR)
+        for other in np.unique(rows.view).tolist()
+        if other != view
+    ]
+    known = np.isfinite(np.reshape(of_pairs, (-1, len(offsets))))
+    count = known.sum(axis=0)
+    if count[most] == 0:
+        return Lag()
+    curve = np.where(known, of_pairs, 0.0).sum(axis=0) / np.where(count > 0, count, np.nan)
+    best = int(np.nanargmin(curve))
+    depth = float(np.nanmedian(curve) - curve[best])
+    return Lag(int(offsets[best]), float(curve[most] - curve[best]) / max(depth, LEAST_MISS))
+
+
+def scan(
+    sightings: Sightings,
+    views: Views,
+    a: int,
+    b: int,
+    lags: Index,
+    common: float,
+    gate: float = GATE,
+) -> Array:
     """(L,) mean residual of possible matches of two cameras, as a share of people's size, for the
     offsets `lags` (L,), frames; NaN with fewer than `common` frames in common.
     """
     one, other = (sightings.rows(sightings.view == view) for view in (a, b))
+    if min(len(one), len(other)) == 0:
+        return np.full(len(lags), np.nan)
     taken = np.unique(one.frame)
     wanted = taken[np.unique(np.linspace(0, len(taken) - 1, _ANCHORS).astype(np.intp))]
     one = one.rows(np.isin(one.frame, wanted))
@@ -30,7 +101,7 @@ def scan(sightings: Sightings, views: Views, a: int, b: int, lags: Index, common
     normal = np.ascontiguousarray(normals(rays_of(one, views), views, a, b))
     rays, size = np.ascontiguousarray(rays_of(other, views)), other.size_px / views.focal_px[b]
     cost, count = np.zeros(len(lags)), np.zeros(len(lags))
-    _scan(normal, rays, one.frame, size, first, begin, lags, GATE, MIN_JOINTS, cost, count)
+    _scan(normal, rays, one.frame, size, first, begin, lags, gate, MIN_JOINTS, cost, count)
     frame = one.frame
     both = np.minimum(frame.max() + lags, last) - np.maximum(frame.min() + lags, begin)
     share = 0.2 * np.minimum(common / np.ptp(frame), 1)
@@ -82,55 +153,3 @@ def normals(rays: Array, views: Views, a: int, b: int) -> Array:
     centres = centres_of(views)
     normal = np.cross(centres[b] - centres[a], rays)
     return np.asarray(normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12))
-
-
-def chosen(
-    curves: dict[tuple[int, int], Array], lags: Index, views: int, around: int
-) -> tuple[Array, Array]:
-    """(V,) shifts relative to the first camera, and their prominence (V,).
-
-    Cameras are added one by one in order of prominence, each at the offset that fits all those
-    before it: frame f of the first camera is frame f + shift of another.
-    """
-    step = int(lags[1] - lags[0]) if len(lags) > 1 else 1
-    half = len(lags) // 2
-
-    def fit(one: int, other: int, apart: Index) -> Array:
-        """Fit of two cameras at offsets `apart`: standard deviations below the median over all
-        offsets.
-        """
-        curve = curves[one, other] if one < other else curves[other, one][::-1]
-        known = np.isfinite(curve)
-        if known.sum() < 3:
-            return np.zeros(len(apart))
-        middle = np.median(curve[known])
-        spread = max(1.5 * float(np.median(np.abs(curve[known] - middle))), LEAST_MISS)
-        place = np.clip(apart + half, 0, len(lags) - 1)
-        inside = (np.abs(apart) <= half) & known[place]
-        return np.where(inside, (middle - curve[place]) / spread, 0.0)
-
-    def best(view: int, placed: dict[int, int]) -> tuple[float, int]:
-        low, high = min(placed.values()) - half, max(placed.values()) + half
-        tried = np.arange(low, high + 1)
-        worth = np.sum(
-            [fit(one, view, tried - at) for one, at in placed.items()], axis=0
-        ) / np.sqrt(len(placed))
-        top = int(np.argmax(worth))
-        far = np.abs(tried - tried[top]) * step > around
-        return float(worth[top] - worth[far].max(initial=0.0)), int(tried[top])
-
-    margins = {pair: best(pair[1], {pair[0]: 0})[0] for pair in curves}
-    root = max(margins, key=lambda pair: margins[pair])[0]
-    placed = {root: 0}
-    while len(placed) < views:
-        offers = {view: best(view, placed) for view in range(views) if view not in placed}
-        view = max(offers, key=lambda each: offers[each][0])
-        placed[view] = offers[view][1]
-    for _ in range(2):
-        for view in range(views):
-            placed[view] = best(view, {one: at for one, at in placed.items() if one != view})[1]
-    sure = np.array(
-        [best(view, {o: at for o, at in placed.items() if o != view})[0] for view in range(views)]
-    )
-    shift = np.array([placed[view] for view in range(views)]) * step
-    return shift - shift[0], sure
