@@ -57,9 +57,9 @@ def off_by(rig: Rig, truth: Rig) -> tuple[np.ndarray, np.ndarray]:
     return np.degrees(turns), np.linalg.norm(a @ R.T - b, axis=1)
 
 
-@pytest.fixture(scope="module", autouse=True)
+@pytest.fixture(scope="module")
 def few_frames():
-    """Thirty frames say as much of these cameras as bounds here ask, in half the time."""
+    """Thirty frames say as much of these cameras as bounds ask, in half the time."""
     before, calibration_people.MOST_FRAMES = calibration_people.MOST_FRAMES, 30
     yield
     calibration_people.MOST_FRAMES = before

@@ -35,6 +35,8 @@ from shapepose_fg.simulation.scene import keypoints_of
 from tests.calibration.conftest import FPS, off_by
 from tests.conftest import read_body
 
+pytestmark = pytest.mark.usefixtures("few_frames")
+
 TIMES = FrameTimes.from_fps(FPS, 250)
 
 

@@ -28,6 +28,8 @@ from tests.calibration.conftest import FPS, disturbed, off_by
 from tests.setup_check.conftest import seen_by
 from tests.setup_check.spoiled_setups import biased, lasting
 
+pytestmark = pytest.mark.usefixtures("few_frames")
+
 TIMES = FrameTimes.from_fps(FPS, 250)
 
 

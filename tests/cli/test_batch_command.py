@@ -50,6 +50,10 @@ fps = 25
 cuts = [18]
 chunk_frames = 12
 
+[recordings.short]
+calibration = "short/rig.json"
+detections = "short/openpose"
+
 [recordings.broken]
 detections = "broken"
 """
@@ -57,10 +61,11 @@ detections = "broken"
 
 @pytest.fixture(scope="module")
 def archive(tmp_path_factory) -> Path:
-    """A recording with a cut, in chunks, and one with files that break off."""
+    """Two recordings, one with a cut and in chunks, and one with files that break off."""
     folder = tmp_path_factory.mktemp("archive")
-    scene = built_in_scene(seed=1, people=2, cameras=3, frames=30)
-    write_simulated(scene, simulate(scene, seed=1), folder / "long", "openpose")
+    for seed, (name, frames) in enumerate((("long", 30), ("short", 8)), start=1):
+        scene = built_in_scene(seed=seed, people=2, cameras=3, frames=frames)
+        write_simulated(scene, simulate(scene, seed=seed), folder / name, "openpose")
     for camera in (folder / "long" / "openpose").iterdir():
         (folder / "broken" / camera.name).mkdir(parents=True)
         first = min(camera.iterdir())
@@ -125,7 +130,7 @@ def test_an_archive_is_interrupted_goes_on_and_is_what_each_recording_alone_give
     assert finished(*words, "--resume") == 1, "one of them failed"
     said = capsys.readouterr()
     batch_status = json.loads((tmp_path / "batch.json").read_text())
-    assert (batch_status["done"], batch_status["failed"]) == (1, 1)
+    assert (batch_status["done"], batch_status["failed"]) == (2, 1)
     assert (
         batch_status["recordings"]["long"]["frames"] == 30
         and batch_status["recordings"]["long"]["people"] >= 2
@@ -135,16 +140,21 @@ def test_an_archive_is_interrupted_goes_on_and_is_what_each_recording_alone_give
     assert "the file ends too early" in broken["reasons"][0]
     assert (
         f"broken: {broken['reasons'][0]}"[:60] in " ".join(said.err.split())
-        and "1 done, 1 failed" in said.out
+        and "2 done, 1 failed" in said.out
     )
     assert "parts" not in {file.name for file in (tmp_path / "long").iterdir()}
-    rig = read_rig(archive / "long" / "rig.json")
-    seen = read_detections(archive / "long" / "openpose", rig)
-    times, execution = FrameTimes.from_fps(25.0, len(seen)), Execution(chunk_frames=12)
-    alone = reconstruct(seen, rig, CONFIG, times=times, execution=execution, cuts=(18,))
-    alone.save(tmp_path / "alone")
-    for file in ("people.npz", "observations.npz"):
-        assert (tmp_path / "long" / file).read_bytes() == (tmp_path / "alone" / file).read_bytes()
+    for name, more in (("long", {"cuts": (18,)}), ("short", {})):
+        rig = read_rig(archive / name / "rig.json")
+        seen = read_detections(archive / name / "openpose", rig)
+        times = FrameTimes.from_fps(25.0, len(seen)) if name == "long" else None
+        execution = Execution(chunk_frames=12 if name == "long" else None)
+        reconstruct(seen, rig, CONFIG, times=times, execution=execution, **more).save(
+            tmp_path / "alone" / name
+        )
+        for file in ("people.npz", "observations.npz"):
+            assert (tmp_path / name / file).read_bytes() == (
+                tmp_path / "alone" / name / file
+            ).read_bytes(), file
 
 
 def test_what_can_be_known_before_is_said_before(archive, tmp_path, capsys, monkeypatch):
@@ -165,7 +175,7 @@ def test_what_can_be_known_before_is_said_before(archive, tmp_path, capsys, monk
     assert f"{archive / 'none'}: there is no such folder" in err
     two = said(
         '[recordings.a]\ndetections = "none"\n[recordings.b]\ntimestamps = "none"\ndetections = '
-        '"long"'
+        '"short"'
     )
     assert "(other recordings with problems: b)" in two
     own = '[recordings.a]\ndetections = "long/openpose"\n'
