@@ -489,7 +489,7 @@ def short_scene(monkeypatch):
     """The demo on five frames of its scene."""
     from shapepose_fg.simulation import built_in_scene
 
-    monkeypatch.setattr("shapepose_fg.cli.demo.built_in_scene", lambda: built_in_scene(frames=5))
+    monkeypatch.setattr("shapepose_fg.simulation.built_in_scene", lambda: built_in_scene(frames=5))
 
 
 def test_demo_compares_with_the_truth_and_leaves_a_report(
@@ -519,13 +519,13 @@ def test_a_report_is_left_or_taken_away(recording, pipeline, capsys):
 
 
 def test_the_scene_is_what_the_demo_says_it_is():
-    from shapepose_fg.cli.main import DEMO
+    from shapepose_fg.cli.demo import SCENE
     from shapepose_fg.simulation import built_in_scene
 
     scene = built_in_scene()
     assert (
         f"{scene.people} people in close motion, {len(scene.rig)} cameras, {len(scene)} frames"
-        in DEMO
+        in SCENE
     )
 
 

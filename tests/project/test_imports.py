@@ -64,10 +64,10 @@ LEVELS = (
     "cli.pictures cli.found_cameras cli.setup_table",
     "cli.reconstruct",
     "cli.batch",
-    "cli.demo cli.tracks cli.detect cli.overlay cli.export cli.report cli.view cli.setup "
+    "cli.tracks cli.detect cli.overlay cli.export cli.report cli.view cli.setup "
     "cli.simulate cli.train_fitter cli.batch.command cli.refine cli.synchronise cli.live "
     "cli.calibrate cli.explain cli.evaluate",
-    "cli.compile",
+    "cli.compile cli.demo",
     "cli.main",
     "__main__",
 )
