@@ -113,9 +113,9 @@ def likelihood(score: float, worth: float, freedom: int) -> float:
     return worth * score * GATE / ERROR - 0.5 * freedom * float(np.log(max(worth, 2.0)))
 
 
-def match(others: Others, seen: Sightings, camera: Pinhole, lag: int = 0) -> Match:
+def match(others: Others, seen: Sightings, camera: Pinhole) -> Match:
     """Mutual nearest neighbours of people and sightings, within the gate."""
-    person, sighting, error = distances(others.frame, others.points, seen, camera, lag)
+    person, sighting, error = distances(others.frame, others.points, seen, camera)
     best_of_person, best_of_sighting = np.full(len(others), np.inf), np.full(len(seen), np.inf)
     np.minimum.at(best_of_person, person, error)
     np.minimum.at(best_of_sighting, sighting, error)
@@ -123,7 +123,7 @@ def match(others: Others, seen: Sightings, camera: Pinhole, lag: int = 0) -> Mat
         (error <= best_of_person[person]) & (error <= best_of_sighting[sighting]) & (error < GATE)
     )
     return Match(
-        person[keep], sighting[keep], error[keep], possible_matches(others.frame, seen.frame - lag)
+        person[keep], sighting[keep], error[keep], possible_matches(others.frame, seen.frame)
     )
 
 

@@ -300,15 +300,14 @@ def _others(
 
 
 def distances(
-    frame: Index, points: Array, seen: Sightings, camera: Pinhole, lag: int = 0
+    frame: Index, points: Array, seen: Sightings, camera: Pinhole
 ) -> tuple[Index, Index, Array]:
     """Median distance of each person's projection to each sighting of one camera in the same frame.
 
-    `points` (P, J, 3) are people at `frame` (P,), `seen` the sightings of the `camera`, `lag`
-    frames later. Returns person (E,), sighting (E,) and error (E,), as a share of the sighting's
-    size.
+    `points` (P, J, 3) are people at `frame` (P,), `seen` the sightings of the `camera`. Returns
+    person (E,), sighting (E,) and error (E,), as a share of the sighting's size.
     """
-    person, sighting = same_frame(frame, seen.frame - lag)
+    person, sighting = same_frame(frame, seen.frame)
     error = miss_px(points[person], seen.xy[sighting], camera)
     return person, sighting, median_of(error, MIN_JOINTS) / seen.size_px[sighting]
 

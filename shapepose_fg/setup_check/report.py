@@ -234,11 +234,6 @@ def rounded(value: Any) -> Any:
     return float(f"{value:.4g}") if isinstance(value, float) else value
 
 
-_MOST_BETA = 5.0
-"""Absolute shape component above which a body is implausible, standard deviations."""
-_SHARE = 0.1
-"""Share of rows above which implausible shapes are reported; fewer are people hardly seen by any
-camera."""
 _FASTEST_M_S, _PAIRS = 10.0, 10
 """Speed of sprinters, m/s, and minimum number of steps for a speed."""
 _MOST, _FEW = 0.5, 50
@@ -260,10 +255,6 @@ _REASONS = {
 _LEAST_USED = 0.1
 """Minimum share of detections that people explain; on Shelf, with false candidates included, it is
 most."""
-_WORST = 2.0
-"""Ratio of a camera's distance from the others to the usual one above which it is reported, if
-nothing else is."""
-_FAR_MM = 60.0
 
 
 @dataclass(frozen=True)
@@ -351,10 +342,9 @@ def result_check(
                 "detections fit"
             )
         )
-    warnings += [*_shapes(people), *_speeds(people)]
+    warnings += _speeds(people)
     chance = [*_too_many(people), *_clutter(uses)][:1]
     warnings += chance or [*_unused(uses), *_unseen(people, detections, rig, frames)]
-    warnings += _outlier(uses) if len(report.findings) == 0 else ()
     return ResultCheck(report, uses, tuple(warnings))
 
 
@@ -411,19 +401,6 @@ def _left_out(table: ObservationTable, rig: Rig) -> tuple[Array, Array]:
     weight, size = table.confidence[rows].astype(np.float64), size_of(np.moveaxis(xy, 2, 1))
     px, depth = left_out(xy, weight, size, Views.of(rig), gate == Gate.USED)
     return px, 1e3 * px * depth / rig.focal_px
-
-
-def _shapes(people: Reconstruction) -> Iterator[str]:
-    """Warning on implausible body shapes."""
-    there = np.isfinite(people.betas).all(axis=1)
-    largest = np.abs(people.betas[there]).max(axis=1, initial=0.0)
-    far = largest > _MOST_BETA
-    if far.sum() > 0 and far.mean() >= _SHARE:
-        yield (
-            f"{far.sum()} of {len(far)} bodies have an implausible shape (a component of "
-            f"{largest.max():.0f} standard deviations); check the calibration's unit, and "
-            "whether its poses are inverted"
-        )
 
 
 def _speeds(people: Reconstruction) -> Iterator[str]:
@@ -550,18 +527,3 @@ def unseen(
             f"({most} see most)"
         )
     ]
-
-
-def _outlier(uses: Sequence[CameraUse]) -> Iterator[str]:
-    """Warning on a camera much farther from the others than these are from each other."""
-    lengths = np.array([use.left_out.median_mm for use in uses], dtype=np.float64)  # None is NaN
-    if np.isfinite(lengths).sum() < 3:
-        return
-    worst = int(np.nanargmax(lengths))
-    usual = float(np.nanmedian(np.delete(lengths, worst)))
-    if lengths[worst] >= max(_WORST * usual, _FAR_MM):
-        yield (
-            f"{uses[worst].camera} is {lengths[worst]:.0f} mm from where the other cameras place "
-            f"its joints (median), and they are {usual:.0f} mm from each other; check its "
-            "calibration and its pictures"
-        )
