@@ -1,56 +1,54 @@
 """The command `demo`: reconstructs the built-in scene and compares the result with the truth."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
-from shapepose_fg.core.frame_times import FrameTimes
-from shapepose_fg.core.reconstruction import Reconstruction
-from shapepose_fg.evaluation.score import Score, score
-from shapepose_fg.evaluation.truth import people_of
-from shapepose_fg.io.solved_setup import CAMERAS
-from shapepose_fg.pipeline.execution import Execution
-from shapepose_fg.pipeline.pipeline import reconstruct
-from shapepose_fg.simulation import Scene, built_in_scene, simulate
-from shapepose_fg.simulation.files import truth_of
-from shapepose_fg.viz.report.writing import REPORT, write_report
+from shapepose_fg.cli.evaluate import show_scores
+from shapepose_fg.cli.options import RESULT, grouped, option
+from shapepose_fg.cli.terminal import progress as progress_bar
+from shapepose_fg.core.storage.output_folder import prepare_output
+
+SCENE = """\
+Built-in scene: 4 people in close motion, 6 cameras, 60 frames. A simulated
+detector sees them with noise, misses, false candidates and occlusion; from what
+it saw the people are reconstructed, over time."""
+_FILES = {
+    "people.npz": "joints, covariances and bodies",
+    "run.json": "settings and times",
+    "observations.npz": "detections assigned to each joint",
+    "cameras.json": "the cameras",
+}
 
 
-@dataclass(frozen=True)
-class Demo:
-    """The scene, and its reconstruction from simulated detections."""
+@grouped
+def demo(
+    output: Path = option(RESULT, "Folder for the result.", Path("demo")),
+    report: bool = option(
+        RESULT, "Write report.html, a page for the browser.", True, "--report/--no-report"
+    ),
+) -> None:
+    """Reconstruct a built-in scene of four people and compare it with the truth."""
+    prepare_output(output)
+    print(SCENE, flush=True)
+    from shapepose_fg.core.frame_times import FrameTimes
+    from shapepose_fg.evaluation.score import score
+    from shapepose_fg.evaluation.truth import people_of
+    from shapepose_fg.pipeline.execution import Execution
+    from shapepose_fg.pipeline.pipeline import reconstruct
+    from shapepose_fg.simulation import built_in_scene, simulate
+    from shapepose_fg.simulation.files import truth_of
+    from shapepose_fg.viz.report.writing import REPORT, write_report
 
-    scene: Scene
-    """People with known truth."""
-    people: Reconstruction
-    """The reconstruction."""
-
-    def score(self) -> Score:
-        """The comparison with the truth."""
-        return score(people_of(self.people), people_of(truth_of(self.scene)))
-
-    def save(self, folder: Path, *, report: bool = True) -> list[str]:
-        """Write all files of the result, and the report; returns notes for the user."""
-        self.people.save(folder)
-        told = [
-            f"{folder / 'people.npz'}  joints, covariances and bodies",
-            f"{folder / 'run.json'}  settings and times",
-            f"{folder / 'observations.npz'}  detections assigned to each joint",
-            f"{folder / CAMERAS}  the cameras",
-        ]
-        if report:
-            told.append(
-                f"{write_report(folder, self.people, self.scene.rig)}  open it in a browser"
-            )
-        else:
-            (folder / REPORT).unlink(missing_ok=True)
-        return told
-
-
-def run_demo(progress: Callable[[int, int], None] | None = None) -> Demo:
-    """Simulate detections of the built-in scene, and reconstruct it."""
     scene = built_in_scene()
-    detections = simulate(scene)
-    times = FrameTimes.from_fps(scene.fps, len(scene))
-    people = reconstruct(detections, scene.rig, times=times, execution=Execution(progress=progress))
-    return Demo(scene, people)
+    detections, times = simulate(scene), FrameTimes.from_fps(scene.fps, len(scene))
+    with progress_bar("reconstructing") as progress:
+        execution = Execution(progress=progress)
+        people = reconstruct(detections, scene.rig, times=times, execution=execution)
+    show_scores({"demo": score(people_of(people), people_of(truth_of(scene)))})
+    people.save(output)
+    print()
+    for name, content in _FILES.items():
+        print(f"{output / name}  {content}")
+    if report:
+        print(f"{write_report(output, people, scene.rig)}  open it in a browser")
+    else:
+        (output / REPORT).unlink(missing_ok=True)

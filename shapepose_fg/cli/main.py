@@ -3,7 +3,6 @@
 import os
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, cast
 
 import typer
@@ -11,17 +10,16 @@ import typer
 from shapepose_fg.cli.batch.command import batch
 from shapepose_fg.cli.calibrate import calibrate
 from shapepose_fg.cli.compile import compile_kernels
+from shapepose_fg.cli.demo import demo
 from shapepose_fg.cli.detect import detect
-from shapepose_fg.cli.evaluate import evaluate, show_scores
+from shapepose_fg.cli.evaluate import evaluate
 from shapepose_fg.cli.explain import explain
 from shapepose_fg.cli.export import export
 from shapepose_fg.cli.live import live
 from shapepose_fg.cli.options import (
-    RESULT,
     Preset,
     flowing,
     grouped,
-    option,
     preset_option,
 )
 from shapepose_fg.cli.overlay import overlay
@@ -33,12 +31,10 @@ from shapepose_fg.cli.simulate import simulate
 from shapepose_fg.cli.stopping import Stopped, stoppable
 from shapepose_fg.cli.synchronise import synchronise
 from shapepose_fg.cli.terminal import note_log, say, use_any_streams
-from shapepose_fg.cli.terminal import progress as progress_bar
 from shapepose_fg.cli.tracks import tracks
 from shapepose_fg.cli.train_fitter import train_fitter
 from shapepose_fg.cli.view import view
 from shapepose_fg.core.errors import InputError, failure
-from shapepose_fg.core.storage.output_folder import prepare_output
 
 # All other modules are imported inside the commands, so that `--help` does not wait for GTSAM and
 # Numba.
@@ -68,6 +64,8 @@ for _panel, _commands in {
     for _command in _commands:
         app.command(rich_help_panel=_panel)(_command)
 app.command("compile", rich_help_panel=_TRY)(flowing(compile_kernels))
+for _command in (demo, simulate):
+    app.command(rich_help_panel=_TRY)(_command)
 
 _UsageProblem = cast("type[Exception]", typer.BadParameter.__mro__[2])
 """typer's exception for an invalid command line; its place differs between versions."""
@@ -108,36 +106,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except (typer.Abort, KeyboardInterrupt):
         code = 130
     sys.exit(code if isinstance(code, int) else 0)
-
-
-DEMO = """\
-Built-in scene: 4 people in close motion, 6 cameras, 60 frames. A simulated
-detector sees them with noise, misses, false candidates and occlusion; from what
-it saw the people are reconstructed, over time."""
-
-
-@app.command(rich_help_panel=_TRY)
-@grouped
-def demo(
-    output: Path = option(RESULT, "Folder for the result.", Path("demo")),
-    report: bool = option(
-        RESULT, "Write report.html, a page for the browser.", True, "--report/--no-report"
-    ),
-) -> None:
-    """Reconstruct a built-in scene of four people and compare it with the truth."""
-    prepare_output(output)
-    print(DEMO, flush=True)
-    from shapepose_fg.cli.demo import run_demo
-
-    with progress_bar("reconstructing") as progress:
-        result = run_demo(progress)
-    show_scores({"demo": result.score()})
-    print()
-    for line in result.save(output, report=report):
-        print(line)
-
-
-app.command(rich_help_panel=_TRY)(simulate)
 
 
 @app.command("config", rich_help_panel=_RECORDING)

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shapepose_fg.cli.options import RESULT, RUN, TakeOptions, grouped, option
+from shapepose_fg.cli.options import RUN, TakeOptions, grouped, option
 from shapepose_fg.cli.pictures import PictureOptions
 from shapepose_fg.cli.terminal import note, progress
 from shapepose_fg.core.errors import InputError
@@ -18,9 +18,6 @@ if TYPE_CHECKING:
 def view(
     part: TakeOptions,
     pictures: PictureOptions,
-    save: Path | None = option(
-        RESULT, "Write a file (.rrd) for `rerun FILE` instead.", metavar="FILE"
-    ),
     connect: str | None = option(
         RUN, "Address of a running viewer: rerun+http://HOST:9876/proxy.", metavar="URL"
     ),
@@ -29,34 +26,23 @@ def view(
     ),
 ) -> None:
     """Show a result in the rerun viewer: people, cameras, and used and unused detections, on a
-    timeline.
+    timeline. `export RESULTS rrd` writes the same into a file.
     """
     from shapepose_fg.io.export import rerun_app
     from shapepose_fg.io.export.registry import Job, read_take
     from shapepose_fg.io.export.rerun_log import log_pictures, log_take
 
     take = read_take(part.results, identities=False, **part.how())
-    if save is not None and connect is not None:
-        raise InputError(
-            "--save and --connect: the result is either written or shown; give one of them"
-        )
     pairs = _pictures(part.results, take, pictures) if pictures.videos else []
-    if connect is None and save is None and not statistics:
+    if connect is None and not statistics:
         note(*rerun_app.quiet_viewer())
     arrays, missing = rerun_app.body_if_there(Job(take, part.results, part.body))
     note(*missing)
-    first = rerun_app.layout_of(take)
-    with (
-        rerun_app.shown(first, connect)
-        if save is None
-        else rerun_app.written(save, first) as stream
-    ):
+    with rerun_app.shown(rerun_app.layout_of(take), connect) as stream:
         log_take(stream, take, arrays)
         if len(pairs) > 0:
             with progress("showing pictures", "pictures") as done:
                 log_pictures(stream, take, pairs, done)
-    if save is not None:
-        print(f"written  {save}")
 
 
 def _pictures(

@@ -134,9 +134,7 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
         if source not in ("none", "recording"):
             noise = NoiseLaw.load(source)
         if fitter is None:
-            fitter = make_fitter(
-                config.body, BodyModel.default().with_keypoints(skeleton.joints), config.law
-            )
+            fitter = make_fitter(config.body, BodyModel.default().with_keypoints(skeleton.joints))
             if source not in ("none", "recording"):
                 fitter = fitter.with_keypoint_offsets(KeypointOffsets.load(source))
         check_fitter(fitter)

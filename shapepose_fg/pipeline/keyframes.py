@@ -52,8 +52,8 @@ def with_rows_between(
     """Add rows in the frames between keyframes, for people present in both adjacent keyframes.
 
     `frame` (F,) are consecutive frames, at `time_s` (F,) seconds, with the mask `key` (F,) of
-    keyframes. New rows have no detections and no body; their joints come from `motion`. Sorted by
-    frame and person.
+    keyframes. New rows have no detections; their joints come from `motion`, and their bodies are
+    interpolated. Sorted by frame and person.
     """
     keys = np.flatnonzero(key)
     order = np.lexsort((rows.frame, rows.person))
@@ -67,7 +67,7 @@ def with_rows_between(
     between = _carried(
         rows.rows(order[pair]), rows.rows(order[pair + 1]), frame[at], time_s[at], motion
     )
-    every = Reconstruction.concatenate([rows, between])
+    every = with_bodies_between(Reconstruction.concatenate([rows, between]))
     return every.rows(np.lexsort((every.person, every.frame)))
 
 
@@ -125,7 +125,7 @@ def with_rows_like(
     between = _carried(
         solved.rows(first), solved.rows(second), rows.frame[new], rows.time_s[new], motion
     )
-    every = Reconstruction.concatenate([solved, between])
+    every = with_bodies_between(Reconstruction.concatenate([solved, between]))
     return every.rows(np.lexsort((every.person, every.frame)))
 
 
@@ -159,8 +159,8 @@ def _carried(
             + unseen[..., None, None] * np.eye(3)
         )
 
-    # The status is that of the first end unless it is good, else of the second; bodies are fitted
-    # later.
+    # The status is that of the first end unless it is good, else of the second; bodies are
+    # interpolated later (`with_bodies_between`).
     fine = np.isin(before.status, (Status.OK, Status.BODY_UNDETERMINED))
     status = np.where(fine, after.status, before.status)
     placed = np.isfinite(joints).all(axis=-1)
@@ -193,46 +193,37 @@ def cubic(
     return place, (way + (1 - s) * (1 - 3 * s) * first - s * (2 - 3 * s) * second) / lasts_s
 
 
-def bodies_between(
-    ok: Mask, bodies: Sequence[Array], key_s: Array, time_s: Array
-) -> tuple[Mask, tuple[Array, Array, Array, Array]]:
-    """Interpolate bodies at times `time_s` (N,) between given ones at ascending times `key_s` (B,);
-    also returns a mask (N,).
-
-    `bodies` are shapes (B, 10), rotations of the root (B, 3) and of the other joints (B, 23, 3),
-    translations (B, 3); those that are not `ok` (B,) are ignored. Translations, and rotations as
-    quaternions, are cubics with the slopes of their neighbours.
+def with_bodies_between(rows: Reconstruction) -> Reconstruction:
+    """The rows with bodies where they had none, between those of the same person that have one:
+    translations, and rotations as quaternions, are cubics with the slopes of their neighbours.
     """
-    after = np.searchsorted(key_s, time_s)
-    before = np.where(key_s[after] == time_s, after, after - 1)
-    fine = ok[before] & ok[after]
-    place = np.cumsum(ok) - 1
-    first, second = place[before[fine]], place[after[fine]]
-    betas, orient, pose, transl = (each[ok] for each in bodies)
-    known_s = key_s[ok]
-    lasts_s = np.where(second > first, known_s[second] - known_s[first], 1.0)
-    share = (time_s[fine] - known_s[first]) / lasts_s
-
-    def between(values: Array) -> Array:
-        slopes = np.gradient(values, known_s, axis=0) if len(values) > 1 else np.zeros_like(values)
-        at, lasts = (each.reshape(-1, *[1] * (values.ndim - 1)) for each in (share, lasts_s))
-        return cubic(at, lasts, (values[first], values[second]), (slopes[first], slopes[second]))[0]
-
-    turned = _rotation_vectors(
-        between(_quaternions(np.concatenate([orient[:, None], pose], axis=1)))
-    )
-
-    def filled(values: Array) -> Array:
-        every = np.zeros((len(time_s), *values.shape[1:]))
-        every[fine] = values
-        return every
-
-    return fine, (
-        filled(betas[first]),
-        filled(turned[:, 0]),
-        filled(turned[:, 1:]),
-        filled(between(transl)),
-    )
+    columns = {name: getattr(rows, name).copy() for name in BODY}
+    status, order = rows.status.copy(), np.lexsort((rows.time_s, rows.person))
+    for mine in np.split(order, np.flatnonzero(np.diff(rows.person[order])) + 1):
+        ok = np.isfinite(rows.betas[mine]).all(axis=1)
+        known_s = rows.time_s[mine[ok]]
+        after = np.searchsorted(known_s, rows.time_s[mine])
+        inside = ~ok & (after > 0) & (after < len(known_s))
+        if not inside.any():
+            continue
+        first, second, new = after[inside] - 1, after[inside], mine[inside]
+        lasts_s = known_s[second] - known_s[first]
+        share = (rows.time_s[new] - known_s[first]) / lasts_s
+        betas, orient, pose, transl = (columns[name][mine[ok]] for name in BODY)
+        turns = _quaternions(np.concatenate([orient[:, None], pose], axis=1)).reshape(
+            len(betas), -1
+        )
+        moving = np.concatenate([turns, transl], axis=1)
+        slopes = np.gradient(moving, known_s, axis=0)
+        places, speeds = (moving[first], moving[second]), (slopes[first], slopes[second])
+        found = cubic(share[:, None], lasts_s[:, None], places, speeds)[0]
+        turned = _rotation_vectors(found[:, :-3].reshape(len(new), -1, 4))
+        bodies = betas[first], turned[:, 0], turned[:, 1:], found[:, -3:]
+        for name, values in zip(BODY, bodies, strict=True):
+            columns[name][new] = values
+        undetermined = status[new] == Status.BODY_UNDETERMINED
+        status[new[undetermined]] = Status.OK
+    return replace(rows, status=status, **columns)
 
 
 def _quaternions(vectors: Array) -> Array:

@@ -3,7 +3,7 @@ return rows.
 """
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -14,7 +14,7 @@ from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.body.fitting.weights import fingerprint
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.shapes import SubjectShapes
-from shapepose_fg.core.arrays import Index
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.frame_times import FrameTimes, check_cuts, spans_of
@@ -27,18 +27,25 @@ from shapepose_fg.core.trust import with_poses
 from shapepose_fg.estimation.floor import Floor
 from shapepose_fg.estimation.trajectory_graph import CameraFactors
 from shapepose_fg.estimation.user_factors import ExtraFactors, functions_of, name_of
-from shapepose_fg.pipeline.bodies_over_time import Person, fit_everybody
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.execution import Execution
 from shapepose_fg.pipeline.keyframes import keyframes
 from shapepose_fg.pipeline.offsets import Sample, kept_noise, kept_offsets
 from shapepose_fg.pipeline.offsets import estimate_offsets as estimate_offsets
+from shapepose_fg.pipeline.person_shapes import (
+    ShapeEvidence,
+    WindowBodies,
+    combined,
+    evidence,
+    with_shape,
+)
 from shapepose_fg.pipeline.runs.assembly import Assembly
 from shapepose_fg.pipeline.runs.parts import Parts
 from shapepose_fg.pipeline.setup import Setup
 from shapepose_fg.pipeline.setup import find_people as find_people
 from shapepose_fg.pipeline.solved_windows import SolvedWindows
 from shapepose_fg.pipeline.trajectories import about, keep, kept_rig, refine, unrefined
+from shapepose_fg.pipeline.workers import Pool
 from shapepose_fg.proposal.thinning import ThinnedFrames
 from shapepose_fg.tracking.stitching import Ends, Trace, stitch
 from shapepose_fg.tracking.track_selection import probability
@@ -115,7 +122,7 @@ def refine_trajectories(
     config = PipelineConfig() if config is None else config
     task = Task(detections, rig, config, frames, times, cuts, camera_factors=camera_factors)
     fitter = make_fitter(
-        config.body, BodyModel.default().with_keypoints(detections.skeleton.joints), config.law
+        config.body, BodyModel.default().with_keypoints(detections.skeleton.joints)
     )
     return _with_refined(
         InMemory(), task, Setup(rig, detections.skeleton, config, fitter), Notebook()
@@ -183,9 +190,7 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
     detections = ThinnedFrames(pictures, rig, config.candidates)
     with book.stage("load"):
         if fitter is None:
-            fitter = make_fitter(
-                config.body, BodyModel.default().with_keypoints(skeleton.joints), config.law
-            )
+            fitter = make_fitter(config.body, BodyModel.default().with_keypoints(skeleton.joints))
         check_fitter(fitter)
     setup = _with_refined(
         kept, task, Setup(rig, skeleton, config, fitter, task.extra_factors), book
@@ -221,21 +226,8 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
             with book.stage("bodies over time"):
                 if config.motion.floor:
                     floor = result.floor(model, rig.up_vector)
-                known = (
-                    SubjectShapes.empty(fingerprint(model)) if task.shapes is None else task.shapes
-                )
-                keyframe_s = config.windows.keyframe_s
                 ground = floor if isinstance(floor, Floor) else None
-                bodies = fit_everybody(
-                    result.rows_of,
-                    lambda number, rows: replace(
-                        result.person(number, rows), floor=ground, keyframe_s=keyframe_s
-                    ),
-                    lambda jobs: pool.map(_fit_person, jobs),
-                    kept,
-                    known,
-                )
-                result = replace(result, bodies=bodies)
+                result = _with_person_shapes(result, task.shapes, model, ground, pool)
     notes = beginning
     for each in (parts.notes(), book.flush()):
         notes.add(each)
@@ -277,9 +269,41 @@ def _with_refined(kept: KeptArrays, task: Task, setup: Setup, book: Notebook) ->
     return replace(setup, rig=known)
 
 
-def _fit_person(setup: Setup, person: Person) -> dict[str, Any]:
-    """Fit one person's bodies, in any process."""
-    return person.fitted(setup.fitter)
+def _with_person_shapes(
+    result: Assembly,
+    known: SubjectShapes | None,
+    model: BodyModel,
+    floor: Floor | None,
+    pool: Pool[Setup],
+) -> Assembly:
+    """The result with one shape per person, and bodies with these shapes."""
+    parts, found = range(len(result.parts)), {number: ShapeEvidence() for number in result.parts_of}
+    for of_part in pool.map(_evidence, map(result.bodies, parts)):
+        for number, each in of_part.items():
+            found[number].add(each)
+    known = SubjectShapes.empty(fingerprint(model)) if known is None else known
+    shapes = combined(found, known, model)
+    betas = dict(zip(found, shapes.betas, strict=True))
+    jobs = ((result.bodies(n), betas, floor) for n in parts)
+    for n, columns in enumerate(pool.map(_with_shape, jobs)):
+        result.keep_bodies(n, columns)
+    return replace(result, shapes=shapes)
+
+
+def _evidence(setup: Setup, rows: WindowBodies) -> dict[int, ShapeEvidence]:
+    """Evidence on shapes, in any process."""
+    assert setup.fitter.model is not None
+    return evidence(rows, setup.fitter.model, setup.config.body.model_sigma_m)
+
+
+def _with_shape(
+    setup: Setup, job: tuple[WindowBodies, Mapping[int, Array], Floor | None]
+) -> dict[str, Array]:
+    """Bodies with people's shapes, in any process."""
+    rows, betas, floor = job
+    own = np.array([betas[number] for number in rows.person.tolist()]).reshape(-1, 10)
+    assert setup.fitter.model is not None
+    return with_shape(rows, own, setup.fitter.model, setup.config.body.model_sigma_m, floor)
 
 
 def _names(tracks: Assembly, setup: Setup, cuts_s: Sequence[float]) -> dict[int, int]:
@@ -291,7 +315,7 @@ def _names(tracks: Assembly, setup: Setup, cuts_s: Sequence[float]) -> dict[int,
             [Trace.of(track, time_s, joints, setup.skeleton) for time_s, joints in pieces]
         )
 
-    return stitch(Ends.of(map(trace, tracks.rows_of)), setup.config.stitching, cuts_s)
+    return stitch(Ends.of(map(trace, tracks.parts_of)), setup.config.stitching, cuts_s)
 
 
 def _summary(

@@ -26,9 +26,9 @@ from shapepose_fg.estimation.user_factors import ExtraFactors
 from shapepose_fg.estimation.window_solution import PersonGraph, WindowSolution
 from shapepose_fg.io.config import ANOTHER_VERSION, config_from
 from shapepose_fg.io.solved_setup import CAMERAS, cameras_of
-from shapepose_fg.pipeline.bodies_over_time import with_bodies_over_time
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.keyframes import looked_at, with_rows_like
+from shapepose_fg.pipeline.person_shapes import with_person_shapes
 from shapepose_fg.pipeline.solve_window import solve_window
 from shapepose_fg.pipeline.windows import near_border, window_stop
 
@@ -60,9 +60,7 @@ class Solver:
         told, body = people.run.get("keypoint_offsets"), people.run.get("body")
         offsets = None if told is None else KeypointOffsets.read(told, run_file)
         model = BodyModel.default() if body is None else BodyModel.load(Path(str(body)))
-        fitter = make_fitter(
-            config.body, model.with_keypoints(tuple(people.joint_names.tolist())), config.law
-        )
+        fitter = make_fitter(config.body, model.with_keypoints(tuple(people.joint_names.tolist())))
         fitter = fitter if offsets is None else fitter.with_keypoint_offsets(offsets)
         return cls(rig, config, fitter, NoiseLaw.read(people.run, run_file))
 
@@ -99,7 +97,8 @@ def solve_rows(
     if solver.fitter.model is None or not solver.config.temporal:
         return solved
     floor = Floor.from_dict(rows.run.get("floor"))
-    return with_bodies_over_time(solved, solver.fitter, floor=floor, keyframe_s=keyframe_s)
+    sigma_m = solver.config.body.model_sigma_m
+    return with_person_shapes(solved, solver.fitter.model, floor=floor, sigma_m=sigma_m)
 
 
 def window_solutions(

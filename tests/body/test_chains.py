@@ -1,12 +1,10 @@
-"""Chains of rows: the motion prior along them, the solver for their linear systems, and how they
-are cut.
-"""
+"""Chains of rows: the motion prior along them, and the solver for their linear systems."""
 
 import numpy as np
 import pytest
 
 from factors import CONSTANT_ACCELERATION, CONSTANT_VELOCITY, Motion, matrices
-from shapepose_fg.body.fitting.chains import Links, cut_segments
+from shapepose_fg.body.fitting.chains import Links
 from shapepose_fg.body.fitting.priors import NUM_MOVING, MotionPrior
 from shapepose_fg.body.kernels.solving import eliminated, put_back
 from shapepose_fg.body.model.rotation import exp_so3
@@ -113,23 +111,6 @@ def test_even_motion_costs_its_speed_alone():
     assert energy == pytest.approx(
         (0.7**2 + 0.3**2) / 0.5 * 0.9
     )  # v² h / density, 9 steps of 0.1 s
-
-
-def test_chains_end_at_gaps_and_long_ones_are_cut_with_overlap():
-    time_s = np.concatenate([np.arange(10) * 0.1, 5 + np.arange(3) * 0.1, [0.0, 0.1]])
-    group = np.repeat([4, 4, 7], [10, 3, 2])
-    rows = np.random.default_rng(0).permutation(15)
-    segments = cut_segments(rows, group, time_s, gap_s=1.0, length=6, overlap=2)
-    assert [(s.rows.tolist(), s.kept.tolist(), s.group) for s in segments] == [
-        (list(range(8)), [True] * 6 + [False] * 2, 4),
-        (list(range(4, 10)), [False] * 2 + [True] * 4, 4),
-        ([10, 11, 12], [True] * 3, 4),
-        ([13, 14], [True] * 2, 7),
-    ]
-    assert cut_segments(rows[:0], group, time_s, gap_s=1.0, length=6, overlap=2) == []
-    time_s[11] = time_s[10]
-    with pytest.raises(ValueError, match=r"group 4 has two rows at 5\.0 s: give one row a time"):
-        cut_segments(rows, group, time_s, gap_s=1.0, length=6, overlap=2)
 
 
 def test_the_motion_prior_is_about_people():

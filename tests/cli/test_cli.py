@@ -22,9 +22,8 @@ from shapepose_fg.core.errors import WorkLost
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.notes import Notes
 from shapepose_fg.core.observation_table import ObservationTable
-from shapepose_fg.core.reconstruction import Known, Reconstruction, Status
+from shapepose_fg.core.reconstruction import BODY, Known, Reconstruction, Status
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.pipeline.bodies_over_time import BodiesOverTime
 from shapepose_fg.pipeline.runs.assembly import Assembly
 from shapepose_fg.pipeline.runs.parts import Part, Parts
 
@@ -192,18 +191,9 @@ def test_shapes_are_kept_from_one_recording_to_the_next(
     def with_shapes(kept, task, execution):
         result, shapes = fake(kept, task, execution), task.shapes
         found = SubjectShapes(np.array(["0"]), np.full((1, 10), 0.5), np.eye(10)[None], shapes.body)
-        rows = result.rows_of
-        nobody = {
-            "ok": np.zeros(1, dtype=bool),
-            "betas": np.zeros((1, 10)),
-            "transl": np.zeros((1, 3)),
-        }
-        nobody |= {"global_orient": np.zeros((1, 3)), "body_pose": np.zeros((1, 23, 3))}
-        for number in rows:
-            result.parts.kept.keep(f"bodies-{number}", nobody)
-        places = {number: {f"bodies-{number}": range(count)} for number, count in rows.items()}
-        bodies = BodiesOverTime(result.parts.kept, places, found)
-        return replace(result, bodies=bodies)
+        for n in range(len(result.parts)):
+            result.keep_bodies(n, {name: result.parts.column(n, name) for name in BODY})
+        return replace(result, shapes=found)
 
     monkeypatch.setattr(shapepose_fg.cli.reconstruct.run, "reconstruct_parts", with_shapes)
     assert run(*recording, "--shapes", str(file)) == 0
@@ -499,7 +489,7 @@ def short_scene(monkeypatch):
     """The demo on five frames of its scene."""
     from shapepose_fg.simulation import built_in_scene
 
-    monkeypatch.setattr("shapepose_fg.cli.demo.built_in_scene", lambda: built_in_scene(frames=5))
+    monkeypatch.setattr("shapepose_fg.simulation.built_in_scene", lambda: built_in_scene(frames=5))
 
 
 def test_demo_compares_with_the_truth_and_leaves_a_report(
@@ -529,13 +519,13 @@ def test_a_report_is_left_or_taken_away(recording, pipeline, capsys):
 
 
 def test_the_scene_is_what_the_demo_says_it_is():
-    from shapepose_fg.cli.main import DEMO
+    from shapepose_fg.cli.demo import SCENE
     from shapepose_fg.simulation import built_in_scene
 
     scene = built_in_scene()
     assert (
         f"{scene.people} people in close motion, {len(scene.rig)} cameras, {len(scene)} frames"
-        in DEMO
+        in SCENE
     )
 
 

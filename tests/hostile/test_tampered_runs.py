@@ -162,20 +162,6 @@ def test_what_has_the_right_digests_and_makes_no_sense_is_refused(
     assert re.search(sentence, text) and file.name in text
 
 
-def test_a_body_whose_shape_is_none_is_refused(task, whole, tmp_path):
-    """Found by tests/hostile/fuzz.py: its digests were right."""
-    kept = InFolder(shutil.copytree(whole / "parts", tmp_path / "parts"))
-    arrays = {name: kept.array("bodies-0", name) for name in kept.keys("bodies-0")}
-    for name, value, sentence in (
-        ("information", -arrays["information"], "positive definite"),
-        ("mean", arrays["mean"] * np.nan, "betas and information must be finite"),
-        ("transl", arrays["transl"][1:], "transl must be"),
-    ):
-        kept.keep("bodies-0", arrays | {name: value})
-        text = refused(kept.folder, task)
-        assert sentence in text and "bodies-0.safetensors" in text
-
-
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs a system with pipes in folders")
 def test_a_pipe_or_a_link_among_the_parts_is_refused_at_once(parts, task, tmp_path):
     file = first(parts, "part")

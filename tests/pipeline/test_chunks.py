@@ -133,23 +133,13 @@ def test_every_row_is_of_its_frame_and_its_person(scene, whole):
 
 @pytest.mark.slow
 def test_a_person_s_rows_are_read_from_all_windows(assembly, whole):
-    rows = [range(3, 8), range(18, 23), range(10, 14)]
-    for number, count in assembly.rows_of.items():
-        mine = np.flatnonzero(whole.person == number)
-        assert len(mine) == count
-        chosen = mine[np.concatenate(rows)]
-        found = assembly.person(number, rows)
-        known = np.linalg.norm(found.targets.information, axis=(-2, -1)) > 0
-        np.testing.assert_array_equal(found.targets.xyz[known], whole.joints[chosen][known])
-        np.testing.assert_allclose(
-            np.linalg.inv(found.targets.information[known]),
-            whole.covariance[chosen][known],
-            rtol=1e-6,
-            atol=1e-12,
-        )
-        np.testing.assert_array_equal(found.time_s, whole.time_s[chosen])
-    first, last = min(assembly.rows_of), max(assembly.rows_of)
-    named = replace(assembly, names={first: 40, last: first}, bodies=None).reconstruction()
+    for number in assembly.parts_of:
+        mine = whole.person == number
+        for name in ("time_s", "joints", "covariance"):
+            found = np.concatenate([piece for (piece,) in assembly.own_pieces(number, (name,))])
+            np.testing.assert_array_equal(found, getattr(whole, name)[mine])
+    first, last = min(assembly.parts_of), max(assembly.parts_of)
+    named = replace(assembly, names={first: 40, last: first}, shapes=None).reconstruction()
     expected = np.where(
         whole.person == first, 40, np.where(whole.person == last, first, whole.person)
     )

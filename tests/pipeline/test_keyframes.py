@@ -15,15 +15,16 @@ from shapepose_fg.estimation.motion_model import MotionModel
 from shapepose_fg.evaluation.metrics import covariance_calibration, joint_metrics, match_people
 from shapepose_fg.pipeline.execution import Execution
 from shapepose_fg.pipeline.keyframes import (
-    bodies_between,
     keyframes,
     spaced,
     strays_m,
+    with_bodies_between,
     with_rows_between,
 )
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.pipeline.solving import Solver, solve_rows
 from shapepose_fg.simulation import built_in_scene, simulate
+from shapepose_fg.simulation.files import truth_of
 
 FAST = PipelineConfig.fast()
 
@@ -107,29 +108,38 @@ def test_how_far_a_joint_strays_between_keyframes_is_told_by_the_states_at_both(
         assert (strays_m(swing, velocity, time_s).mean() > 0.03) == far
 
 
-def test_bodies_turn_evenly_between_keyframes():
-    """Once around in 0.8 s, past the angle at which rotation vectors jump; beside a row without a
-    body is none.
+def test_bodies_turn_evenly_between_keyframes(scene):
+    """Once around in 0.8 s, past the angle at which rotation vectors jump; where a keyframe has no
+    body, the interval is twice as long, and before the first and after the last is none.
     """
-    key_s, time_s = np.arange(9) * 0.1, np.arange(33) * 0.025
+    time_s, number = np.arange(-2, 35) * 0.025, np.arange(37)
     axis = np.array([0.6, 0.0, 0.8])
-
-    def bodies(at_s: np.ndarray) -> list[np.ndarray]:
-        turn = log_so3(exp_so3(at_s[:, None] / 0.8 * 2 * np.pi * axis))
-        pose = np.tile(turn[:, None], (1, 23, 1))
-        return [np.zeros((len(at_s), 10)), turn, pose, np.stack([at_s**2, at_s, 0 * at_s], axis=1)]
-
-    ok = np.ones(9, dtype=bool)
-    ok[6] = False
-    fine, found = bodies_between(ok, bodies(key_s), key_s, time_s)
-    assert np.flatnonzero(~fine).tolist() == list(range(21, 28))
-    apart = exp_so3(found[1][fine]).mT @ exp_so3(bodies(time_s[fine])[1])
-    assert (
-        np.linalg.norm(log_so3(apart), axis=-1).max() < 0.02
-    )  # 45 degrees a keyframe; a straight line: 0.05
-    inside = fine & (time_s > 0.1) & (time_s < 0.5)  # slopes at ends are of one side
-    np.testing.assert_allclose(found[3][inside], bodies(time_s[inside])[3], atol=1e-9)
-    np.testing.assert_allclose(found[2][fine][:, 4], found[1][fine], atol=1e-12)
+    turn = log_so3(exp_so3(time_s[:, None] / 0.8 * 2 * np.pi * axis))
+    columns = {
+        "betas": np.zeros((37, 10)),
+        "global_orient": turn,
+        "body_pose": np.tile(turn[:, None], (1, 23, 1)),
+        "transl": np.stack([time_s**2, time_s, 0 * time_s], axis=1),
+    }
+    truth = truth_of(scene).rows(np.zeros(37, dtype=int))
+    truth = replace(truth, frame=number, time_s=time_s, **columns)
+    key = (number % 4 == 2) & (number != 26)
+    given = {name: np.where(key.reshape(-1, *[1] * (each.ndim - 1)), each, np.nan)
+             for name, each in columns.items()}  # fmt: skip
+    status = np.where(key, Status.OK, Status.BODY_UNDETERMINED)
+    found = with_bodies_between(replace(truth, status=status, **given))
+    inside = (number >= 2) & (number <= 34)
+    assert np.array_equal(np.isfinite(found.betas).all(axis=1), inside)
+    assert np.array_equal(found.status == Status.OK, inside)
+    apart = log_so3(exp_so3(found.global_orient[inside]).mT @ exp_so3(turn[inside]))
+    # 45 degrees a keyframe, once 90; a straight line: 0.05
+    far = np.linalg.norm(apart, axis=-1)
+    assert np.delete(far, np.arange(20, 29)).max() < 0.02 and far.max() < 0.1
+    middle = (time_s > 0.1) & (time_s < 0.5)  # slopes at ends are of one side
+    np.testing.assert_allclose(found.transl[middle], truth.transl[middle], atol=1e-9)
+    np.testing.assert_allclose(
+        found.body_pose[inside][:, 4], found.global_orient[inside], atol=1e-12
+    )
 
 
 @pytest.fixture(scope="module")

@@ -116,7 +116,7 @@ def test_a_run_that_is_stopped_again_and_again_ends_the_same(scene, recording, w
     """
     stops, result = 0, None
     while result is None:
-        kept = Interrupted(tmp_path / "parts", 3 + stops % 2, behind=stops % 3 == 1)
+        kept = Interrupted(tmp_path / "parts", 3 + stops, behind=stops % 3 == 1)
         try:
             result = reconstruct_parts(kept, Task(recording, scene.rig, CONFIG, cuts=CUTS))
         except Stopped:

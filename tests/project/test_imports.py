@@ -40,7 +40,7 @@ LEVELS = (
     "estimation",
     "tracking",
     "pipeline.solve_window pipeline.keyframes",
-    "pipeline.config pipeline.cluster pipeline.bodies_over_time",
+    "pipeline.config pipeline.cluster pipeline.person_shapes",
     "pipeline.windows",
     "pipeline.runs",
     "pipeline.setup pipeline.execution",
@@ -64,10 +64,10 @@ LEVELS = (
     "cli.pictures cli.found_cameras cli.setup_table",
     "cli.reconstruct",
     "cli.batch",
-    "cli.demo cli.tracks cli.detect cli.overlay cli.export cli.report cli.view cli.setup "
+    "cli.tracks cli.detect cli.overlay cli.export cli.report cli.view cli.setup "
     "cli.simulate cli.train_fitter cli.batch.command cli.refine cli.synchronise cli.live "
     "cli.calibrate cli.explain cli.evaluate",
-    "cli.compile",
+    "cli.compile cli.demo",
     "cli.main",
     "__main__",
 )
@@ -225,7 +225,7 @@ LIGHT = {
     "readers": (
         "from shapepose_fg import InputError, Reconstruction, read_detections, read_rig, write_rig"
     ),
-    "stage I": "import shapepose_fg.proposal.association",
+    "stage I": "import shapepose_fg.proposal.stage_one",
     "stage II": "import shapepose_fg.pipeline.solve_window",
     "fits": "from shapepose_fg.body.fitting.fitters import make_fitter; make_fitter()",
     "processes that look": "import shapepose_fg.simulation.visibility",

@@ -53,14 +53,9 @@ class Held(FitRows):
     """(B, A) centre of the pose prior in the free angles, rad."""
 
 
-def robust_cost(squared: Array, scale: float) -> Array:
-    """Geman-McClure cost c² s / (c² + s), bounded by c²."""
-    return np.asarray(scale**2 * squared / (scale**2 + squared))
-
-
 def robust_weight(squared: Array, scale: float) -> Array:
-    """Derivative of `robust_cost`: the weight of a joint in iteratively reweighted least squares, 1
-    at its target.
+    """Derivative of the Geman-McClure cost c² s / (c² + s), which is bounded by c²: the weight of a
+    joint in iteratively reweighted least squares, 1 at its target.
     """
     return np.asarray((scale**2 / (scale**2 + squared)) ** 2)
 
@@ -147,7 +142,7 @@ class BodyEnergy:
         pose[:, self._hidden] = angles @ self.priors.gain.T + self.priors.at_zero
         return BodyParameters(free[:, :10], free[:, 10:13], pose.reshape(-1, 23, 3), free[:, -3:])
 
-    def parameters(self, fit: BodyFit, origin: Array) -> Array:
+    def parameters(self, fit: BodyFit | BodyParameters, origin: Array) -> Array:
         """Free parameters (B, P) of fitted bodies relative to their origins (B, 3)."""
         angles = fit.body_pose.reshape(len(fit), -1)[:, self.angles]
         return np.concatenate((fit.betas, fit.global_orient, angles, fit.transl - origin), axis=1)

@@ -3,14 +3,13 @@
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, get_args
+from typing import TYPE_CHECKING, ClassVar, Literal, get_args
 
 import numpy as np
-from annotated_types import Interval
 from numpy.typing import NDArray
 
 from shapepose_fg.core.arrays import Array, Index, Mask
-from shapepose_fg.core.bounds import Factor, Metres, RepeatsOrNone, Seconds, Settings
+from shapepose_fg.core.bounds import Factor, Metres, RepeatsOrNone, Settings
 from shapepose_fg.core.rows import Rows
 
 if TYPE_CHECKING:
@@ -20,9 +19,10 @@ if TYPE_CHECKING:
 
 Method = Literal["auto", "learned", "plain"]
 _ONE_TABLE = (
-    "is one with [body] now, which has model_sigma_m, kernel_scale, polish_steps, unfinished, "
-    "gap_s and correlation_s (lasting_s before); its other settings are constants"
+    "is one with [body] now, which has model_sigma_m, kernel_scale, polish_steps and unfinished; "
+    "its other settings are constants"
 )
+_IN_WINDOWS = "was removed: bodies over time are those of the windows"
 
 
 @dataclass(frozen=True)
@@ -48,14 +48,13 @@ class BodyConfig(Settings):
     unfinished: Factor = 30.0
     """Maximum decrease of the energy that a further step predicts; rows above it are fitted by the
     plain optimiser: a few in a hundred with contradictory joints, e.g. of two people."""
-    gap_s: Seconds = 1.0
-    """Bodies over time: rows of a person with a larger gap, s, are not linked."""
-    correlation_s: Annotated[float, Interval(gt=0, le=3600)] = 1.5
-    """Bodies over time: correlation time of errors of targets, seconds; rows within it count as one
-    observation of the shape. On real detections of a static camera the correlation is 0.83 after
-    0.04 s, 0.63 after 0.2 s and 0.40 after 1 s."""
 
-    replaced: ClassVar[dict[str, str]] = {"learned": _ONE_TABLE, "plain": _ONE_TABLE}
+    replaced: ClassVar[dict[str, str]] = {
+        "learned": _ONE_TABLE,
+        "plain": _ONE_TABLE,
+        "gap_s": _IN_WINDOWS,
+        "correlation_s": _IN_WINDOWS,
+    }
     """Obsolete settings, and what replaces them."""
 
     @classmethod
@@ -192,51 +191,13 @@ class BodyFit(Rows):
         self.transl[index] = body.transl + origin
 
 
-@dataclass(frozen=True)
-class Shapes:
-    """Gaussian posteriors of the shapes (betas) of G people."""
-
-    mean: Array
-    """(G, 10) mean betas, in standard deviations over adults."""
-    information: Array
-    """(G, 10, 10) inverse covariances; the prior of an unknown person is the identity, around 0."""
-
-    def __post_init__(self) -> None:
-        if (
-            self.mean.ndim != 2
-            or self.mean.shape[1] != 10
-            or self.information.shape != (*self.mean.shape, 10)
-        ):
-            shapes = f"{self.mean.shape} and {self.information.shape}"
-            raise ValueError(f"mean and information must be (G, 10) and (G, 10, 10), got {shapes}")
-
-    @classmethod
-    def unknown(cls, count: int) -> "Shapes":
-        """Prior shapes of `count` unknown people: adults."""
-        return cls(np.zeros((count, 10)), np.tile(np.eye(10), (count, 1, 1)))
-
-
-@dataclass(frozen=True)
-class SequenceFit:
-    """Bodies of B rows, and posteriors of their shapes."""
-
-    fit: BodyFit
-    """The bodies. `covariance` is from a row's own targets, given the shape of its group:
-    correlated errors are not averaged out."""
-    groups: Index
-    """(G,) the groups, in order."""
-    shapes: Shapes
-    """(G) posterior shapes, including the prior given; they can be the prior for a next
-    recording."""
-
-
 class BodyFitter(ABC):
     """Base class of body fitters. Your own must define `fit`; the rest is optional."""
 
     model: "BodyModel | None" = None
-    """The body model. A fitter with one must define `with_keypoint_offsets` and `fit_sequence`,
-    too; without one, the detector's offsets are not estimated, and people have no common shape over
-    time."""
+    """The body model. A fitter with one must define `with_keypoint_offsets`, too; without one,
+    bodies are not in the factor graph, the detector's offsets are not estimated, and people have no
+    common shape over time."""
 
     @abstractmethod
     def fit(self, targets: JointTargets, initial: BodyFit | None = None) -> BodyFit:
@@ -249,32 +210,6 @@ class BodyFitter(ABC):
         """Return a fitter for a detector whose joints have these offsets from the body's."""
         raise NotImplementedError(f"{type(self).__name__} has a model and no with_keypoint_offsets")
 
-    def fit_sequence(
-        self,
-        targets: JointTargets,
-        groups: Index,
-        time_s: Array,
-        shapes: Shapes | None = None,
-        *,
-        fixed_shapes: bool = False,
-        faster: Array | None = None,
-    ) -> SequenceFit:
-        """Fit one shape per group, and poses over time with a motion prior.
-
-        Parameters
-        ----------
-        targets: joint targets of B rows, each a person in a frame.
-        groups: (B,) integers that identify people.
-        time_s: (B,) times, seconds. Rows of a group more than `gap_s` apart are not linked.
-        shapes: prior shapes of the groups, in the order of `np.unique(groups)`; None: adults.
-        fixed_shapes: keep the means of `shapes`.
-        faster: (B, J) ratio, at least 1, by which the motion prior of joints is widened; None: 1.
-
-        Rows with too few joints are interpolated by the motion prior. Raises ValueError if a group
-        has two rows at one time.
-        """
-        raise NotImplementedError(f"{type(self).__name__} has a model and no fit_sequence")
-
 
 def check_fitter(fitter: object) -> None:
     """Raise TypeError unless `fitter` is a `BodyFitter`."""
@@ -284,13 +219,3 @@ def check_fitter(fitter: object) -> None:
             "shapepose_fg.body.fitting.fitter.BodyFitter, which makes the other methods of a "
             "fitter from `fit`"
         )
-
-
-def check_groups(groups: Index, rows: int) -> Index:
-    """`groups` as an array; raises ValueError unless it has one integer per row."""
-    groups = np.asarray(groups)
-    if groups.shape != (rows,) or groups.dtype.kind not in "iu":
-        raise ValueError(
-            f"groups must be {rows} whole numbers, one a row, got {groups.dtype} {groups.shape}"
-        )
-    return groups

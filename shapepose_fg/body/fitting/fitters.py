@@ -5,8 +5,6 @@ from pathlib import Path
 
 import numpy as np
 
-from factors import CONSTANT_VELOCITY, Motion
-from shapepose_fg.body.fitting.body_sequence import SequenceFitter
 from shapepose_fg.body.fitting.energy import BodyEnergy, EnergyTargets, Evaluated
 from shapepose_fg.body.fitting.evidence import Evidence, weigh
 from shapepose_fg.body.fitting.fitter import (
@@ -15,16 +13,13 @@ from shapepose_fg.body.fitting.fitter import (
     BodyFitter,
     FitStatus,
     JointTargets,
-    SequenceFit,
-    Shapes,
 )
 from shapepose_fg.body.fitting.optimisers import LevenbergMarquardt, NetworkDescent
 from shapepose_fg.body.fitting.priors import PosePrior
-from shapepose_fg.body.fitting.sizes import Sizes
 from shapepose_fg.body.fitting.weights import FitterWeights, fingerprint
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
-from shapepose_fg.core.arrays import Array, Index, Mask
+from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.rows import Rows
 
 _CHUNK = 64
@@ -35,9 +30,6 @@ _CONVERGED = 9.0
 """Without a network: maximum decrease of the energy that a Newton step predicts for a converged row
 (3 sigma of the posterior). With a network, `BodyConfig.unfinished` is used after the plain
 optimiser."""
-_ROUNDS = 2
-"""Number of fits at an adult's size; the first estimate of the size is biased by the prior of
-adults."""
 _SPREAD = {"RWrist": 2.0, "LWrist": 2.0}
 """Factors on the variance of joints without a target. Elbows bend farther from their mean
 than a Gaussian predicts: without them, 85 % of the wrists of the validation subjects
@@ -47,23 +39,21 @@ than a Gaussian predicts: without them, 85 % of the wrists of the validation sub
 def make_fitter(
     config: BodyConfig | None = None,
     model: BodyModel | None = None,
-    law: Motion = CONSTANT_VELOCITY,
 ) -> "SmplFitter":
-    """The fitter for `config`, on `model` or the body of the package; `law` is the motion model
-    over time.
+    """The fitter for `config`, on `model` or the body of the package.
 
     Raises InputError if the network is requested and its weights are missing or for another body.
     """
     config = BodyConfig() if config is None else config
     model = BodyModel.default() if model is None else model
     if config.method == "plain":
-        return SmplFitter(model, config=config, law=law)
+        return SmplFitter(model, config=config)
     weights = (
         FitterWeights.load(Path(config.weights)) if config.weights else FitterWeights.of(model)
     )
     if config.method == "auto" and not config.weights and fingerprint(model) != weights.body:
-        return SmplFitter(model, config=config, law=law)
-    return SmplFitter(model, config=config, weights=weights, law=law)
+        return SmplFitter(model, config=config)
+    return SmplFitter(model, config=config, weights=weights)
 
 
 class SmplFitter(BodyFitter):
@@ -82,13 +72,10 @@ class SmplFitter(BodyFitter):
         pose_prior: PosePrior | None = None,
         config: BodyConfig | None = None,
         weights: FitterWeights | None = None,
-        law: Motion = CONSTANT_VELOCITY,
     ):
         self.model = BodyModel.default() if model is None else model
         self.prior = PosePrior.default() if pose_prior is None else pose_prior
         self.config = config = BodyConfig() if config is None else config
-        self.law = law
-        """Motion model of bodies over time."""
         self.weights = weights
         """Weights of the network; None: no network is used."""
         self.energy = BodyEnergy(self.model, self.prior)
@@ -111,7 +98,7 @@ class SmplFitter(BodyFitter):
     def with_keypoint_offsets(self, offsets: KeypointOffsets) -> "SmplFitter":
         """Return a fitter for a detector whose joints have these offsets from the body's."""
         model = self.model.with_keypoint_offsets(offsets)
-        return SmplFitter(model, self.prior, self.config, self.weights, self.law)
+        return SmplFitter(model, self.prior, self.config, self.weights)
 
     def fit(self, targets: JointTargets, initial: BodyFit | None = None) -> BodyFit:
         """Fit a body to every row of `targets`; see `BodyFit` for the result.
@@ -135,7 +122,7 @@ class SmplFitter(BodyFitter):
             return fit
         evidence = evidence.rows(rows)
         start = None if initial is None else self._start(initial.rows(rows), evidence.centre)
-        found, _ = self._fitted(evidence, np.arange(count), start)
+        found = self._fitted(evidence, start)
         done = found.left < self._unfinished  # false for NaN
         done &= np.isfinite(found.xyz).all(axis=(1, 2))
         done &= np.isfinite(found.covariance).all(axis=(1, 2, 3))
@@ -149,86 +136,31 @@ class SmplFitter(BodyFitter):
         fit.residual_m[rows] = np.sqrt(found.squared.sum(axis=1) / evidence.total_information)
         return fit
 
-    def fit_sequence(
-        self,
-        targets: JointTargets,
-        groups: Index,
-        time_s: Array,
-        shapes: Shapes | None = None,
-        *,
-        fixed_shapes: bool = False,
-        faster: Array | None = None,
-    ) -> SequenceFit:
-        """See `BodyFitter`; people far from adults' size are fitted at that size first
-        (`sizes`).
-        """
-        sequence = SequenceFitter(self.energy, self._starts, self.law, self.config)
-        found = sequence.fit(
-            targets, groups, time_s, shapes, fixed_shapes=fixed_shapes, faster=faster
-        )
-        sizes = Sizes.of(self.model)
-        far = sizes.far(found.shapes.mean)
-        if shapes is not None or not far.any():
-            return found
-        rows = np.flatnonzero(np.isin(groups, found.groups[far]))
-        own, groups, time_s = targets.rows(rows), groups[rows], time_s[rows]
-        faster = None if faster is None else faster[rows]
-        whose = np.unique(groups, return_inverse=True)[1]
-        mean, information = found.shapes.mean.copy(), found.shapes.information
-        for _ in range(_ROUNDS):
-            size = sizes.ratio(mean[far])
-            adult = sequence.fit(own.larger(1 / size[whose]), groups, time_s, faster=faster)
-            mean[far] = sizes.resized(self.model, adult.shapes.mean, size)
-        again = sequence.fit(
-            own,
-            groups,
-            time_s,
-            Shapes(mean[far], information[far]),
-            fixed_shapes=True,
-            faster=faster,
-        )
-        return SequenceFit(
-            found.fit.with_rows(rows, again.fit), found.groups, Shapes(mean, information)
-        )
-
-    def _fitted(
-        self, evidence: Evidence, asked: Index, start: Array | None = None
-    ) -> tuple["JointPosterior", Array]:
-        """Posteriors of R rows relative to `evidence.centre`, with covariances of the joints
-        `asked` (N,), and the centres of the pose prior (R, A). Rows begin at `start` (R, P) where
+    def _fitted(self, evidence: Evidence, start: Array | None = None) -> "JointPosterior":
+        """Posteriors of R rows relative to `evidence.centre`. Rows begin at `start` (R, P) where
         the optimiser can.
 
         Each row separately: the choice of optimiser does not depend on the targets of another one.
         """
-        parts, angles = list[JointPosterior](), list[Array]()
+        parts = list[JointPosterior]()
         for some in _parts(len(evidence.xyz), _ARRIVE):
             targets, variance = _relative(evidence.rows(some))
             free, held = self.optimiser.arrive(
                 targets, variance, None if start is None else start[some]
             )
             for near in _parts(len(free), _CHUNK):
-                names = np.broadcast_to(asked, (len(free[near]), len(asked)))
-                given, priors = targets.rows(near), held.rows(near)
-                part = JointPosterior.of(self.optimiser.evaluated(free[near], given, priors, names))
+                given = targets.rows(near)
+                part = JointPosterior.of(
+                    self.optimiser.evaluated(free[near], given, held.rows(near))
+                )
                 unsettled = np.flatnonzero(~(part.left < self._unfinished))  # true for NaN
                 if self._fallback is not None and len(unsettled) > 0:
                     again = given.rows(unsettled)
                     arrived, usual = self._fallback.arrive(again, variance[near][unsettled])
-                    body = self._fallback.evaluated(arrived, again, usual, names[unsettled])
+                    body = self._fallback.evaluated(arrived, again, usual)
                     part.put(unsettled, JointPosterior.of(body))
-                    priors.angles[unsettled] = body.free[:, 13:-3]
                 parts.append(part)
-                angles.append(priors.angles)
-        return JointPosterior.concatenate(parts), np.concatenate(angles)
-
-    def _starts(self, evidence: Evidence) -> tuple[Array, Array, Mask]:
-        """Fit rows (R), each with a shape of its own.
-
-        Returns parameters (R, P) relative to `evidence.centre`, the centres of the pose prior (R,
-        A), and a mask (R,) of converged rows.
-        """
-        found, angles = self._fitted(evidence, np.empty(0, dtype=np.intp))
-        return found.free, angles, found.left < self._unfinished
+        return JointPosterior.concatenate(parts)
 
     def _start(self, initial: BodyFit, centre: Array) -> Array:
         """Free parameters (R, P) of bodies relative to the origins (R, 3); NaN where there is no
@@ -248,7 +180,7 @@ class JointPosterior(Rows):
     xyz: Array
     """(B, J, 3) joints, metres."""
     covariance: Array
-    """(B, N, 3, 3) covariances of the joints asked for, m² (Laplace)."""
+    """(B, J, 3, 3) covariances of the joints, m² (Laplace)."""
     squared: Array
     """(B, J) squared Mahalanobis distance of each joint to its target."""
     left: Array
@@ -256,7 +188,7 @@ class JointPosterior(Rows):
 
     @classmethod
     def of(cls, body: Evaluated) -> "JointPosterior":
-        """Build it from evaluated bodies, with systems for the joints asked for."""
+        """Build it from evaluated bodies, with systems for all joints."""
         return cls(body.free, body.xyz, body.covariances()[0], body.squared, body.left)
 
 

@@ -23,7 +23,7 @@ from shapepose_fg.body.kernels.solving import solved
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model.rotation import log_so3
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, slots
-from shapepose_fg.core.arrays import Array, Index, Mask
+from shapepose_fg.core.arrays import Array, Mask
 
 STALE = 0.3
 """Change of a joint's robust weight in a step above which the row is linearised again."""
@@ -94,19 +94,16 @@ class NetworkDescent:
         free[~(np.abs(arrived.betas).max(axis=1) < _NOBODY)] = np.nan
         return free, Held(arrived.betas, np.ones(count), angles)
 
-    def evaluated(
-        self, free: Array, targets: EnergyTargets, held: Held, asked: Index | None = None
-    ) -> Evaluated:
-        """The bodies of `arrive` (B, P), polished by Gauss-Newton steps, with the energy and the
-        keypoints `asked` (default: all); a step that does not lower a row's energy is
-        rejected.
+    def evaluated(self, free: Array, targets: EnergyTargets, held: Held) -> Evaluated:
+        """The bodies of `arrive` (B, P), polished by Gauss-Newton steps, with the energy; a step
+        that does not lower a row's energy is rejected.
 
         The energy is linearised before each step. After the last, it is linearised only for rows in
         which the weight of some joint changed: covariances hardly change otherwise, and a
         linearisation is a third of the total cost.
         """
         scale, energy = self._scale, self._energy
-        body = energy.evaluate(free, targets, scale, held, asked)
+        body = energy.evaluate(free, targets, scale, held)
         for _ in range(self._polish_steps):
             before = robust_weight(body.squared, scale)
             there = energy.retract(body.free, body.step)
@@ -116,12 +113,7 @@ class NetworkDescent:
                 np.abs(robust_weight(body.squared, scale) - before).max(axis=1) > STALE
             )
             if len(stale) > 0:
-                given = (
-                    targets.rows(stale),
-                    scale,
-                    held.rows(stale),
-                    None if asked is None else asked[stale],
-                )
+                given = targets.rows(stale), scale, held.rows(stale)
                 body.put(stale, energy.evaluate(body.free[stale], *given))
         return body
 
@@ -152,13 +144,9 @@ class LevenbergMarquardt:
         held = self._energy.held_by_priors(count)
         return self.solve(free, targets, warm, held), held
 
-    def evaluated(
-        self, free: Array, targets: EnergyTargets, held: Held, asked: Index | None = None
-    ) -> Evaluated:
-        """The bodies of `arrive` (B, P), with the energy and the keypoints `asked`
-        (default: all).
-        """
-        return self._energy.evaluate(free, targets, self._scale, held, asked)
+    def evaluated(self, free: Array, targets: EnergyTargets, held: Held) -> Evaluated:
+        """The bodies of `arrive` (B, P), with the energy."""
+        return self._energy.evaluate(free, targets, self._scale, held)
 
     def solve(self, free: Array, targets: EnergyTargets, warm: Mask, held: Held) -> Array:
         """Minimise from `free` (B, P); converged rows leave the batch. Returns (B, P)."""

@@ -17,6 +17,8 @@ from shapepose_fg.core.arrays import Array, Mask
 
 _ADULT = 2.0
 """Range of adults' stature, standard deviations from the mean."""
+_ROUNDS = 2
+"""Number of estimates at an adult's size; the first size is biased by the prior of adults."""
 _POINT_M = 0.02
 """Distance of a point, m, that costs as much as a beta of 1."""
 
@@ -54,6 +56,22 @@ class Sizes:
     def ratio(self, betas: Array) -> Array:
         """(G,) stature for `betas` (G, 10), relative to the mean body."""
         return 1 + betas @ self.taller / self.stature_m
+
+    def measured(self, body: BodyModel, betas: Array, information: Array, pull: Array) -> Array:
+        """(10,) betas of a person who was measured with `information` (10, 10) about `pull` =
+        information times betas (10,), without a prior; `betas` (10,) are a first estimate.
+
+        At an adult's size, the prior of adults holds: if the person is `size` times the adult with
+        betas a, size a + (size - 1) u is measured, with u the betas that make a body larger.
+        """
+        mean, by_betas = points_at_rest(body)
+        larger = np.linalg.lstsq(by_betas, mean, rcond=None)[0]
+        for _ in range(_ROUNDS):
+            size = self.ratio(betas[None])[0]
+            right = size * (pull - (size - 1) * information @ larger)
+            adult = np.linalg.solve(size**2 * information + np.eye(10), right)
+            betas = self.resized(body, adult[None], np.array([size]))[0]
+        return betas
 
     def resized(self, body: BodyModel, betas: Array, size: Array) -> Array:
         """(G, 10) betas of the bodies closest to bodies `betas` (G, 10) scaled by `size` (G,), with

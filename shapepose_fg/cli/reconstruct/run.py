@@ -104,7 +104,7 @@ def carry_out(
         fitter = None
         if asked.body is not None:
             model = BodyModel.load(asked.body).with_keypoints(recording.skeleton.joints)
-            fitter = make_fitter(settings.body, model, settings.law)
+            fitter = make_fitter(settings.body, model)
             if fitter.weights is None and settings.body.method != "plain":
                 cure = f"shapepose-fg train-fitter {shlex.join(['--body', str(asked.body)])}"
                 note(
@@ -329,7 +329,7 @@ class _Run:
         show(summary)
         if checked is not None:
             show_check(checked)
-        count = len(result.rows_of) if self.task.config.temporal else None
+        count = len(result.parts_of) if self.task.config.temporal else None
         return Ended(
             len(self.task.whole()[0]),
             len(result),

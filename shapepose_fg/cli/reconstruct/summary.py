@@ -73,7 +73,7 @@ def summary_table(
             else f"{each['way_m']:.1f} m, as given"
         )
         table.add_row("moving", f"{' '.join(each['cameras'])}: {words}")
-    count = f"{len(result.rows_of)} people over time" if over_time else "without identities"
+    count = f"{len(result.parts_of)} people over time" if over_time else "without identities"
     table.add_row(
         "people",
         f"{count}, {per_frame.mean():.1f} a frame ({per_frame.min()} to {per_frame.max()})",

@@ -1,6 +1,5 @@
 """Assembles the result of a run from its parts, by column: in memory, or directly into files."""
 
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -28,7 +27,7 @@ from shapepose_fg.core.storage.npz import Pieces
 from shapepose_fg.core.storage.schema import Table
 from shapepose_fg.estimation.contact import feet_of
 from shapepose_fg.estimation.floor import LOOK_S, Floor, find_floor
-from shapepose_fg.pipeline.bodies_over_time import BodiesOverTime, Person
+from shapepose_fg.pipeline.person_shapes import WindowBodies
 from shapepose_fg.pipeline.runs.parts import OBSERVED, Parts
 
 _STANDS_M_S = 0.1
@@ -48,18 +47,14 @@ class Assembly:
     """(V,) names of the cameras."""
     names: Mapping[int, int] = field(default_factory=dict)
     """Identities of tracks in the result; tracks not listed keep their number."""
-    bodies: BodiesOverTime | None = None
-    """Bodies that replace those of the windows."""
+    shapes: SubjectShapes | None = None
+    """The shapes of all people. With them, stored bodies (`keep_bodies`) replace those of the
+    windows."""
     run: dict[str, Any] = field(default_factory=dict)
     """Origin of the result (`Reconstruction.run`)."""
 
     def __len__(self) -> int:
         return self.parts.rows
-
-    @property
-    def shapes(self) -> SubjectShapes | None:
-        """The shapes of all people."""
-        return None if self.bodies is None else self.bodies.shapes
 
     @cached_property
     def persons(self) -> list[NDArray[np.int64]]:
@@ -71,46 +66,33 @@ class Assembly:
         ]
 
     @cached_property
-    def rows_of(self) -> dict[int, int]:
-        """Number of rows of each person."""
-        return {number: sum(places.values()) for number, places in sorted(self._places.items())}
-
-    @cached_property
-    def _places(self) -> dict[int, dict[int, int]]:
-        """For each person the parts with rows of that person, and their number in each."""
-        places: dict[int, dict[int, int]] = {}
+    def parts_of(self) -> dict[int, list[int]]:
+        """For each person, by number, the parts with rows of the person."""
+        found: dict[int, list[int]] = {}
         for n, person in enumerate(self.persons):
-            for number, count in Counter(person.tolist()).items():
-                places.setdefault(number, {})[n] = count
-        return places
+            for number in np.unique(person).tolist():
+                found.setdefault(number, []).append(n)
+        return dict(sorted(found.items()))
 
-    def own_pieces(
-        self, number: int, columns: Sequence[str], rows: range | None = None
-    ) -> Iterator[tuple[NDArray[Any], ...]]:
-        """`columns` of one person's rows, by part; `rows` is a range among the person's own, None
-        for all.
-        """
-        wanted = range(self.rows_of[number]) if rows is None else rows
-        before = 0
-        for n, count in self._places[number].items():
-            first, last = max(wanted.start - before, 0), min(wanted.stop - before, count)
-            before += count
-            if first < last:
-                mine = np.flatnonzero(self.persons[n] == number)[first:last]
-                yield tuple(self.parts.column(n, name)[mine] for name in columns)
+    def own_pieces(self, number: int, columns: Sequence[str]) -> Iterator[tuple[NDArray[Any], ...]]:
+        """`columns` of one person's rows, by part."""
+        for n in self.parts_of[number]:
+            mine = self.persons[n] == number
+            yield tuple(self.parts.column(n, name)[mine] for name in columns)
 
-    def person(self, number: int, rows: Sequence[range]) -> Person:
-        """Data for fitting a person's bodies, in ranges of the person's own rows, in order."""
-        columns = ("joints", "covariance", "time_s")
-        pieces = [piece for part in rows for piece in self.own_pieces(number, columns, part)]
-        return Person.of(number, *(np.concatenate(column) for column in zip(*pieces, strict=True)))
+    def bodies(self, n: int) -> WindowBodies:
+        """The bodies of a part, as they were solved."""
+        _, *names = WindowBodies.__dataclass_fields__
+        return WindowBodies(self.persons[n], *(self.parts.column(n, name) for name in names))
+
+    def keep_bodies(self, n: int, columns: Mapping[str, Array]) -> None:
+        """Store bodies of a part, by column."""
+        self.parts.kept.keep(_bodies(n), columns)
 
     def pieces(self, name: str) -> Iterator[NDArray[Any]]:
         """A column of people.npz, or of observations.npz (`OBSERVED`), by part."""
-        before: Counter[int] = Counter()
-        for n, person in enumerate(self.persons):
-            yield self._piece(n, name, before)
-            before.update(person.tolist())
+        for n in range(len(self.parts)):
+            yield self._piece(n, name)
 
     def counts(self) -> dict[str, Any]:
         """The entry of run.json about the rows (`Reconstruction.counts`)."""
@@ -142,15 +124,14 @@ class Assembly:
         rows = {
             name: np.empty((count, *each.shape[1:]), each.dtype) for name, each in columns.items()
         }
-        before: Counter[int] = Counter()
         stop = 0
-        for n, (mine, person) in enumerate(zip(chosen, self.persons, strict=True)):
+        for n, mine in enumerate(chosen):
             start, stop = stop, stop + len(mine)
             for name, all_rows in rows.items():
-                all_rows[start:stop] = self._piece(n, name, before)[mine]
-            before.update(person.tolist())
+                all_rows[start:stop] = self._piece(n, name)[mine]
             if consume:
                 self.parts.drop(n)
+                self.parts.kept.drop(_bodies(n))
         table = None
         if len(self) > 0:
             table = ObservationTable.empty(self.joint_names, self.view_names)
@@ -165,16 +146,13 @@ class Assembly:
         """Return a copy with further entries in run.json."""
         return replace(self, run=self.run | entries)
 
-    def _piece(self, n: int, name: str, before: Mapping[int, int]) -> NDArray[Any]:
-        """A column of a part; `before` is the number of rows of each person in earlier parts."""
+    def _piece(self, n: int, name: str) -> NDArray[Any]:
+        """A column of a part."""
         if name.removeprefix(OBSERVED) == "person":
             return self.persons[n]
-        values = self.parts.column(n, name)
-        return (
-            values
-            if self.bodies is None
-            else self.bodies.filled(name, values, self.persons[n], before)
-        )
+        if name in BODY and self.shapes is not None:
+            return self.parts.kept.array(_bodies(n), name)
+        return self.parts.column(n, name)
 
     def _columns(self, empty: Table, prefix: str) -> dict[str, Pieces]:
         """The columns of an `empty` table with the rows of all parts."""
@@ -218,3 +196,8 @@ class Assembly:
             looks.append(np.stack([parts.column(n, "person")[rows], side, look], axis=1))
         whose = np.unique(np.concatenate(looks), axis=0, return_inverse=True)[1]
         return find_floor(np.concatenate(points), whose.ravel(), up)
+
+
+def _bodies(n: int) -> str:
+    """Name under which the bodies of a part are stored."""
+    return f"bodies-{n:06d}"

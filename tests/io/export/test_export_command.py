@@ -177,19 +177,6 @@ def test_view_without_a_viewer_is_one_sentence(copied, capfd):
     assert "the rerun viewer cannot be reached at nonsense" in capfd.readouterr().err
 
 
-def test_what_is_viewed_can_be_saved_instead(copied, tmp_path, capsys):
-    rerun = pytest.importorskip("rerun")
-    path = tmp_path / "new" / "walk.rrd"
-    assert run("view", copied, "--save", path) == 0
-    assert capsys.readouterr().out == f"written  {path}\n"
-    paths = {chunk.entity_path for chunk in rerun.chunk.RrdReader(path).stream()}
-    assert {"/world/people/3/joints", "/world/people/7/body/head", "/world/cameras/cam0"} < paths
-    assert (
-        run("view", copied, "--save", path, "--connect", "rerun+http://localhost:9876/proxy") == 2
-    )
-    assert "--save and --connect" in capsys.readouterr().err
-
-
 def test_rerun_sends_no_statistics(tmp_path, monkeypatch):
     """On a machine where rerun was never used they are on; `rerun analytics disable` is what its
     manual says.

@@ -1,0 +1,222 @@
+"""One shape per person over a recording, and the bodies of windows with that shape.
+
+Every window has solved bodies with a shape of its own. The shapes of a person's windows are
+combined by their information, and each body is turned so that its joints stay where the window has
+them.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from shapepose_fg.body.fitting.energy import SETTLED, BodyEnergy, EnergyTargets, Held, nothing
+from shapepose_fg.body.fitting.evidence import weigh
+from shapepose_fg.body.fitting.fitter import BodyConfig, JointTargets
+from shapepose_fg.body.fitting.priors import PosePrior
+from shapepose_fg.body.fitting.sizes import Sizes
+from shapepose_fg.body.fitting.weights import fingerprint
+from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
+from shapepose_fg.body.model.soles import above_floor
+from shapepose_fg.body.shapes import SubjectShapes, recognise
+from shapepose_fg.core.arrays import Array, Index, Whole
+from shapepose_fg.core.reconstruction import BODY, Reconstruction
+from shapepose_fg.core.rows import Rows
+from shapepose_fg.estimation.floor import LOOK_S, Floor
+
+_BATCH = 64
+"""Rows per batch: their Hessians fit into the cache."""
+_NOT_ROBUST = 1e9
+"""Width of the robust kernel, standard deviations, at which it has no effect."""
+_STEPS = 2
+"""Gauss-Newton steps from a window's body to one with another shape."""
+
+
+@dataclass(frozen=True)
+class WindowBodies(Rows):
+    """R rows with bodies, as their windows solved them."""
+
+    person: Whole
+    """(R,) numbers of people."""
+    time_s: Array
+    """(R,) times, seconds."""
+    joints: Array
+    """(R, J, 3) joints in the world, metres; NaN if unknown."""
+    covariance: Array
+    """(R, J, 3, 3) their covariances, m²."""
+    betas: Array
+    """(R, 10) shapes; NaN without a body."""
+    global_orient: Array
+    """(R, 3) rotations of the root, axis-angle, rad."""
+    body_pose: Array
+    """(R, 23, 3) rotations of the other joints relative to their parents, axis-angle, rad."""
+    transl: Array
+    """(R, 3) translations, metres."""
+
+    @classmethod
+    def of(cls, people: Reconstruction) -> "WindowBodies":
+        """The rows of a result."""
+        return cls(*(getattr(people, name) for name in cls.__dataclass_fields__))
+
+    @property
+    def body(self) -> BodyParameters:
+        """The bodies."""
+        return BodyParameters(self.betas, self.global_orient, self.body_pose, self.transl)
+
+
+@dataclass
+class ShapeEvidence:
+    """What rows say about a person's shape, without a prior."""
+
+    information: Array = field(default_factory=lambda: np.zeros((10, 10)))
+    """(10, 10) sum of the information of all rows on the betas."""
+    pull: Array = field(default_factory=lambda: np.zeros(10))
+    """(10,) sum of information times betas."""
+    count: int = 0
+    """Number of rows."""
+    looks: set[int] = field(default_factory=set)
+    """Intervals of `LOOK_S` with rows. Errors of joints last as long: together, the rows of an
+    interval are one measurement of the shape."""
+
+    def add(self, other: "ShapeEvidence") -> None:
+        """Add the evidence of other rows."""
+        self.information = self.information + other.information
+        self.pull = self.pull + other.pull
+        self.count += other.count
+        self.looks |= other.looks
+
+    @property
+    def measured(self) -> tuple[Array, Array]:
+        """Information (10, 10) of all intervals, and information times betas (10,)."""
+        share = min(len(self.looks) / max(self.count, 1), 1.0)
+        return share * self.information, share * self.pull
+
+
+def evidence(
+    rows: WindowBodies, model: BodyModel, sigma_m: float = BodyConfig.model_sigma_m
+) -> dict[int, ShapeEvidence]:
+    """The evidence of rows on the shapes of their people.
+
+    `sigma_m` is the standard deviation of a detector's joint from the body's, metres.
+    """
+    found, energy = dict[int, ShapeEvidence](), BodyEnergy(model, PosePrior.default())
+    for some, mine, free in _batches(rows, energy):
+        count, known = len(some), JointTargets.solved(mine.joints, mine.covariance)
+        xyz = energy.model.keypoints(energy.complete(free))
+        targets = EnergyTargets(xyz, weigh(known, sigma_m).information)
+        held = Held(np.zeros((count, 10)), np.ones(count), free[:, 13:-3])
+        body = energy.evaluate(free, targets, _NOT_ROBUST, held, nothing(count))
+        said = np.linalg.inv(body.covariances()[1]) - np.eye(10)
+        pull = (said @ free[:, :10, None])[..., 0]
+        looks = (mine.time_s // LOOK_S).astype(np.int64).tolist()
+        for n, number in enumerate(mine.person.tolist()):
+            each = ShapeEvidence(said[n], pull[n], 1, {looks[n]})
+            found.setdefault(number, ShapeEvidence()).add(each)
+    return found
+
+
+def combined(
+    found: Mapping[int, ShapeEvidence], known: SubjectShapes, model: BodyModel
+) -> SubjectShapes:
+    """The shapes of people, in the order of `found`; the prior is that of adults.
+
+    `known` are people of other recordings. If one is recognised by shape (`recognise`), the known
+    shape is the prior, and the name is kept; others are named by their numbers. Raises ValueError
+    if they are of another body model.
+    """
+    people, sizes = [each.measured for each in found.values()], Sizes.of(model)
+    seen = np.array([information for information, _ in people]).reshape(-1, 10, 10)
+    pull = np.array([each for _, each in people]).reshape(-1, 10)
+    information = seen + np.eye(10)
+    betas = np.asarray(np.linalg.solve(information, pull[..., None])[..., 0], dtype=np.float64)
+    numbers = np.array([str(number) for number in found], dtype=str)
+    whose = recognise(SubjectShapes(numbers, betas, information, fingerprint(model)), known)
+    for n, subject in enumerate(whose.tolist()):
+        if subject >= 0:
+            prior = known.information[subject]
+            information[n] = seen[n] + prior
+            betas[n] = np.linalg.solve(information[n], pull[n] + prior @ known.betas[subject])
+        elif sizes.far(betas[[n]])[0]:
+            betas[n] = sizes.measured(model, betas[n], seen[n], pull[n])
+    names = _names(list(found), known, whose.tolist())
+    return SubjectShapes(np.array(names, dtype=str), betas, information, known.body)
+
+
+def with_shape(
+    rows: WindowBodies,
+    betas: Array,
+    model: BodyModel,
+    sigma_m: float = BodyConfig.model_sigma_m,
+    floor: Floor | None = None,
+) -> dict[str, Array]:
+    """The bodies of rows with the shapes `betas` (R, 10), by column.
+
+    Poses change so that joints of bodies stay; no body sinks into the `floor`. Rows without a body
+    stay so.
+    """
+    found = {name: getattr(rows, name).copy() for name in BODY}
+    energy = BodyEnergy(model, PosePrior.default())
+    for some, _, free in _batches(rows, energy):
+        # All joints alike, or poses would tremble with the views that see them.
+        xyz = energy.model.keypoints(energy.complete(free))
+        alike = np.broadcast_to(np.eye(3) / sigma_m**2, (*xyz.shape, 3))
+        targets = EnergyTargets(xyz, alike)
+        held = Held(betas[some], np.full(len(some), SETTLED), free[:, 13:-3])
+        free[:, :10] = betas[some]
+        for _ in range(_STEPS):
+            body = energy.evaluate(free, targets, _NOT_ROBUST, held, nothing(len(some)))
+            free = energy.retract(free, body.step)
+        made = replace(energy.complete(free), betas=betas[some])
+        bodies = made.betas, made.global_orient, made.body_pose, made.transl + rows.transl[some]
+        if floor is not None:
+            bodies = above_floor(model, bodies, floor.normal, floor.height_m)
+        for name, values in zip(BODY, bodies, strict=True):
+            found[name][some] = values
+    return found
+
+
+def _batches(rows: WindowBodies, energy: BodyEnergy) -> Iterator[tuple[Index, WindowBodies, Array]]:
+    """Rows with a body, in batches: their indices, the rows, and the free parameters of their
+    bodies relative to their translations.
+    """
+    ok = np.flatnonzero(np.isfinite(rows.betas).all(axis=1))
+    for at in range(0, len(ok), _BATCH):
+        mine = rows.rows(some := ok[at : at + _BATCH])
+        yield some, mine, energy.parameters(mine.body, mine.transl)
+
+
+def with_person_shapes(
+    people: Reconstruction,
+    model: BodyModel,
+    known: SubjectShapes | None = None,
+    floor: Floor | None = None,
+    sigma_m: float = BodyConfig.model_sigma_m,
+) -> Reconstruction:
+    """Return the rows with one shape per person, and these shapes (`combined`).
+
+    Joints and their covariances do not change; bodies are those of `with_shape`.
+    """
+    if len(people) == 0:
+        return people
+    known = SubjectShapes.empty(fingerprint(model)) if known is None else known
+    rows, numbers = WindowBodies.of(people), np.unique(people.person)
+    found = {number: ShapeEvidence() for number in numbers.tolist()}
+    for number, each in evidence(rows, model, sigma_m).items():
+        found[number].add(each)
+    shapes = combined(found, known, model)
+    betas = shapes.betas[np.searchsorted(numbers, people.person)]
+    return replace(people, shapes=shapes, **with_shape(rows, betas, model, sigma_m, floor))
+
+
+def _names(numbers: Sequence[int], known: SubjectShapes, whose: Sequence[int]) -> list[str]:
+    """Names of people in the file of shapes: known names; new people get their number, or the next
+    free one.
+    """
+    names, taken = [], set(known.names.tolist())
+    for number, subject in zip(numbers, whose, strict=True):
+        name = str(number) if subject < 0 else str(known.names[subject])
+        if subject < 0 and name in taken:
+            name = str(1 + max(int(each) for each in taken if each.isdecimal()))
+        names.append(name)
+        taken.add(name)
+    return names
