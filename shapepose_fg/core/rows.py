@@ -37,14 +37,6 @@ class Rows:
             else:
                 values[index] = getattr(other, name)
 
-    def with_rows(self, index: Any, other: Self) -> Self:
-        """Return a copy in which the rows `index` (R,) are those of `other`."""
-        changed = replace(
-            cast(Any, self), **{name: value.copy() for name, value in self._columns().items()}
-        )
-        changed.put(index, other)
-        return changed
-
     @classmethod
     def concatenate(cls, parts: Sequence[Self], **others: Any) -> Self:
         """The rows of one or more parts, one after the other; fields that apply to all rows are

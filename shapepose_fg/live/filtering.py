@@ -275,6 +275,7 @@ class Filter:
             np.concatenate([np.column_stack([gone.time_s, gone.time_s]), begin]),
             np.concatenate([gone.place, now.place[ready]])[:, None].repeat(2, axis=1),
             np.concatenate([gone.bones, bones]),
+            np.zeros((G + R, 3)),  # a track has been extrapolated when it ends
         )
         names = stitch(ends, self.stitching)
         return {

@@ -24,17 +24,9 @@ MOST_FRAMES = 256
 """Maximum number of frames in a block at any frame rate; bounds memory."""
 _SAME_M = 0.35
 """Mean distance of core joints, m, below which two hypotheses in a frame are the same person."""
-_WALK_MPS = 1.5
-"""Growth of the re-identification distance while a person is out of arrays, m/s."""
-
 _ROUNDS = 3
 """Maximum number of searches for people in an isolated frame, repeated while sides are
 exchanged."""
-_PACE_S = 0.2
-"""Duration over which the speed before a disappearance is measured, s."""
-_COASTS_S = 0.5
-"""Longest extrapolation of a person out of arrays, s; as long as a track is followed without
-evidence."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +98,7 @@ def _decide(tracker: Tracker, state: FollowState, own: int) -> tuple[FollowState
     for start, stop in zip(rest.start.tolist(), rest.stop.tolist(), strict=True):
         tracker.drop(_UNLIKELY, [frame.frame for frame in frames[start : min(stop, own)]])
     chosen = _with_detections(found, chosen, first=len(state.people) == 0, last=own == len(frames))
-    identity, next_id = _identities(found, chosen, state, times_of(frames), own, tracker.skeleton)
+    identity, next_id = _identities(found, chosen, state.next_id, own, tracker.skeleton)
     rows = {
         keys[t]: _rows(frame, t, found, chosen, identity) for t, frame in enumerate(frames[:own])
     }
@@ -161,10 +153,8 @@ def alone(tracker: Tracker, given: Input, next_id: int) -> Decided:
 def _rows(
     given: Input, t: int, found: Hypotheses, chosen: SelectedTracks, identity: Index
 ) -> Observations:
-    """The people of a frame as observations, each identity once; uncertain joints are NaN."""
+    """The people of a frame as observations; uncertain joints are NaN."""
     here = np.flatnonzero(chosen.during(t) & (identity >= 0))
-    _, first = np.unique(identity[here], return_index=True)
-    here = here[np.sort(first)]
     who = chosen.hypothesis[here]
     own = found.candidate[who, t].astype(np.intp)
     evidence = own_evidence(own, found.weight[who, t], found.price[who, t])
@@ -186,23 +176,16 @@ def observed(
 
 
 def _identities(
-    found: Hypotheses,
-    chosen: SelectedTracks,
-    state: FollowState,
-    times: Array,
-    own: int,
-    skeleton: Skeleton,
+    found: Hypotheses, chosen: SelectedTracks, next_id: int, own: int, skeleton: Skeleton
 ) -> tuple[Index, int]:
     """(K,) identity of each chosen person, -1 if present only in later frames; and the next unused
     identity.
 
-    People present in the first frame take the identity of the carried person at the same place.
-    People who appear later take the identity of a person who disappeared nearby, if there is one;
-    else a new one.
+    People present in the first frame take the identity of the carried person at the same place,
+    others get a new one; `stitching` finds those who return.
     """
     identity = np.full(len(chosen), -1, dtype=np.intp)
-    needed = chosen.start < own
-    early = np.flatnonzero(needed & (chosen.start == 0))
+    early = np.flatnonzero(chosen.start == 0)
     carried = np.flatnonzero((found.carried >= 0) & found.there[:, 0])
     apart = core_distance(
         found.places[chosen.hypothesis[early], 0], found.places[carried, 0], skeleton
@@ -210,61 +193,10 @@ def _identities(
     for row, column in zip(*least_cost_pairs(np.minimum(apart, 2 * _SAME_M)), strict=True):
         if apart[row, column] < _SAME_M:
             identity[early[row]] = found.carried[carried[column]]
-    next_id = state.next_id
-    for k in np.argsort(chosen.start, kind="stable").tolist():
-        if not needed[k] or identity[k] >= 0:
-            continue
-        identity[k] = _returned(found, chosen, k, identity, times, skeleton)
-        if identity[k] < 0:
-            identity[k], next_id = next_id, next_id + 1
-    return identity, next_id
-
-
-def _returned(
-    found: Hypotheses,
-    chosen: SelectedTracks,
-    k: int,
-    identity: Index,
-    times: Array,
-    skeleton: Skeleton,
-) -> int:
-    """Identity of the nearest person who disappeared before the `k`-th chosen appears;
-    -1 for none.
-    """
-    start, best, nearest_m = int(chosen.start[k]), -1, np.inf
-    here = found.places[chosen.hypothesis[[k]], start]
-    for j in np.flatnonzero((identity >= 0) & (chosen.stop <= start)).tolist():
-        again = (identity == identity[j]) & (chosen.stop > chosen.stop[j])
-        gap_s = times[start] - times[chosen.stop[j] - 1]
-        there = _left_at(
-            found.places[chosen.hypothesis[j], chosen.start[j] : chosen.stop[j]],
-            times[chosen.start[j] :],
-            gap_s,
-        )
-        apart = float(core_distance(here, there, skeleton)[0, 0])
-        if not again.any() and apart < min(nearest_m, _SAME_M + _WALK_MPS * gap_s):
-            best, nearest_m = int(identity[j]), apart
-    return best
-
-
-def _left_at(places: Array, times: Array, later_s: float) -> Array:
-    """(1, J, 3) extrapolated joints, m, `later_s` after the last of `places` (T, J, 3) at `times`
-    (T,).
-
-    All joints move at the median velocity over the last `_PACE_S`, for at most `_COASTS_S`.
-    """
-    last = len(places) - 1
-    first = int(np.searchsorted(times[:last], times[last] - _PACE_S))
-    moved = places[last] - places[first]
-    known = np.isfinite(moved).all(axis=-1)
-    if not known.any():
-        return places[[last]]
-    pace = (
-        np.median(moved[known], axis=0) / (times[last] - times[first])
-        if first < last
-        else np.zeros(3)
-    )
-    return (places[last] + min(later_s, _COASTS_S) * pace)[None]
+    new = np.argsort(chosen.start, kind="stable")
+    new = new[(chosen.start[new] < own) & (identity[new] < 0)]
+    identity[new] = next_id + np.arange(len(new))
+    return identity, next_id + len(new)
 
 
 def core_distance(places: Array, others: Array, skeleton: Skeleton) -> Array:

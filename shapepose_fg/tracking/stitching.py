@@ -25,6 +25,13 @@ _BUILD = 2.0
 """Maximum mean squared difference of bone lengths, in variances, of one person. Its expectation is
 1 for one person; bone lengths of adults differ by 2 to 3 cm, which gives 3 to 5."""
 
+_BRIEF_S = 1.0
+"""Longest gap over which tracks are joined without knowing their build, s."""
+_PACE_S = 0.2
+"""Duration over which the velocity at the end of a track is measured, s."""
+_COASTS_S = 0.5
+"""Longest extrapolation of a person out of sight, s; as long as a track is followed without
+evidence."""
 _WALK_MPS = 1.5
 """Growth of the maximum distance with the gap, m/s: people walk at 1.4 m/s."""
 
@@ -71,6 +78,13 @@ class Trace(Rows):
         enough = np.isfinite(self.bones).sum(axis=0) >= LEAST_ROWS
         return np.where(enough, np.nanmedian(np.where(enough, self.bones, 0.0), axis=0), np.nan)
 
+    @property
+    def velocity(self) -> Array:
+        """(3,) mean velocity of the centre over the last `_PACE_S`, m/s; 0 with a single row."""
+        first = int(np.searchsorted(self.time_s[:-1], self.time_s[-1] - _PACE_S - 1e-6))
+        step_s = max(self.time_s[-1] - self.time_s[first], 1e-6)
+        return (self.centre[-1] - self.centre[first]) / step_s
+
 
 @dataclass(frozen=True)
 class Ends:
@@ -84,16 +98,23 @@ class Ends:
     """(G, 2, 3) centre of the core joints at the track's start and end, metres."""
     bones: Array
     """(G, B) median length of each bone between core joints, metres; NaN where unknown."""
+    velocity: Array
+    """(G, 3) velocity of the centre at the track's end, m/s."""
 
     @classmethod
     def of(cls, traces: Iterable[Trace]) -> "Ends":
         """Summarise tracks one at a time, to save memory."""
         rows = [
-            (each.track, each.time_s[[0, -1]], each.centre[[0, -1]], each.build) for each in traces
+            (each.track, each.time_s[[0, -1]], each.centre[[0, -1]], each.build, each.velocity)
+            for each in traces
         ]
         if len(rows) == 0:
             return cls(
-                np.zeros(0, np.intp), np.zeros((0, 2)), np.zeros((0, 2, 3)), np.zeros((0, 0))
+                np.zeros(0, np.intp),
+                np.zeros((0, 2)),
+                np.zeros((0, 2, 3)),
+                np.zeros((0, 0)),
+                np.zeros((0, 3)),
             )
         return cls(*map(np.array, zip(*rows, strict=True)))
 
@@ -129,13 +150,15 @@ def _pairs(
     before = np.repeat(np.arange(len(end_s)), count)
     after = order[np.arange(len(before)) + np.repeat(first - np.cumsum(count) + count, count)]
     gap_s = begin_s[after] - end_s[before]
-    apart_m = np.linalg.norm(ends.place[after, 0] - ends.place[before, 1], axis=-1)
+    moved = ends.velocity[before] * np.minimum(gap_s, _COASTS_S)[:, None]
+    apart_m = np.linalg.norm(ends.place[after, 0] - ends.place[before, 1] - moved, axis=-1)
     reach_m = config.reach_m + _WALK_MPS * gap_s
     may = (gap_s <= config.longest_gap_s) & (apart_m <= reach_m)
     for cut in cuts_s:
         may &= ~((end_s[before] < cut) & (begin_s[after] >= cut))
     before, after, apart_m, reach_m = before[may], after[may], apart_m[may], reach_m[may]
     unlike = _unlike(ends.bones[before], ends.bones[after])
+    unlike = np.where(np.isnan(unlike) & (gap_s[may] <= _BRIEF_S), 1.0, unlike)  # the expectation
     alike = unlike <= _BUILD  # false where unknown
     cost = _costs(apart_m, reach_m, ends.bones.shape[1] * unlike)[alike]
     return before[alike], after[alike], cost

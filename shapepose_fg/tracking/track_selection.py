@@ -83,9 +83,8 @@ def weighed(
 
     `candidate` (A, J, V) are detections of one frame, -1 for none, `places` (A, J, 3) the joints,
     metres, NaN where unknown; people of the same `world` (A,) occlude each other. A detection is
-    weighted by its affinity to the same person's others and by the share that these have in its
-    affinity to anybody's, and pays the cost of its place. A detection is expected for each joint
-    within a view's image; a joint of unknown position is
+    weighted by its affinity to the same person's others, and pays the cost of its place. A
+    detection is expected for each joint within a view's image; a joint of unknown position is
     assumed at the mean of the others.
     """
     (A, J), known = candidate.shape[:2], np.asarray(np.isfinite(places).all(axis=-1))
@@ -119,9 +118,8 @@ def _weigh(
     tie(whose[:count], which[:count], candidate, arrays, tied, neighbours)
     of_joint, of_view = arrays.of_joint, arrays.of_view
     for n in range(count):
-        a, d = whose[n], which[n]
-        counts = min(max(tied[n] / _SURE_AFFINITY, 0.0), 1.0) if neighbours[n] > 0 else _ALONE
-        weight[a, of_joint[d], of_view[d]] = counts * _own_share(a, d, candidate, world, arrays)
+        counts, d = min(max(tied[n] / _SURE_AFFINITY, 0.0), 1.0), which[n]
+        weight[whose[n], of_joint[d], of_view[d]] = counts if neighbours[n] > 0 else _ALONE
     for a in range(people):
         _fill(places[a], known[a], at[a])
     for v in range(views):
@@ -144,25 +142,6 @@ def _weigh(
         for j in range(joints):
             for v in range(views):
                 weight[a, j, v] /= max(expected[a], 1.0)
-
-
-@part
-def _own_share(a, d, candidate, world, arrays):
-    """Share of the affinity of detection `d` to detections of people of its world that is to those
-    of person `a`; 1 without any.
-
-    Where two people divide the joints of one 2D person, each of these counts less for both.
-    """
-    v, own, others = arrays.of_view[d], 0.0, 0.0
-    for n in range(arrays.begin[d], arrays.begin[d + 1]):
-        j = arrays.of_joint[arrays.other[n]]
-        if candidate[a, j, v] == arrays.other[n]:
-            own += arrays.value[n]
-            continue
-        for b in range(len(world)):
-            if world[b] == world[a] and candidate[b, j, v] == arrays.other[n]:
-                others += arrays.value[n]
-    return own / (own + others) if own + others > 0 else 1.0
 
 
 @part

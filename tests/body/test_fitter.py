@@ -237,8 +237,8 @@ def test_a_failed_row_takes_any_other_status():
     before, after = (
         BodyFit.failed(np.full(2, each), 25) for each in ("too_few_joints", "invalid_targets")
     )
-    changed = before.with_rows(np.array([1]), after.rows(np.array([1])))
-    assert changed.status.tolist() == [FitStatus.TOO_FEW_JOINTS, FitStatus.INVALID_TARGETS]
+    before.put(np.array([1]), after.rows(np.array([1])))
+    assert before.status.tolist() == [FitStatus.TOO_FEW_JOINTS, FitStatus.INVALID_TARGETS]
 
 
 def test_misuse_is_told(fitter, joints):

@@ -9,8 +9,11 @@ from shapepose_fg.core.detections import Recording
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
+from shapepose_fg.setup_check.evidence import Look, gather
 from shapepose_fg.setup_check.findings import Kind
+from shapepose_fg.setup_check.joint_order import order_of_joints
 from shapepose_fg.setup_check.report import check_setup
+from tests.setup_check.spoiled_setups import biased, lasting
 
 SIDES = [(joint, "L" + joint[1:]) for joint in BODY_25.joints if joint[0] == "R"]
 LEGS = ("Hip", "Knee", "Ankle")
@@ -101,3 +104,14 @@ def test_a_known_layout_that_fits_is_named(shared_cases):
 def test_nothing_is_said_of_sound_recordings(shared_data, shared_cases, cameras, detections):
     rig = read_rig(shared_data.parent / cameras)
     assert order_findings(read_detections(shared_data.parent / detections, rig), rig) == []
+
+
+@pytest.mark.slow
+def test_a_biased_detector_is_no_other_order(room, people, look_at):
+    """One person, whose joints are seen up to an eighth of the size beside where they are."""
+    one = people[:, :1]
+    for seed in range(8):
+        bias = lasting(np.random.default_rng(seed), 0.02, 0.12, 1, 25, len(room))
+        seen = biased(look_at(room, one), room, one, bias)
+        look = Look.given(gather(seen, range(len(seen)), len(room)), room)
+        assert order_of_joints(seen, look) == []

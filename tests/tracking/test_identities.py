@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 from shapepose_fg.core.detections import Detections, Input
+from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.pipeline.runs.parts import Checkpoint, checkpoint_arrays, checkpoint_of
 from shapepose_fg.pipeline.windows import StreamState
 from shapepose_fg.tracking.global_hypotheses import Seed, follow_worlds
 from shapepose_fg.tracking.identities import BLOCK_S, FollowingConfig, FollowState, finish, follow
+from shapepose_fg.tracking.stitching import Ends, StitchingConfig, Trace, stitch
 from shapepose_fg.tracking.tracker import Tracks
 from tests.marks import slow
 
@@ -42,19 +44,18 @@ def test_two_who_pass_each_other_keep_their_names(followed, five_cameras, walkin
 
 
 @pytest.mark.parametrize(("missing", "bridged"), [(12, True), (18, False)])
-def test_who_is_out_of_sight_has_rows_for_half_a_second_and_the_name_for_longer(
+def test_who_is_out_of_sight_has_rows_for_half_a_second(
     followed, five_cameras, walking, nobody, missing, bridged
 ):
-    """They pass each other meanwhile: nearer to where one vanished it is the other who appears, 1.2
-    m/s on.
-    """
+    """They pass each other meanwhile, at 1.2 m/s; after a longer time `stitching` knows them."""
     frames, truth = walking
     gap = range(20, 20 + missing)
     rows = followed(five_cameras, [nobody if t in gap else frame for t, frame in enumerate(frames)])
     tracks = identities(
         rows.rows(np.flatnonzero(np.isfinite(rows.initial).all(axis=(1, 2)))), truth
     )
-    assert all(len(own) == 1 for own in tracks.values()) and tracks[0] != tracks[1]
+    assert all(len(own) == (1 if bridged else 2) for own in tracks.values())
+    assert not tracks[0] & tracks[1]
     # 0.6 s is more than the patience of 0.5 s.
     assert len(rows) == 2 * (len(frames) if bridged else len(frames) - missing)
 
@@ -141,7 +142,14 @@ def test_who_enters_late_leaves_early_and_comes_back_is_the_same_person(
     )
     person, _ = who(rows, truth)
     assert sorted(rows.frame[person == 1].tolist()) == here and (person == 0).sum() == 60
-    assert all(len(own) == 1 for own in identities(rows, truth).values())
+    traces = (
+        Trace.of(n, rows.time_s[own].mean(axis=1), rows.initial[own], BODY_25)
+        for n in np.unique(rows.track).tolist()
+        for own in [rows.track == n]
+    )
+    named = stitch(Ends.of(traces), StitchingConfig())
+    same = [{named[n] for n in own} for own in identities(rows, truth).values()]
+    assert len(same) == 2 and same[0] != same[1] and all(len(own) == 1 for own in same)
 
 
 @pytest.mark.parametrize("fps", [5, *slow(30, 60)])

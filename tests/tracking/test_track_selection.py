@@ -247,32 +247,6 @@ def test_detections_count_by_the_affinity_to_the_same_person_s(
     ).all()
 
 
-def test_the_joints_of_one_2d_person_that_two_tracks_divide_count_less_for_both(
-    five_cameras, two_people, seen_exactly
-):
-    """Two tracks at nearly the same place, to which the joints of every 2D person went by turns,
-    have less evidence together than one track that has them all; in different worlds each counts
-    what it has.
-    """
-    detections = seen_exactly(five_cameras, two_people[:1])
-    own = np.full((1, 25, 5), -1)
-    own[0, detections.joint, detections.view] = np.arange(len(detections))
-    even = (np.arange(25) % 2 == 0)[:, None]
-    halves = np.concatenate([np.where(even, own, -1), np.where(even, -1, own)])
-    places = np.concatenate([two_people[:1], two_people[:1] + 0.03])
-    arrays = FrameArrays.of(detections, five_cameras, BODY_25)
-
-    def evidence(candidate, places, world):
-        weight, price = weighed(candidate, places, arrays, BODY_25, np.array(world))
-        return weight.sum(axis=(1, 2)) - price
-
-    (whole,) = evidence(own, places[:1], [0])
-    divided, apart = evidence(halves, places, [0, 0]), evidence(halves, places, [0, 1])
-    assert (divided < apart).all()
-    assert divided.sum() < whole / 4
-    assert (divided < 0.0).all(), "neither of the two is there"
-
-
 def test_who_is_seen_wholly_has_a_second_of_evidence_in_a_second(
     five_cameras, two_people, seen_exactly
 ):

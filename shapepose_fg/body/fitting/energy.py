@@ -53,14 +53,9 @@ class Held(FitRows):
     """(B, A) centre of the pose prior in the free angles, rad."""
 
 
-def robust_cost(squared: Array, scale: float) -> Array:
-    """Geman-McClure cost c² s / (c² + s), bounded by c²."""
-    return np.asarray(scale**2 * squared / (scale**2 + squared))
-
-
 def robust_weight(squared: Array, scale: float) -> Array:
-    """Derivative of `robust_cost`: the weight of a joint in iteratively reweighted least squares, 1
-    at its target.
+    """Derivative of the Geman-McClure cost c² s / (c² + s), which is bounded by c²: the weight of a
+    joint in iteratively reweighted least squares, 1 at its target.
     """
     return np.asarray((scale**2 / (scale**2 + squared)) ** 2)
 
