@@ -37,16 +37,6 @@ def project(camera, x):
 
 
 @part
-def apart_m(place, camera, focal, xy):
-    """Distance of a pixel from the projection of a point, as a length at the point's depth, m;
-    infinite behind the camera.
-    """
-    u, v, depth = project(camera, place)
-    off_px = math.sqrt((u - xy[0]) ** 2 + (v - xy[1]) ** 2)
-    return off_px * depth / focal if depth > 0 else math.inf
-
-
-@part
 def add_view(camera, u, v, depth, to_u, to_v, weight, information, gradient):
     """Add J^T w J to `information` and J^T w r to `gradient`, with J the derivative of the pixel
     (u, v) by the point, and r = (to_u, to_v).

@@ -13,9 +13,9 @@ from annotated_types import Interval
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.bounds import Metres, Settings
 from shapepose_fg.core.camera import Rig
-from shapepose_fg.core.compiled import kernel
+from shapepose_fg.core.compiled import kernel, part
 from shapepose_fg.core.detections import Detections
-from shapepose_fg.core.kernel_geometry import apart_m, solved
+from shapepose_fg.core.kernel_geometry import project, solved
 
 
 @dataclass(frozen=True)
@@ -128,8 +128,8 @@ def _triangulate(order, stop, rays, cameras, centres, gap_m, least_sine, gate_m,
                 -A[2, 3] - B[2, 3], x,
             )  # fmt: skip
             if (
-                apart_m(x, cameras[one], 1.0, rays.xy[i]) < gate_m
-                and apart_m(x, cameras[other], 1.0, rays.xy[j]) < gate_m
+                _off_m(cameras[one], rays.xy[i], x) < gate_m
+                and _off_m(cameras[other], rays.xy[j], x) < gate_m
             ):
                 if count < len(pair):
                     pair[count, 0], pair[count, 1] = i, j
@@ -140,3 +140,10 @@ def _triangulate(order, stop, rays, cameras, centres, gap_m, least_sine, gate_m,
                     )  # slicing compiles slowly
                 count += 1
     return count
+
+
+@part
+def _off_m(camera, xy, x):
+    """Reprojection error as a length at the point's depth, metres; infinite behind the camera."""
+    u, v, depth = project(camera, x)
+    return math.hypot(u - xy[0], v - xy[1]) * depth if depth > 0 else math.inf

@@ -93,8 +93,9 @@ def vote(points: PairPoints, frame: Frame) -> Candidates:
     owner, detection = owner[best], detection[best]
     _, one = np.unique(owner * views + found.view[detection], return_index=True)
     owner, detection = owner[one], detection[one]
-    confidence = np.bincount(owner, found.confidence[detection], count)
-    score = np.asarray(confidence / np.bincount(owner, minlength=count), dtype=np.float64)
+    score = np.bincount(owner, found.confidence[detection], count) / np.bincount(
+        owner, minlength=count
+    )
     xyz = np.stack(total, axis=1) / votes[kept][:, None]
     return Candidates(xyz, joint[kept], score, np.column_stack([owner, detection]))
 
@@ -147,8 +148,7 @@ def grown(hips: Index, candidates: Candidates, frame: Frame) -> Index:
         person, which = np.nonzero(linked > 0)
         joint = candidates.joint[which]
         slot = person * len(skeleton) + joint
-        score = np.asarray(linked[person, which] + views[which], dtype=np.float64)
-        picked = match_best_first(slot, which, score)
+        picked = match_best_first(slot, which, linked[person, which] + views[which])
         chosen[person[picked], joint[picked]] = which[picked]
     return chosen
 

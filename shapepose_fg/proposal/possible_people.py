@@ -7,9 +7,9 @@ import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig
-from shapepose_fg.core.compiled import kernel
+from shapepose_fg.core.compiled import kernel, part
 from shapepose_fg.core.detections import Detections
-from shapepose_fg.core.kernel_geometry import apart_m, triangulated
+from shapepose_fg.core.kernel_geometry import solved
 from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.proposal.nearby import FrameArrays, nearby
@@ -21,10 +21,10 @@ _FAR_M = 0.15
 _SURE_AFFINITY = 0.5
 """Minimum mean affinity of a detection for a joint without a position."""
 DETECTOR_M = 0.03
-"""Measured error of a detector, m: the scale of the robust kernel for triangulation, of the
+"""Measured error of a detector, m: the scale of the Cauchy kernel for triangulation, of the
 distances of rays from joints, and of the errors of bone lengths."""
-_LEAST_DEPTH_M = 0.1
-"""Minimum depth of a joint in the weights of views, m."""
+_ROUNDS = 2
+"""Number of reweighted triangulations of a joint."""
 _STRETCH = (1.0, 0.9, 0.8)
 """Maximum distance over one, two and three bones, as a share of their summed maximum lengths."""
 
@@ -46,6 +46,11 @@ class Frame:
     def arrays(self) -> FrameArrays:
         """Detections and cameras of the frame as the arrays that compiled kernels take."""
         return FrameArrays.of(self.detections, self.rig, self.skeleton)
+
+    @cached_property
+    def rays(self) -> Array:
+        """(D, 3) unit directions of the detections' rays, in the world."""
+        return self.rig.rays(self.detections.view, self.detections.xy)
 
     @property
     def spans(self) -> tuple[Index, Array]:
@@ -114,14 +119,14 @@ def settled(
     """
     for _ in range(passes):
         chosen = claimed(places, own, frame, exclusive=exclusive)
-        places = triangulated_joints(chosen, frame)
-        chosen = np.where(np.nan_to_num(gaps(places, chosen, frame)) < _FAR_M, chosen, -1)
+        places, gap_m = triangulated(chosen, frame)
+        chosen = np.where(np.nan_to_num(gap_m) < _FAR_M, chosen, -1)
         part = connected(places, frame)
         astray = (part >= 0) & (part != sizes(part).argmax(axis=1)[:, None])
         places = np.where(astray[..., None], np.nan, places)
         own = np.where(astray[..., None], -1, chosen)
-    places = triangulated_joints(own, frame)
-    return PossiblePeople(places, own, gaps(places, own, frame))
+    places, gap_m = triangulated(own, frame)
+    return PossiblePeople(places, own, gap_m)
 
 
 def claimed(places: Array, own: Index, frame: Frame, *, exclusive: bool) -> Index:
@@ -142,54 +147,83 @@ def claimed(places: Array, own: Index, frame: Frame, *, exclusive: bool) -> Inde
     return chosen
 
 
-def triangulated_joints(chosen: Index, frame: Frame) -> Array:
-    """(H, J, 3) joints triangulated from detections `chosen` (H, J, V), -1 for none; NaN for those
-    that fewer than two views see.
+def triangulated(chosen: Index, frame: Frame) -> tuple[Array, Array]:
+    """Triangulate joints (H, J, 3) from detections `chosen` (H, J, V); also returns distances to
+    the rays (H, J, V), metres.
+
+    Weighted by confidence and a Cauchy kernel. NaN for joints seen by fewer than two views; the
+    distance is infinite behind the camera.
     """
-    places, views = np.full((*chosen.shape[:2], 3), np.nan), chosen.shape[2]
-    uv, sure, room = np.empty((views, 2)), np.empty(views), np.empty(views)
-    _triangulate(chosen, frame.arrays, uv, sure, room, places)
-    return places
+    places, gap_m = np.full((*chosen.shape[:2], 3), np.nan), np.full(chosen.shape, np.nan)
+    confidence = frame.detections.confidence
+    _triangulate(
+        chosen, frame.rays, confidence, frame.rig.centres, np.empty(chosen.shape[2]), places, gap_m
+    )
+    return places, gap_m
 
 
-@kernel("i3", FrameArrays, "f2 f1 f1 f3")
-def _triangulate(chosen, arrays, uv, sure, room, places):
-    """Fill in `places`, NaN before; `uv` (V, 2), `sure` (V,) and `room` (V,) are workspace."""
+@kernel("i3 f2 f1 f2 f1 f3 f3")
+def _triangulate(chosen, rays, confidence, centres, weight, places, gap_m):
+    """Fill in the results of `triangulated`; `weight` (V,) is workspace."""
     people, joints, views = chosen.shape
     for h in range(people):
         for j in range(joints):
             seen = 0
             for v in range(views):
-                d = chosen[h, j, v]
-                seen += d >= 0
-                sure[v] = arrays.confidence[d] if d >= 0 else 0.0
-                uv[v, 0], uv[v, 1] = arrays.xy[d, 0], arrays.xy[d, 1]
-            if seen >= 2:
-                views_of = arrays.cameras, arrays.focal, uv, sure
-                triangulated(*views_of, DETECTOR_M, np.inf, _LEAST_DEPTH_M, room, places[h, j])
+                weight[v] = confidence[chosen[h, j, v]] if chosen[h, j, v] >= 0 else 0.0
+                seen += chosen[h, j, v] >= 0
+            for _ in range(_ROUNDS if seen >= 2 else 0):
+                _nearest(chosen[h, j], rays, weight, centres, places[h, j])
+                for v in range(views):
+                    d = chosen[h, j, v]
+                    if d >= 0:
+                        gap_m[h, j, v] = _gap(rays[d], centres[v], places[h, j])
+                        off = (gap_m[h, j, v] if gap_m[h, j, v] < np.inf else 1.0) / DETECTOR_M
+                        weight[v] = confidence[d] / (1 + off * off)
+
+
+@part
+def _nearest(chosen, rays, weight, centres, place):
+    """Least-squares point nearest to weighted rays: sum w (1 - r r^T) (x - c) = 0."""
+    xx = yy = zz = 1e-9
+    xy = xz = yz = px = py = pz = 0.0
+    for v in range(len(chosen)):
+        if chosen[v] >= 0:
+            d, w = chosen[v], weight[v]
+            x, y, z = rays[d, 0], rays[d, 1], rays[d, 2]
+            a, b, c = centres[v, 0], centres[v, 1], centres[v, 2]
+            along = x * a + y * b + z * c
+            xx, yy, zz = xx + w * (1 - x * x), yy + w * (1 - y * y), zz + w * (1 - z * z)
+            xy, xz, yz = xy - w * x * y, xz - w * x * z, yz - w * y * z
+            px, py, pz = (
+                px + w * (a - along * x),
+                py + w * (b - along * y),
+                pz + w * (c - along * z),
+            )
+    solved(xx, xy, xz, yy, yz, zz, px, py, pz, place)
+
+
+@part
+def _gap(ray, centre, place):
+    """Distance of a ray from a point, metres; infinite behind the camera."""
+    x, y, z = place[0] - centre[0], place[1] - centre[1], place[2] - centre[2]
+    depth = x * ray[0] + y * ray[1] + z * ray[2]
+    squared = x * x + y * y + z * z - depth * depth
+    return np.inf if depth <= 0 else np.sqrt(squared) if squared > 0 else 0.0
 
 
 def gaps(places: Array, chosen: Index, frame: Frame) -> Array:
-    """(H, J, V) distances of the detections `chosen` (H, J, V), -1 for none, from joints at
-    `places` (H, J, 3), as lengths at the joints, metres; NaN for none.
+    """(H, J, V) distances of the rays of detections `chosen` (H, J, V) from `places` (H, J, 3),
+    metres; NaN for none.
 
     Infinite if the joint is behind the camera.
     """
-    gap_m = np.full(chosen.shape, np.nan)
-    _gaps(np.ascontiguousarray(places), chosen, frame.arrays, gap_m)
-    return gap_m
-
-
-@kernel("f3 i3", FrameArrays, "f3")
-def _gaps(places, chosen, arrays, gap_m):
-    """Fill in the results of `gaps`, NaN before."""
-    for h in range(len(places)):
-        for j in range(places.shape[1]):
-            for v in range(chosen.shape[2]):
-                d = chosen[h, j, v]
-                if d >= 0:
-                    view = arrays.cameras[v], arrays.focal[v], arrays.xy[d]
-                    gap_m[h, j, v] = apart_m(places[h, j], *view)
+    if len(frame.rays) == 0:
+        return np.full(chosen.shape, np.nan)
+    from_camera = places[:, :, None] - frame.rig.centres
+    depth = (frame.rays[chosen] * from_camera).sum(axis=-1)
+    across_m = np.sqrt(np.maximum((from_camera**2).sum(axis=-1) - depth**2, 0.0))
+    return np.where(chosen >= 0, np.where(depth <= 0, np.inf, across_m), np.nan)
 
 
 def connected(places: Array, frame: Frame) -> Index:

@@ -9,7 +9,7 @@ import numpy as np
 from factors import DEFAULT_WIDTH_SIGMA
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.compiled import kernel, part
-from shapepose_fg.core.kernel_geometry import ROBUST, apart_m, project, triangulated
+from shapepose_fg.core.kernel_geometry import ROBUST, project, triangulated
 from shapepose_fg.estimation.kernels import add_detection
 from shapepose_fg.estimation.linearisation import MIN_DEPTH_M, ObservationConfig
 from shapepose_fg.proposal.nearby import FrameArrays
@@ -111,14 +111,14 @@ def _measure(mean, covariance, lost, candidate, confident, arrays, trust, bones,
             for v in range(views if not arrays.swings[j] else 0):
                 d = candidate[a, j, v]
                 trunk += (
-                    d >= 0 and apart_m(mean[a, j], cameras[v], focal[v], xy[d]) < trust.rho_2d_m
+                    d >= 0 and _apart_m(mean[a, j], cameras[v], focal[v], xy[d]) < trust.rho_2d_m
                 )
         for j in range(joints):
             seen, near, at[0], at[1], at[2] = 0, 0, mean[a, j, 0], mean[a, j, 1], mean[a, j, 2]
             for v in range(views):
                 d, sigma_px[v], inlier[j, v] = candidate[a, j, v], 0.0, False
                 if d >= 0 and confident[d] > 0:
-                    near += apart_m(mean[a, j], cameras[v], focal[v], xy[d]) < trust.rho_2d_m
+                    near += _apart_m(mean[a, j], cameras[v], focal[v], xy[d]) < trust.rho_2d_m
                     depth = project(cameras[v], mean[a, j])[2]
                     depth = depth if depth >= MIN_DEPTH_M else depths[v]
                     depth = fixed_m if fixed_m > 0 else depth
@@ -170,6 +170,13 @@ def _measure(mean, covariance, lost, candidate, confident, arrays, trust, bones,
         for v in range(views):
             most = max(most, (core & (candidate[a, :, v] >= 0)).sum())
         evident[a] = twice >= MIN_SEEN_TWICE or most >= MIN_IN_A_VIEW
+
+
+@part
+def _apart_m(place, camera, focal, xy):
+    """Reprojection distance of a detection from a 3D position, as a length at its depth, m."""
+    x, y, depth = project(camera, place)
+    return np.sqrt((x - xy[0]) ** 2 + (y - xy[1]) ** 2) * depth / focal
 
 
 @part

@@ -18,9 +18,8 @@ from shapepose_fg.proposal.possible_people import (
     Frame,
     PossiblePeople,
     connected,
-    gaps,
     settled,
-    triangulated_joints,
+    triangulated,
 )
 from shapepose_fg.proposal.selection import Evidence, choose, existence
 from shapepose_fg.simulation import built_in_scene, simulate
@@ -143,9 +142,9 @@ def test_a_ray_that_misses_hardly_moves_the_joint(five_cameras, two_people, seen
     assert np.nanmax(hypothesis.gap_m) < 1e-6
     xy = detections.xy.copy()
     xy[hypothesis.chosen[0, 4, 0]] += [30.0, 0.0]
-    frame = frame_of(replace(detections, xy=xy), five_cameras)
-    places = triangulated_joints(hypothesis.chosen, frame)
-    gap_m = gaps(places, hypothesis.chosen, frame)
+    places, gap_m = triangulated(
+        hypothesis.chosen, frame_of(replace(detections, xy=xy), five_cameras)
+    )
     off_m = np.linalg.norm(places[0] - two_people[0], axis=1)
     assert 0 < off_m[4] < 0.03 and np.delete(off_m, 4).max() < 1e-6
     assert gap_m[0, 4, 0] > 3 * np.delete(gap_m[0, 4], 0).max()
