@@ -111,7 +111,7 @@ class Notebook:
         self._searched = frame
 
     def thin(self, what: str, is_thinned: bool, frame: int | None = None) -> None:
-        """Note that some detections, points or people of a frame were left out because there
+        """Note that some detections, points or candidates of a frame were left out because there
         were too many.
         """
         frame = next(
@@ -126,7 +126,17 @@ class Notebook:
         for camera in cameras:
             self._notes.repeated_pictures.setdefault(camera, []).append(frame)
 
-    def drop(self, reason: str, frames: Sequence[int]) -> None:
+    def drop(self, reason: str, count: int) -> None:
+        """Note that people of the current frame were dropped: false positives, or too few
+        detections.
+
+        With tracking there is no current frame, because blocks of frames are read several times:
+        see `drop_in`.
+        """
+        if self._frame is not None:
+            self.drop_in(reason, [self._frame] * count)
+
+    def drop_in(self, reason: str, frames: Sequence[int]) -> None:
         """Note that a person was dropped in all `frames`."""
         self._notes.dropped.setdefault(reason, []).extend(frames)
 

@@ -187,6 +187,17 @@ class Skeleton:
         joined[first, second] = joined[second, first] = 1
         return joined
 
+    @cached_property
+    def tree_neighbours(self) -> Index:
+        """(J, N) parent and children of each joint in the tree, padded with -1."""
+        parents = np.array(self.parents)
+        lists = [
+            [*parents[[j]][parents[[j]] >= 0], *np.flatnonzero(parents == j)]
+            for j in range(len(self))
+        ]
+        most = max(map(len, lists))
+        return np.array([row + [-1] * (most - len(row)) for row in lists], dtype=np.intp)
+
 
 def _limbs(text: str) -> tuple[tuple[int, int], ...]:
     """Limbs from a text of index pairs: "1-8 9-10"."""

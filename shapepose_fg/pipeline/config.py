@@ -28,7 +28,7 @@ from shapepose_fg.estimation.estimator_config import (
 from shapepose_fg.estimation.linearisation import ObservationConfig
 from shapepose_fg.estimation.motion_model import MotionConfig
 from shapepose_fg.proposal.candidates import CandidateConfig
-from shapepose_fg.proposal.stage_one import ProposalConfig
+from shapepose_fg.proposal.proposals import ProposalConfig
 from shapepose_fg.tracking.identities import FollowingConfig
 from shapepose_fg.tracking.stitching import StitchingConfig
 from shapepose_fg.tracking.tracker import TrackingConfig

@@ -150,6 +150,8 @@ class Setup:
         """The tracker with its windows; notes are written to `book`."""
         config, skeleton, tracking = self.config, self.skeleton, self.config.tracking
         sure = StageOne(skeleton, config.candidates, config.proposals, book)
+        # Unexplained detections may be people with hips seen by two views; later frames decide.
+        hips = sure.of_the_rest()
         if sure.proposals.evidence and not config.temporal:
             # In single frames evidence decides during reassociation.
             likely = replace(
@@ -161,8 +163,9 @@ class Setup:
         scale = BodyScale(
             longest_bones(skeleton), motion.density(np.full(len(skeleton), FAST_M_S), UNSEEN_S), law
         )
-        told = {"fitter": self.fitter, "drop": book.drop, "search": book.search}
-        return Engine(Tracker(skeleton, scale, sure, tracking, config.observations, **told), config)
+        find = (sure, hips) if config.temporal else (sure,)
+        told = {"fitter": self.fitter, "drop": book.drop_in, "search": book.search}
+        return Engine(Tracker(skeleton, scale, find, tracking, config.observations, **told), config)
 
 
 def _doubted(solution: WindowSolution, doubted: Mapping[int, tuple[int, ...]]) -> NDArray[np.str_]:

@@ -1,6 +1,7 @@
-"""Points where the rays of two detections of a joint meet.
+"""3D joint candidates: triangulation of pairs of views, clustered by confidence-weighted voting.
 
-Stage I (b) of the paper (section 3.1, "3D Joint Candidates Reconstruction").
+Stage I (b) and (c) of the paper (section 3.1, "3D Joint Candidates Reconstruction" and "Candidates
+Association").
 """
 
 import math
@@ -10,8 +11,8 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from annotated_types import Interval
 
-from shapepose_fg.core.arrays import Array, Index
-from shapepose_fg.core.bounds import Metres, Settings
+from shapepose_fg.core.arrays import Array, Index, Mask
+from shapepose_fg.core.bounds import Count, Metres, Settings
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.compiled import kernel, part
 from shapepose_fg.core.detections import Detections
@@ -20,7 +21,7 @@ from shapepose_fg.core.kernel_geometry import project, solved
 
 @dataclass(frozen=True)
 class CandidateConfig(Settings):
-    """Settings for points from pairs of detections."""
+    """Settings for 3D joint candidates from pairs of detections."""
 
     gate_m: Metres = 0.07
     """Maximum reprojection error of a pair's point, as a length at the point's depth, m. Each of
@@ -28,18 +29,49 @@ class CandidateConfig(Settings):
     is half certain."""
     min_angle_deg: Annotated[float, Interval(gt=0, le=90)] = 3.0
     """Minimum angle between the two rays; below it the depth is poorly observed."""
+    vote_radius_m: Metres = 0.12
+    """Radius rho of a cluster, m: points of one joint this close to the most confident one vote for
+    it."""
+    min_votes: Count = 3
+    """The paper's three points; a candidate with fewer is *weak* and cannot anchor a person. Two
+    cameras give a single pair, so the limit is min(min_votes, pairs of views)."""
+    min_view_fraction: Annotated[float, Interval(gt=0, le=1)] = 1 / 6
+    """With very many views, chance crossings of rays also get three votes: a strong candidate needs
+    the votes of all pairs of this fraction of the views (30 cameras: 5 views, 10 votes; 18 and
+    fewer: 3)."""
+    weak: bool = True
+    """Whether clusters with fewer votes are kept as weak candidates. The paper drops them, and
+    loses joints seen by only two views."""
+    weighted_centre: bool = True
+    """Whether the centre of a cluster is weighted by the squared confidence of its points. In the
+    paper it is their mean."""
+
     most_pairs: Annotated[int, Interval(ge=1000, le=1_000_000)] = 150_000
     """Maximum number of pairs of detections per joint and frame; each view keeps its most confident
     detections."""
     most_points: Annotated[int, Interval(ge=100, le=100_000)] = 8000
     """Maximum number of points per joint; the most confident are kept. Twelve people before 30
     cameras have 5000."""
+    most_candidates: Annotated[int, Interval(ge=10, le=10_000)] = 250
+    """Maximum number of candidates per joint; those with most votes are kept. Twelve people before
+    30 cameras have 220, half of them chance crossings of rays."""
 
     @classmethod
     def paper(cls) -> "CandidateConfig":
-        """The settings of section 3.1: every pair is triangulated without a gate."""
+        """The settings of section 3.1: every pair is triangulated without a gate; at least three
+        points.
+
+        The paper does not give rho: 6 cm is the best of 5 to 12 on `tune`.
+        """
         # Gate that any pair of rays in a room passes, m.
-        return cls(gate_m=10.0, min_angle_deg=1e-3)
+        return cls(
+            gate_m=10.0,
+            min_angle_deg=1e-3,
+            vote_radius_m=0.06,
+            min_view_fraction=1e-3,
+            weak=False,
+            weighted_centre=False,
+        )
 
 
 @dataclass(frozen=True)
@@ -54,6 +86,28 @@ class PairPoints:
     """(M, 2) indices of the two detections."""
     score: Array
     """(M,) confidence of the point: the geometric mean of the two detections' confidences."""
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """3D joint candidates: clusters of pair points."""
+
+    xyz: Array
+    """(C, 3) position in the world, metres."""
+    joint: Index
+    """(C,) index of the joint in the skeleton."""
+    score: Array
+    """(C,) mean confidence of the supporting detections."""
+    votes: Index
+    """(C,) number of pair points in the cluster."""
+    strong: Mask
+    """(C,) whether the cluster has the votes that the paper requires."""
+    support: Index
+    """(S, 2) rows (candidate, detection): the supporting detections, at most one per
+    view, sorted."""
+
+    def __len__(self) -> int:
+        return len(self.xyz)
 
 
 def triangulate_pairs(detections: Detections, rig: Rig, config: CandidateConfig) -> PairPoints:
@@ -102,6 +156,66 @@ class _Rays(NamedTuple):
     kinds = "i1 f2 f2 f1 f3"
 
 
+def vote(
+    points: PairPoints, detections: Detections, views: int, config: CandidateConfig
+) -> Candidates:
+    """Cluster the points of each joint around the most confident ones (the paper's set S_i).
+
+    As in the paper: pick the most confident point, add all neighbours within rho, remove them, and
+    repeat.
+    """
+    if len(points.xyz) == 0:
+        none = np.zeros(0, dtype=np.intp)
+        return Candidates(
+            np.zeros((0, 3)), none, np.zeros(0), none, none > 0, np.zeros((0, 2), dtype=np.intp)
+        )
+    seed = greedy_seeds(points, config.vote_radius_m)
+    _, cluster = np.unique(seed, return_inverse=True)
+    count = cluster.max() + 1
+    votes = np.bincount(cluster, minlength=count)
+    # Confidence weights: one bad view must not move a point that four good views agree on.
+    weight = points.score**2 if config.weighted_centre else np.ones(len(points.score))
+    total = np.bincount(cluster, weight, count)
+    xyz = np.stack([np.bincount(cluster, weight * x, count) / total for x in points.xyz.T], axis=1)
+    joint = np.zeros(count, dtype=np.intp)
+    joint[cluster] = points.joint
+    support = _support(np.repeat(cluster, 2), points.pair.ravel(), detections)
+    confidence = np.bincount(support[:, 0], detections.confidence[support[:, 1]], count)
+    score = confidence / np.bincount(support[:, 0], minlength=count)
+    strong = votes >= _needed_votes(views, config)
+    # Detections of strong candidates are explained: their other points are chance crossings of
+    # rays.
+    explained = np.zeros(len(detections), dtype=bool)
+    explained[support[strong[support[:, 0]], 1]] = True
+    unexplained = np.bincount(support[:, 0], ~explained[support[:, 1]], count) > 0
+    keep = strong | (unexplained & config.weak)
+    support = support[keep[support[:, 0]]]
+    support[:, 0] = (np.cumsum(keep) - 1)[support[:, 0]]
+    return Candidates(xyz[keep], joint[keep], score[keep], votes[keep], strong[keep], support)
+
+
+def _needed_votes(views: int, config: CandidateConfig) -> int:
+    """Votes for a strong candidate: `min_votes`, fewer if there are fewer pairs, more with very
+    many views.
+    """
+    seen_by = int(views * config.min_view_fraction)
+    return min(max(config.min_votes, seen_by * (seen_by - 1) // 2), views * (views - 1) // 2)
+
+
+def _support(cluster: Index, detection: Index, detections: Detections) -> Index:
+    """Rows (candidate, detection), sorted: per view the detection with most of the candidate's
+    points.
+    """
+    key, points = np.unique(cluster * len(detections) + detection, return_counts=True)
+    cluster, detection = np.divmod(key, len(detections))
+    view = detections.view[detection]
+    order = np.lexsort((-detections.confidence[detection], -points, view, cluster))
+    cluster, detection, view = cluster[order], detection[order], view[order]
+    first = np.ones(len(order), dtype=bool)
+    first[1:] = (cluster[1:] != cluster[:-1]) | (view[1:] != view[:-1])
+    return np.stack([cluster[first], detection[first]], axis=1)
+
+
 @kernel("i1 i1", _Rays, "f3 f2 f0 f0 f0 i2 f2")
 def _triangulate(order, stop, rays, cameras, centres, gap_m, least_sine, gate_m, pair, xyz):
     """Fill in `pair` and `xyz`, as far as the arrays reach; returns the number of points. `order`
@@ -147,3 +261,37 @@ def _off_m(camera, xy, x):
     """Reprojection error as a length at the point's depth, metres; infinite behind the camera."""
     u, v, depth = project(camera, x)
     return math.hypot(u - xy[0], v - xy[1]) * depth if depth > 0 else math.inf
+
+
+def greedy_seeds(points: PairPoints, radius_m: float) -> Index:
+    """Index of the seed (M,) of each point's cluster; points are picked by descending
+    confidence.
+    """
+    order = np.argsort(-points.score, kind="stable")
+    along = np.lexsort((points.xyz[:, 0], points.joint))
+    place, seed = np.empty_like(along), np.full(len(along), -1, dtype=np.intp)
+    place[along] = np.arange(len(along))
+    _pick_seeds(order, along, place, np.ascontiguousarray(points.xyz), points.joint, radius_m, seed)
+    return seed
+
+
+@kernel("i1 i1 i1 f2 i1 f0 i1")
+def _pick_seeds(order, along, place, xyz, joint, radius_m, seed):
+    """Fill in `seed` (M,). Points are picked in `order`; `along` sorts them by joint and first
+    coordinate, and `place` is the rank of each in it, so that only near points are compared.
+    """
+    for i in order:
+        if seed[i] >= 0:
+            continue
+        seed[i] = i
+        for step in (-1, 1):
+            k = place[i] + step
+            while 0 <= k < len(along):
+                j = along[k]
+                x = xyz[j, 0] - xyz[i, 0]
+                if joint[j] != joint[i] or abs(x) > radius_m:
+                    break
+                y, z = xyz[j, 1] - xyz[i, 1], xyz[j, 2] - xyz[i, 2]
+                if seed[j] < 0 and x * x + y * y + z * z <= radius_m * radius_m:
+                    seed[j] = i
+                k += step

@@ -118,7 +118,7 @@ def settled(
     to another person.
     """
     for _ in range(passes):
-        chosen = claimed(places, own, frame, exclusive=exclusive)
+        chosen = _claimed(places, own, frame, exclusive=exclusive)
         places, gap_m = triangulated(chosen, frame)
         chosen = np.where(np.nan_to_num(gap_m) < _FAR_M, chosen, -1)
         part = connected(places, frame)
@@ -129,9 +129,9 @@ def settled(
     return PossiblePeople(places, own, gap_m)
 
 
-def claimed(places: Array, own: Index, frame: Frame, *, exclusive: bool) -> Index:
-    """(H, J, V) detections nearest to the joints at `places` (H, J, 3); for joints without a
-    position, by affinity to the `own` ones (H, J, V).
+def _claimed(places: Array, own: Index, frame: Frame, *, exclusive: bool) -> Index:
+    """(H, J, V) detections nearest to the joints; for joints without a position, by affinity to the
+    own ones.
     """
     H, J, _ = own.shape
     world = np.zeros(H, dtype=np.intp) if exclusive else np.arange(H)

@@ -1,7 +1,7 @@
-"""Limits on the detections and points of a frame, so that its cost is bounded.
+"""Limits on the detections and candidates of a frame, so that its cost is bounded.
 
-Every detection is paired with those of the same joint in all other views: cost grows with the
-square of their number. Ordinary crowds (a dozen people
+Every detection is paired with those of the same joint in all other views, and every candidate
+compared with every person: cost grows with the square of both. Ordinary crowds (a dozen people
 before thirty cameras) stay below all limits.
 """
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from shapepose_fg.core.arrays import Index, Mask
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import DerivedFrames, Detections
-from shapepose_fg.proposal.candidates import CandidateConfig, PairPoints
+from shapepose_fg.proposal.candidates import CandidateConfig, Candidates, PairPoints
 from shapepose_fg.proposal.view_faults import without_faults
 
 _LEAST_IN_A_VIEW = 8
@@ -68,18 +68,60 @@ def kept_detections(detections: Detections, views: int, config: CandidateConfig)
     most = max(_LEAST_IN_A_VIEW, int(np.sqrt(2 * config.most_pairs / (views * (views - 1)))))
     if np.bincount(group, minlength=1).max() <= most:
         return None
-    return best_of(group, most, (-detections.confidence,))
+    return _best(group, most, (-detections.confidence,))
 
 
 def thinned_points(points: PairPoints, config: CandidateConfig) -> PairPoints:
     """The `config.most_points` most confident points of each joint."""
     if np.bincount(points.joint, minlength=1).max() <= config.most_points:
         return points
-    keep = best_of(points.joint, config.most_points, (-points.score,))
+    keep = _best(points.joint, config.most_points, (-points.score,))
     return PairPoints(points.xyz[keep], points.joint[keep], points.pair[keep], points.score[keep])
 
 
-def best_of(group: Index, most: int, order: tuple[NDArray[Any], ...]) -> Mask:
+def thinned_candidates(
+    candidates: Candidates, detections: Detections, config: CandidateConfig
+) -> Candidates:
+    """At most `config.most_candidates` candidates per joint, fewer if there are too many links.
+
+    Strong ones are kept first, then those with most votes and confidence.
+    """
+    most = config.most_candidates
+    kept = _with_most(candidates, most)
+    while most > _LEAST_IN_A_VIEW and _count_links(kept, detections) > _MOST_LINKS:
+        most //= 2
+        kept = _with_most(kept, most)
+    return kept
+
+
+_MOST_LINKS = 2_000_000
+"""Maximum number of pairs of candidates with affinities: 12 people before 30 cameras
+have 50,000."""
+
+
+def _count_links(candidates: Candidates, detections: Detections) -> int:
+    """Number of pairs of candidates linked by the affinities of a frame."""
+    supports = np.bincount(candidates.support[:, 1], minlength=len(detections))
+    return int(supports[detections.pairs].prod(axis=1).sum())
+
+
+def _with_most(candidates: Candidates, most: int) -> Candidates:
+    """The best candidates of each joint, at most `most`."""
+    if np.bincount(candidates.joint, minlength=1).max() <= most:
+        return candidates
+    keep = _best(candidates.joint, most, (-candidates.score, -candidates.votes, ~candidates.strong))
+    place = np.cumsum(keep) - 1
+    support = candidates.support[keep[candidates.support[:, 0]]]
+    columns = {
+        name: getattr(candidates, name)[keep]
+        for name in ("xyz", "joint", "score", "votes", "strong")
+    }
+    return replace(
+        candidates, **columns, support=np.column_stack([place[support[:, 0]], support[:, 1]])
+    )
+
+
+def _best(group: Index, most: int, order: tuple[NDArray[Any], ...]) -> Mask:
     """(N,) mask of the first `most` of each group by `order` (last key first); ties keep their
     order.
     """

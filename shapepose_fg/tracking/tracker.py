@@ -6,7 +6,7 @@ is a global hypothesis, a set of tracks that share no detection; worlds are inde
 other.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -35,6 +35,9 @@ NoteDropped = Callable[[str, list[int]], None]
 
 _APART_M = 0.25
 """Minimum mean distance of a new person's joints from any track's, m; nearer is the same person."""
+_MOST_PEOPLE = 64
+"""Maximum number of new people; no further search where stage I reaches it
+(`ProposalConfig.most_people`)."""
 _BIRTH_SIGMA_M = 0.04
 """Standard deviation of a new person's joints from stage I, m."""
 
@@ -95,8 +98,8 @@ class Tracker:
     """The detector's joints."""
     scale: BodyScale
     """Size of people and noise of their motion."""
-    find: FindPeople
-    """Stage I, for new people."""
+    find: Sequence[FindPeople]
+    """Variants of stage I for new people; each searches what the earlier ones left."""
     config: TrackingConfig
     """Settings of the tracker."""
     observation: ObservationConfig
@@ -176,18 +179,28 @@ class Tracker:
         """New people among the detections not assigned to the `tracks` of one world: positions (P,
         J, 3), metres, NaN where unknown, and detections (P, J, V).
         """
+        core, J = list(self.skeleton.core), len(self.skeleton)
+        there, found, theirs = (
+            tracks.joints.position,
+            [np.zeros((0, J, 3))],
+            [np.zeros((0, J, len(rig)), np.intp)],
+        )
         free = np.ones(len(detections), dtype=bool)
         free[candidate[candidate >= 0]] = False
-        if not self.enough(detections, free):
-            shape = 0, len(self.skeleton), len(rig)
-            return np.zeros((*shape[:2], 3)), np.zeros(shape, dtype=np.intp)
-        people = self.find(detections.only(free), rig)
-        rest = np.append(np.flatnonzero(free), -1)
-        own = np.where(people.candidate >= 0, rest[people.candidate], -1)
-        twice = (own >= 0).sum(axis=2)[:, list(self.skeleton.core)] >= 2
-        apart = (mean_distance(people.initial, tracks.joints.position) > _APART_M).all(axis=1)
-        new = apart & (twice.sum(axis=1) >= self.config.min_new_joints)
-        return people.initial[new], own[new]
+        for find in self.find:
+            if not self.enough(detections, free) or sum(map(len, found)) >= _MOST_PEOPLE:
+                break
+            rest = np.flatnonzero(free)
+            people = find(detections.only(free), rig)
+            own = np.where(people.candidate >= 0, np.append(rest, -1)[people.candidate], -1)
+            twice = (own >= 0).sum(axis=2)[:, core] >= 2
+            apart = (mean_distance(people.initial, there) > _APART_M).all(axis=1)
+            new = apart & (twice.sum(axis=1) >= self.config.min_new_joints)
+            found.append(people.initial[new])
+            theirs.append(own[new])
+            there = np.concatenate([there, people.initial[new]])
+            free[own[new][own[new] >= 0]] = False
+        return np.concatenate(found), np.concatenate(theirs)
 
     def enough(self, detections: Detections, free: Mask) -> bool:
         """Whether the unassigned detections suffice for a person: enough core joints, each in two

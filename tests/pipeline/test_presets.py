@@ -19,6 +19,7 @@ from shapepose_fg.estimation.linearisation import linearise, observation_sigmas
 from shapepose_fg.io.config import read_config
 from shapepose_fg.pipeline.pipeline import PipelineConfig, find_people
 from shapepose_fg.pipeline.solve_window import solve_window
+from shapepose_fg.proposal.candidates import triangulate_pairs, vote
 
 PAPER = PipelineConfig.paper()
 STAGE_II = PAPER.estimator
@@ -181,6 +182,42 @@ def test_the_paper_proposes_by_three_votes_and_nine_parts_in_ten(
         for config in (PipelineConfig(), PAPER)
     ]
     assert count == [1, 0]
+
+
+def test_the_paper_s_candidate_is_the_mean_of_its_points(five_cameras, two_people, seen_exactly):
+    exact = seen_exactly(five_cameras, two_people[:1])
+    rng = np.random.default_rng(0)
+    noisy = replace(
+        exact,
+        xy=exact.xy + rng.normal(0, 3.0, exact.xy.shape),
+        confidence=rng.uniform(0.2, 1.0, len(exact)),
+    )
+    points = triangulate_pairs(noisy, five_cameras, PAPER.candidates)
+    assert len(points.xyz) == 25 * 10  # whatever the angle and the gap of the rays
+    means = vote(points, noisy, 5, PAPER.candidates)
+    weighted = vote(points, noisy, 5, replace(PAPER.candidates, weighted_centre=True))
+    for joint in (WRIST, KNEE):
+        own = points.joint == joint
+        largest = np.flatnonzero(means.joint == joint)[means.votes[means.joint == joint].argmax()]
+        if means.votes[largest] == own.sum():  # no point is an outlier
+            np.testing.assert_allclose(means.xyz[largest], points.xyz[own].mean(axis=0), atol=1e-9)
+            assert np.abs(means.xyz[largest] - weighted.xyz[largest]).max() > 1e-4
+
+
+def test_stage_one_s_settings_of_the_paper():
+    """Section 3.1: three votes, 90 % of the parts; what it does not have is off. Chosen on `tune`:
+    6 and 60 cm.
+    """
+    c, p = PAPER.candidates, PAPER.proposals
+    assert (c.min_votes, c.vote_radius_m, c.weak, c.weighted_centre) == (3, 0.06, False, False)
+    assert c.gate_m >= 10 and c.min_angle_deg < 0.01 and c.min_view_fraction < 0.01
+    assert (p.min_parts, p.separation_m, p.min_grown_parts, p.min_observed_parts) == (
+        0.9,
+        0.6,
+        0.0,
+        0.0,
+    )
+    assert (p.weak_anchors, p.growth.bridge_m) == (False, 0.0)
 
 
 def test_stage_two_s_settings_of_the_paper():

@@ -15,11 +15,16 @@ from shapepose_fg.pipeline.config import PeopleConfig
 from shapepose_fg.pipeline.pipeline import PipelineConfig, find_people, reconstruct
 from shapepose_fg.proposal.candidates import (
     CandidateConfig,
+    Candidates,
+    PairPoints,
+    greedy_seeds,
     triangulate_pairs,
+    vote,
 )
 from shapepose_fg.proposal.thinning import (
     ThinnedFrames,
     kept_detections,
+    thinned_candidates,
     thinned_points,
 )
 from shapepose_fg.simulation.scene import ring_of_cameras
@@ -51,6 +56,8 @@ def test_ordinary_frames_are_left_as_they_are(five_cameras, two_people, seen_exa
     assert kept_detections(detections, 5, config) is None
     points = triangulate_pairs(detections, five_cameras, config)
     assert thinned_points(points, config) is points
+    candidates = vote(points, detections, 5, config)
+    assert thinned_candidates(candidates, detections, config) is candidates
     frames = ThinnedFrames(Recording(BODY_25, [detections]), five_cameras, config)
     assert len(frames[0]) == len(detections) and not frames.is_thinned(0)
 
@@ -81,6 +88,66 @@ def test_the_most_confident_points_of_each_joint_stay(rig):
         before, after = (np.sort(each.score[each.joint == joint])[::-1] for each in (points, kept))
         assert len(before) > 100
         np.testing.assert_array_equal(after, before[:100])
+
+
+def test_of_candidates_with_too_many_links_half_stay(rig):
+    """250 candidates for each joint, all made of the same two detections: 3 million links, where 2
+    are allowed.
+    """
+    view, joint = (index.ravel() for index in np.indices((2, 25)))
+    first, second = np.array(BODY_25.limbs).T
+    pairs = np.concatenate([np.column_stack([25 * v + first, 25 * v + second]) for v in range(2)])
+    detections = Detections(
+        view, joint, np.zeros((50, 2)), np.full(50, 0.8), pairs, np.full(len(pairs), 0.9)
+    )
+    of_joint = np.arange(25).repeat(250)
+    support = np.concatenate(
+        [np.column_stack([np.arange(len(of_joint)), 25 * v + of_joint]) for v in range(2)]
+    )
+    rng = np.random.default_rng(0)
+    every = Candidates(
+        rng.normal(size=(len(of_joint), 3)), of_joint, rng.uniform(size=len(of_joint)),
+        np.full(len(of_joint), 3), np.ones(len(of_joint), dtype=bool), support,
+    )  # fmt: skip
+    kept = thinned_candidates(every, detections, CandidateConfig(most_candidates=250))
+    assert np.bincount(kept.joint).tolist() == [125] * 25
+    few = thinned_candidates(every, detections, CandidateConfig(most_candidates=200))
+    assert np.bincount(few.joint).tolist() == [100] * 25
+
+
+def test_strong_candidates_and_those_with_most_votes_stay(rig):
+    detections, config = crowd(rig, 20), CandidateConfig(most_candidates=20)
+    every = vote(triangulate_pairs(detections, rig, config), detections, len(rig), config)
+    kept = thinned_candidates(every, detections, config)
+    assert np.bincount(every.joint).max() > 20 and np.bincount(kept.joint).max() == 20
+    for joint in (0, 8):
+        before, after = (np.flatnonzero(each.joint == joint) for each in (every, kept))
+        order = np.lexsort((-every.score[before], -every.votes[before], ~every.strong[before]))[:20]
+        assert set(map(tuple, kept.xyz[after])) == set(map(tuple, every.xyz[before[order]]))
+    # Each candidate still has the detections that made it.
+    assert set(kept.support[:, 0].tolist()) == set(range(len(kept)))
+    made = detections.joint[kept.support[:, 1]]
+    np.testing.assert_array_equal(made, kept.joint[kept.support[:, 0]])
+
+
+@pytest.mark.slow
+def test_many_points_are_clustered_as_if_one_by_one():
+    rng = np.random.default_rng(0)
+    count, radius = 9000, 0.12
+    points = PairPoints(
+        rng.uniform(0, 2.5, (count, 3)),
+        rng.integers(0, 3, count),
+        np.zeros((count, 2), dtype=np.intp),
+        np.round(rng.uniform(0, 1, count), 2),  # equal scores, too
+    )
+    expected = np.full(count, -1)
+    for pick in np.argsort(-points.score, kind="stable"):
+        if expected[pick] < 0:
+            near = (np.linalg.norm(points.xyz - points.xyz[pick], axis=1) <= radius) & (
+                expected < 0
+            )
+            expected[near & (points.joint == points.joint[pick])] = pick
+    np.testing.assert_array_equal(greedy_seeds(points, radius), expected)
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ import pytest
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections, Input
 from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.pipeline.config import PeopleConfig
 from shapepose_fg.pipeline.pipeline import PipelineConfig, find_people
 from shapepose_fg.tracking.identities import FollowingConfig, FollowState, finish, follow
 from shapepose_fg.tracking.tracker import BodyScale, Tracker, TrackingConfig, Tracks
@@ -18,8 +19,8 @@ FPS = 30.0
 @pytest.fixture(scope="session")
 def tracker() -> Tracker:
     """Stage I as the pipeline makes it, bones of 0.7 m at most."""
-    config = PipelineConfig()
-    find = partial(find_people, skeleton=BODY_25, config=config)
+    config, likely = PipelineConfig(), PipelineConfig(people=PeopleConfig(min_probability=0.15))
+    find = [partial(find_people, skeleton=BODY_25, config=each) for each in (config, likely)]
     scale = BodyScale(np.full(25, 0.7), np.full(25, 10.0))
     return Tracker(BODY_25, scale, find, TrackingConfig(), config.observations)
 

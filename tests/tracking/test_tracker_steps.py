@@ -219,6 +219,37 @@ def test_who_is_lost_entirely_is_sought_where_expected(
         assert (np.linalg.norm(off, axis=1) < 1e-6).mean() > 0.95
 
 
+def test_hips_that_two_views_saw_are_asked_for_last(
+    tracker, five_cameras, two_people, seen_exactly
+):
+    """Stage I is asked for weak hips among what is left, and not at all where that is too
+    little.
+    """
+    detections = seen_exactly(five_cameras, two_people[:1])
+    asked = []
+
+    def sure(left, rig):
+        asked.append((len(left), "sure"))
+        return tracker.find[0](left, rig).rows(np.zeros(0, dtype=int))
+
+    def weak(left, rig):
+        asked.append((len(left), "weak"))
+        return tracker.find[0](left, rig)
+
+    none, searching = np.zeros((0, 25, 5), dtype=int), replace(tracker, find=(sure, weak))
+    places, candidate = searching.newcomers(Tracks.none(BODY_25), none, detections, five_cameras)
+    assert asked == [(125, "sure"), (125, "weak")] and len(places) == 1
+    assert sorted(candidate.ravel().tolist()) == list(range(125))
+    asked.clear()
+    places, _ = replace(searching, find=(sure,)).newcomers(
+        Tracks.none(BODY_25), none, detections, five_cameras
+    )
+    assert asked == [(125, "sure")] and len(places) == 0
+    asked.clear()
+    places, _ = searching.newcomers(tracks_at(two_people[:1]), candidate, detections, five_cameras)
+    assert asked == [] and len(places) == 0
+
+
 def test_newcomers_are_sought_among_what_nobody_has(
     tracker, five_cameras, two_people, seen_exactly
 ):
