@@ -31,8 +31,8 @@ _PANOPTIC = (
     "RKnee RAnkle LEye LEar REye REar"
 ).split()
 """Joint order of CMU Panoptic (`joints19`)."""
-_MOST_M = 1e6
-"""Largest magnitude of a coordinate, m."""
+_LARGEST = 1e6
+"""Limit of positions, m, and angles, rad; beyond it a file is damaged."""
 _SIZE_M = (0.1, 5.0)
 """Diagonal of the box around the joints of a person, m; another median means another unit."""
 _SMPLX_VALUES = 165
@@ -132,7 +132,7 @@ def _table(place: object, rows: list[tuple[int, int, Array]], names: tuple[str, 
     size = np.linalg.norm(box[np.isfinite(box).all(axis=1) & box.any(axis=1)], axis=1)
     median = float(np.median(size)) if len(size) > 0 else 1.0
     largest = np.abs(joints[~np.isnan(joints)]).max(initial=0)
-    if not (_SIZE_M[0] < median < _SIZE_M[1] and largest < _MOST_M):
+    if not (_SIZE_M[0] < median < _SIZE_M[1] and largest < _LARGEST):
         raise InputError(
             f"{place}: joints must be metres, but people are {median:.3g} m large and up to "
             f"{largest:.3g} m from the origin; check the unit"
@@ -210,17 +210,26 @@ def _amass(files: list[Path], turn: Array, fps: float | None, body: Path | None)
             raise InputError(f"{file}: its shape belongs to SMPL; give that model with --body")
         poses, trans, betas = (data.get(key, np.zeros(0)) for key in keys[:3])
         count = len(poses) if poses.ndim == 2 else 0
-        if count == 0 or poses.shape[1] < 66 or trans.shape != (count, 3) or betas.ndim != 1:
+        numbers = data.get("frames", np.arange(count))
+        rates = data.get("mocap_framerate", data.get("mocap_frame_rate", np.array(np.nan)))
+        if (
+            count == 0
+            or poses.shape[1] < 66
+            or (trans.shape, numbers.shape) != ((count, 3), (count,))
+            or (betas.ndim, rates.size) != (1, 1)
+            or any(each.dtype.kind not in "fiu" for each in (poses, trans, betas, rates))
+            or numbers.dtype.kind not in "iu"
+            or not all((np.abs(each) < _LARGEST).all() for each in (poses, trans, betas))
+        ):
             raise InputError(
-                f"{file}: must hold poses (F, 66 or more), trans (F, 3) and betas (10 or more); "
-                "give a motion of AMASS"
+                f"{file}: must hold finite poses (F, 66 or more), trans (F, 3) and betas (10 or "
+                "more), and whole frames (F) and one mocap_framerate, if any; give AMASS motions"
             )
         if poses.shape[1] == _SMPLX_VALUES:
             raise InputError(
                 f"{file}: its shape belongs to SMPL-X; download the motion as SMPL+H instead"
             )
-        numbers = data.get("frames", np.arange(count))
-        rate = float(data.get("mocap_framerate", data.get("mocap_frame_rate", np.nan)))
+        rate = float(rates.item())
         step = 1.0 if "frames" in data or fps is None or not rate > fps else rate / fps
         at = np.rint(np.arange(0, count - 0.5, step)).astype(np.intp)
         number = numbers[at] if step == 1 else np.arange(len(at))

@@ -104,7 +104,7 @@ def scan(
     _scan(normal, rays, one.frame, size, first, begin, lags, gate, MIN_JOINTS, cost, count)
     frame = one.frame
     both = np.minimum(frame.max() + lags, last) - np.maximum(frame.min() + lags, begin)
-    share = 0.2 * np.minimum(common / np.ptp(frame), 1)
+    share = 0.2 * np.minimum(common / max(np.ptp(frame), 1), 1)
     enough = (both >= common) & (count >= share * len(frame)) & (count > 0)
     return np.where(enough, cost / np.maximum(count, 1), np.nan)
 
