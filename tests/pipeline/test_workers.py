@@ -103,11 +103,15 @@ def test_any_main_will_do(how, tmp_path):
             (tmp_path / "script.py").write_text(code)
             words = ["script.py"]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    said = subprocess.run(
-        [sys.executable, *words], input=given, cwd=tmp_path, env=environment, capture_output=True,
-        text=True, timeout=120,
-    )  # fmt: skip
-    assert said.stdout.split("\n") == ["begins", _RESULT, ""], said.stderr
+    for _ in range(2):
+        said = subprocess.run(
+            [sys.executable, *words], input=given, cwd=tmp_path, env=environment,
+            capture_output=True, text=True, timeout=120,
+        )  # fmt: skip
+        assert said.stdout.split("\n") == ["begins", _RESULT, ""], said.stderr
+        # Rarely, loky's helper process looks for a semaphore between its end and the message of it.
+        if "FileNotFoundError" not in said.stderr:
+            break
     assert said.stderr == ""
 
 
