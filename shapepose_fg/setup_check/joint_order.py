@@ -66,14 +66,7 @@ def order_of_joints(detections: DetectionSequence, look: Look) -> list[Finding]:
         ]
     if order == list(range(len(names))):
         return []
-    words = _words(names, order)
-    moved = {names[place][1:] for k, place in enumerate(order) if place != k}
-    # The distances of a biased detector may fit some permutation better. If joints look like a body
-    # as they are named, only exchanges of sides or along limbs are plausible.
-    odd = words == ("",) or not moved <= {*_ARMS, *_LEGS}
-    if odd and np.nanmean(fit_of_order(flat, names)) > LIKE_A_BODY:
-        return []
-    return [Finding(Kind.JOINT_ORDER, (), joints=words)]
+    return [Finding(Kind.JOINT_ORDER, (), joints=_words(names, order))]
 
 
 def _words(names: Sequence[str], order: Sequence[int]) -> tuple[str, ...]:
@@ -102,7 +95,12 @@ def _listed(words: Sequence[str]) -> str:
 
 
 def _gains(flat: Array, space: Array | None, names: Sequence[str], order: Sequence[int]) -> bool:
-    """Whether people fit a body significantly better with another order of their joints."""
+    """Whether people fit a body significantly better with another order of their joints.
+
+    Exchanges of sides or along a limb must be significant in pictures or in space. Joints that a
+    detector sees beside where they are may fit any other order better in one of the two, so this
+    must be significant in both.
+    """
 
     def gain(people: Array) -> tuple[float, float]:
         more = fit_of_order(people[:, order], names) - fit_of_order(people, names)
@@ -122,9 +120,11 @@ def _gains(flat: Array, space: Array | None, names: Sequence[str], order: Sequen
     if space is None:
         return in_pictures
     in_space, share = gain(space)
-    return (
-        in_picture > 0 and in_space > 0 and (in_pictures or (in_space > _GAIN and share > _SHARE))
-    )
+    in_spaces = in_space > _GAIN and share > _SHARE
+    moved = {names[place][1:] for k, place in enumerate(order) if place != k}
+    if moved and (_words(names, order) == ("",) or not moved <= {*_ARMS, *_LEGS}):
+        return in_pictures and in_spaces
+    return in_picture > 0 and in_space > 0 and (in_pictures or in_spaces)
 
 
 def _other_layout(people: Array, skeleton: Skeleton) -> str | None:

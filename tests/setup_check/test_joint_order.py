@@ -50,6 +50,7 @@ WRONG = {
     "everything": (SIDES, "left and right appear to be exchanged"),
     "legs": (both(*LEGS), "left and right hip, knee and ankle appear to be exchanged"),
     "elbow and wrist": ([("RElbow", "RWrist")], "RElbow and RWrist appear to be exchanged"),
+    "neck and nose": ([("Neck", "Nose")], "Neck and Nose appear to be exchanged"),
     "many": (
         [
             ("RElbow", "LKnee"),
