@@ -53,7 +53,9 @@ def main() -> None:
     parser.add_argument("--only", choices=("faults", "biases"))
     parser.add_argument("--read", nargs="*", type=Path, help="such files, instead of rooms")
     arguments = parser.parse_args()
-    rows = [row for file in arguments.read or () for row in csv.reader(file.open(newline=""))]
+    rows = list[list[object]]()
+    for file in arguments.read or ():
+        rows += csv.reader(file.open(newline=""))
     for seed in () if rows else range(*map(int, arguments.rigs.split(":"))):
         rng = np.random.default_rng([seed, 20])
         people, cameras = int(rng.choice([1, 2, 3, 4, 6, 8])), int(rng.integers(3, 7))
