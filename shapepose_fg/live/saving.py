@@ -112,4 +112,6 @@ def _made(tree: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
         return arrays[content]
     inside = [_made(each, arrays) for each in content]
     of = _CLASSES[kind]
-    return of(**dict(inside)) if is_dataclass(of) else of(dict(inside) if of is Counter else inside)
+    if hasattr(of, "__dataclass_fields__"):
+        return of(**dict(inside))
+    return of(dict(inside) if of is Counter else inside)
