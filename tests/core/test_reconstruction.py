@@ -238,7 +238,10 @@ def test_bad_files(tmp_path, kind, sentence):
 def test_bad_run_json(tmp_path):
     people([0]).save(tmp_path)
     (tmp_path / "run.json").write_text("[]")
-    with pytest.raises(InputError, match=r"run.json: the file must be an object, got a list of 0; restore it or delete it"):
+    with pytest.raises(
+        InputError,
+        match=r"run.json: the file must be an object, got a list of 0; restore it or delete it",
+    ):
         Reconstruction.load(tmp_path)
     (tmp_path / "run.json").unlink()
     assert Reconstruction.load(tmp_path).run == {}
