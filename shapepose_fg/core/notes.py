@@ -63,21 +63,8 @@ class Notes:
 
     def add(self, other: "Notes") -> None:
         """Add the notes of later frames."""
-        self.frames += other.frames
-        both: Any = ((self.seconds, other.seconds), (self.probable, other.probable))
-        for mine, more in both:
-            for name, amount in more.items():
-                mine[name] = mine.get(name, 0) + amount
-        for kind in ("dropped", "thinned_frames", "repeated_pictures"):
-            for name, frames in getattr(other, kind).items():
-                getattr(self, kind).setdefault(name, []).extend(frames)
-        for track, (evidence, rows) in other.evidence.items():
-            before = self.evidence.get(track, (0.0, 0))
-            self.evidence[track] = before[0] + evidence, before[1] + rows
-        self.problems += other.problems
-        for name, counts in other.factors.items():
-            before = self.factors.get(name, (0, 0))
-            self.factors[name] = before[0] + counts[0], before[1] + counts[1]
+        for name, more in vars(other).items():
+            setattr(self, name, _sum(getattr(self, name), more))
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values for JSON; `from_dict` is the inverse."""
@@ -93,6 +80,16 @@ class Notes:
             raise ValueError(
                 f"notes: {'.'.join(map(str, problem['loc']))}: {problem['msg']}"
             ) from None
+
+
+def _sum(one: Any, other: Any) -> Any:
+    """Numbers added, lists joined; of tuples and dicts entry by entry."""
+    if isinstance(one, tuple):
+        return tuple(map(_sum, one, other))
+    if not isinstance(one, dict):
+        return one + other
+    both = {name: _sum(one[name], more) if name in one else more for name, more in other.items()}
+    return one | both
 
 
 class Notebook:

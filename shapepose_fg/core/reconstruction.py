@@ -1,5 +1,6 @@
 """The result: the people of every frame, as arrays with one row per person and frame."""
 
+import json
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
@@ -10,6 +11,7 @@ from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, Field, FiniteFloat
 
 from shapepose_fg.core.arrays import Array, Mask, Whole
 from shapepose_fg.core.camera import Rig
@@ -25,11 +27,12 @@ from shapepose_fg.core.result_files import (
     write_result,
 )
 from shapepose_fg.core.rig_file import CAMERAS, is_replaceable, write_rig
-from shapepose_fg.core.run_summary import check_run, merged_run
+from shapepose_fg.core.run_summary import check_frames, merged_run
 from shapepose_fg.core.shapes import SubjectShapes
 from shapepose_fg.core.skeleton import BODY_25, check_joint_names
 from shapepose_fg.core.storage.files import read_json
 from shapepose_fg.core.storage.schema import Column, Table, code_names
+from shapepose_fg.core.validation import validated
 
 
 class Status(StrEnum):
@@ -392,13 +395,35 @@ _CHECKED_ROWS = 4096
 """Number of rows that are read at a time to check that a file is readable."""
 
 
+class _Time(BaseModel, strict=True):
+    fps: FiniteFloat | None = None
+
+
+class _Run(BaseModel, strict=True):
+    """Entries of run.json that this program reads again; there may be others."""
+
+    configuration: dict[str, Any] = {}
+    versions: dict[str, Any] = {}
+    inputs: dict[str, Any] = {}
+    people: dict[str, Any] = {}
+    seconds: dict[str, FiniteFloat] = {}
+    time: _Time = _Time()
+    cuts: list[Annotated[int, Field(ge=0)]] = []
+    body: str | None = None
+
+
 def _read_run(file: Path, people_id: object) -> dict[str, Any]:
-    """Content of run.json, which must have this id; empty if there is no file."""
-    run = read_json(file) if file.is_file() else {}
-    with naming(file, "restore it or delete it"):
-        if not isinstance(run, dict):
-            raise ValueError("must hold an object")
-        check_run(run)
+    """The content of run.json, empty if there is none. InputError if it is invalid, or belongs to
+    another run.
+    """
+    run, cure = read_json(file) if file.is_file() else {}, "restore it or delete it"
+    validated(_Run, run, file, cure)
+    with naming(file, cure):
+        check_frames(run)
+        try:
+            json.dumps(run, allow_nan=False)
+        except ValueError:
+            raise ValueError("a number in it is not finite, or too large") from None
     check_id(people_id, run.pop(RUN_ID, None), file)
     return run
 

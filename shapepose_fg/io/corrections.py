@@ -16,7 +16,7 @@ from shapepose_fg.core.provenance import checksums
 from shapepose_fg.core.reconstruction import MOST_NUMBER, Reconstruction
 from shapepose_fg.core.result_files import OBSERVATIONS, PEOPLE, RUN
 from shapepose_fg.core.storage.files import inside, read_json, write_content
-from shapepose_fg.io.validation import validated
+from shapepose_fg.core.validation import validated
 from shapepose_fg.tracking.edits import Edit, Edited, Solve, apply, solve_anew, undo
 
 CORRECTIONS, UNCORRECTED = "corrections.json", "uncorrected"

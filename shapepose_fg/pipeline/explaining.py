@@ -16,11 +16,11 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.joint_names import mirrored
 from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.reconstruction import Known, Reconstruction, sigma_m
+from shapepose_fg.core.validation import validated
 from shapepose_fg.estimation.factor_shares import FactorEvidence, factor_evidence
 from shapepose_fg.estimation.linearisation import inverses, observation_sigmas
 from shapepose_fg.estimation.user_factors import ExtraFactors, functions_of, name_of
 from shapepose_fg.estimation.window_solution import PersonGraph
-from shapepose_fg.io.validation import validated
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.explanation import (
     GATES,

@@ -13,9 +13,9 @@ from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import SKELETONS
 from shapepose_fg.core.storage.files import open_regular, text_pieces
+from shapepose_fg.core.validation import is_number
 from shapepose_fg.io.camera_names import MOST_FRAME, last_number, match_names
 from shapepose_fg.io.detections.people import CameraPeople, PeopleBlock
-from shapepose_fg.io.validation import is_number
 
 _DEEPLABCUT, _CALISCOPE = "DeepLabCut's CSV", "Caliscope's CSV"
 _RERUN = "write the detections again, in pixels"

@@ -17,8 +17,8 @@ from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import read_json, write_content
+from shapepose_fg.core.validation import validated
 from shapepose_fg.io.footage.places import per_camera
-from shapepose_fg.io.validation import validated
 
 FOOTAGE = "footage.json"
 """Name of the file beside the detections."""
