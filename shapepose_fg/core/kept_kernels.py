@@ -21,7 +21,7 @@ from typing import Any, cast
 
 import numba
 from llvmlite.binding import get_host_cpu_features, get_host_cpu_name
-from numba.core.runtime import rtsys
+from numba.core.runtime.nrt import rtsys
 
 from shapepose_fg.core.storage.files import user_cache
 
