@@ -17,7 +17,7 @@ def least_cost_pairs(cost: Array) -> tuple[Index, Index]:
     (R, C), nowhere = cost.shape, np.intp(-1)
     if R > C:
         columns, rows = least_cost_pairs(cost.T)
-        return rows[order := rows.argsort()], columns[order]
+        return rows[order := rows.argsort(kind="stable")], columns[order]
     column_of, row_of, u, v = np.full(R, nowhere), np.full(C, nowhere), np.zeros(R), np.zeros(C)
     for first in range(R):
         row, far, rows = first, 0.0, list[int]()
