@@ -14,7 +14,7 @@ from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Camera
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import BODY_25, COCO_18, Skeleton
-from shapepose_fg.core.storage.files import SMALL, open_regular, text_pieces
+from shapepose_fg.core.storage.files import SMALL, text_pieces
 from shapepose_fg.core.validation import is_number
 from shapepose_fg.io.detection_table import BLOCK_FRAMES
 from shapepose_fg.io.detections.people import OVERSHOOT
@@ -150,10 +150,20 @@ class NumberStream:
         return values
 
     def _line(self, index: int | None) -> int:
-        """The line of a number, from 1; the last one for None. The file is read again."""
-        with open_regular(self.path) as stream:
-            ends = np.cumsum([len(line.split()) for line in stream])
-        return len(ends) if index is None else int(np.searchsorted(ends, index, side="right")) + 1
+        """The line, counted from 1, of a value; the last line for None or a value behind the
+        last.
+        """
+        lines, numbers, last = 0, 0, 1
+        for text in _whole_words(self.path):
+            counts = [len(line.split()) for line in text.splitlines()]
+            ends = numbers + np.cumsum(counts)
+            if index is not None and len(ends) > 0 and index < ends[-1]:
+                return lines + int(np.searchsorted(ends, index, side="right")) + 1
+            numbers += sum(counts)
+            last = lines + max(len(counts), 1)
+            # A line that continues in the next piece is not counted as complete.
+            lines += len((text + "|").splitlines()) - 1
+        return last
 
 
 def read_association_text(path: Path, camera: Camera) -> ViewStream:
