@@ -1,5 +1,6 @@
-"""Fit how uncertain people in single frames are (`estimation/body_frames.Doubt`) to the errors in
-simulated recordings, and average the noise laws learnt from them (`estimation/noise_law.py`).
+"""Fit how uncertain people in single frames are (`Doubt` of `estimation/covariance_factors.py`) to
+the errors in simulated recordings, and average the noise laws learnt from them
+(`estimation/noise_law.py`).
 
     python scripts/fit_covariances.py --mocap cmu_smpl24.npz --output covariances.json
 
@@ -23,7 +24,7 @@ from scipy.stats import chi2
 
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.estimation import body_solution
-from shapepose_fg.estimation.body_frames import Doubt, doubts, signs_of_doubt
+from shapepose_fg.estimation.covariance_factors import Doubt, covariance_factors, signs_of_doubt
 from shapepose_fg.estimation.noise_law import NoiseLaw
 from shapepose_fg.evaluation.metrics import match_people
 from shapepose_fg.pipeline.config import PipelineConfig
@@ -94,7 +95,11 @@ def errors(
         whole = sequence(name, split, mocap, cameras=cameras, until=FRAMES, fps=FPS, config=config)
         scene = whole.part(range(FRAMES))
     detections, solved = simulate(scene, seed=seed), []
-    with patch.object(body_solution, "doubts", lambda each: solved.append(each) or doubts(each)):
+    with patch.object(
+        body_solution,
+        "covariance_factors",
+        lambda each, noise: solved.append(each) or covariance_factors(each, noise),
+    ):
         people = reconstruct(
             detections,
             scene.rig,
@@ -109,7 +114,11 @@ def errors(
         off = (joints[found.row] - scene.keypoints[found.frame, found.person])[..., None]
         squared = (off.mT @ np.linalg.solve(marginals.joints()[found.row], off))[..., 0, 0]
         views = window.last.evidence.inlier[found.row].sum(axis=-1)
-        signs = (np.repeat(each[found.row, None], 25, 1) for each in signs_of_doubt(marginals))
+        sigma_m, told, used = signs_of_doubt(marginals)
+        signs = (
+            np.repeat(each[found.row, None], 25, 1)
+            for each in (sigma_m, 1 - used / np.maximum(told, 1e-9))
+        )
         seen = views > 0
         yield tuple(each[seen] for each in (squared, views, *signs))
 
@@ -121,14 +130,14 @@ def fitted(
     share = np.where(views > 1, SHARES[1] / (views > 1).sum(), SHARES[0] / (views == 1).sum())
 
     def loss(numbers: np.ndarray) -> float:
-        factor = Doubt(np.exp(numbers[0]), numbers[1], REJECTED_POWER).factors(sigma_m, rejected)
+        factor = Doubt(np.exp(numbers[0]), numbers[1], REJECTED_POWER).in_frames(sigma_m, rejected)
         off = squared / factor
         off = np.where(off > FAR, FAR * (1 + np.log(np.maximum(off, FAR) / FAR)), off)
         return float((share * (off + 3 * np.log(factor))).sum())
 
     numbers = minimize(loss, (0.0, 1.0), method="Nelder-Mead").x
     power = float(numbers[1])
-    off = squared / Doubt(1.0, power, REJECTED_POWER).factors(sigma_m, rejected)
+    off = squared / Doubt(1.0, power, REJECTED_POWER).in_frames(sigma_m, rejected)
     order = np.argsort(off, kind="stable")
     at = np.searchsorted(np.cumsum(share[order]) / share.sum(), 0.95)
     scale = off[order][at] / chi2.ppf(0.95, 3)

@@ -8,8 +8,17 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from typing import Annotated, Any, ClassVar
 
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import (
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    NonNegativeInt,
+    PositiveInt,
+    TypeAdapter,
+    ValidationError,
+)
 
+from shapepose_fg.core.bounds import MOST_NUMBER
 from shapepose_fg.core.detections import Input
 
 
@@ -29,9 +38,7 @@ class Problem:
     """Description of the problem."""
 
 
-_Count = Annotated[int, Field(ge=0, lt=2**53)]
-_Number = Annotated[float, Field(allow_inf_nan=False)]
-_Rows = Annotated[int, Field(gt=0)]
+_Count = Annotated[NonNegativeInt, Field(le=MOST_NUMBER)]
 _Frames = dict[str, list[_Count]]
 
 
@@ -42,9 +49,9 @@ class Notes:
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
     frames: _Count = 0
     """Number of frames that the notes are about."""
-    seconds: dict[str, _Number] = field(default_factory=dict)
+    seconds: dict[str, FiniteFloat] = field(default_factory=dict)
     """Time per stage, s, summed over all processes."""
-    evidence: dict[_Count, tuple[_Number, _Rows]] = field(default_factory=dict)
+    evidence: dict[_Count, tuple[FiniteFloat, PositiveInt]] = field(default_factory=dict)
     """By track: sum of the evidence (`Observations.evidence`) of its rows, and number of these
     rows."""
     probable: dict[str, _Count] = field(default_factory=dict)
@@ -63,21 +70,8 @@ class Notes:
 
     def add(self, other: "Notes") -> None:
         """Add the notes of later frames."""
-        self.frames += other.frames
-        both: Any = ((self.seconds, other.seconds), (self.probable, other.probable))
-        for mine, more in both:
-            for name, amount in more.items():
-                mine[name] = mine.get(name, 0) + amount
-        for kind in ("dropped", "thinned_frames", "repeated_pictures"):
-            for name, frames in getattr(other, kind).items():
-                getattr(self, kind).setdefault(name, []).extend(frames)
-        for track, (evidence, rows) in other.evidence.items():
-            before = self.evidence.get(track, (0.0, 0))
-            self.evidence[track] = before[0] + evidence, before[1] + rows
-        self.problems += other.problems
-        for name, counts in other.factors.items():
-            before = self.factors.get(name, (0, 0))
-            self.factors[name] = before[0] + counts[0], before[1] + counts[1]
+        for name, more in vars(other).items():
+            setattr(self, name, _sum(getattr(self, name), more))
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values for JSON; `from_dict` is the inverse."""
@@ -93,6 +87,16 @@ class Notes:
             raise ValueError(
                 f"notes: {'.'.join(map(str, problem['loc']))}: {problem['msg']}"
             ) from None
+
+
+def _sum(one: Any, other: Any) -> Any:
+    """Numbers added, lists joined; of tuples and dicts entry by entry."""
+    if isinstance(one, tuple):
+        return tuple(map(_sum, one, other))
+    if not isinstance(one, dict):
+        return one + other
+    both = {name: _sum(one[name], more) if name in one else more for name, more in other.items()}
+    return one | both
 
 
 class Notebook:

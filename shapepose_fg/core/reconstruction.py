@@ -1,5 +1,6 @@
 """The result: the people of every frame, as arrays with one row per person and frame."""
 
+import json
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
@@ -10,8 +11,10 @@ from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, Field, FiniteFloat
 
 from shapepose_fg.core.arrays import Array, Mask, Whole
+from shapepose_fg.core.bounds import MOST_NUMBER
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError, naming, optional
 from shapepose_fg.core.observation_table import ObservationTable
@@ -25,11 +28,12 @@ from shapepose_fg.core.result_files import (
     write_result,
 )
 from shapepose_fg.core.rig_file import CAMERAS, is_replaceable, write_rig
-from shapepose_fg.core.run_summary import check_run, merged_run
+from shapepose_fg.core.run_summary import check_frames, merged_run
 from shapepose_fg.core.shapes import SubjectShapes
 from shapepose_fg.core.skeleton import BODY_25, check_joint_names
-from shapepose_fg.core.storage.files import read_json
+from shapepose_fg.core.storage.files import BLOCK_FRAMES, ROWS_AT_ONCE, read_json
 from shapepose_fg.core.storage.schema import Column, Table, code_names
+from shapepose_fg.core.validation import validated
 
 
 class Status(StrEnum):
@@ -75,9 +79,6 @@ class Known(IntEnum):
 
 BODY = ("betas", "global_orient", "body_pose", "transl")
 """The columns of a result that describe the body."""
-MOST_NUMBER = 2**53 - 1
-"""The highest number of a frame or a person: the largest integer up to which doubles represent all
-integers."""
 _LATER: Any = None
 """Default of a column that is not given: unknown values."""
 
@@ -334,7 +335,7 @@ class OpenedReconstruction(ExitStack):
     def at(self, frame: int) -> Reconstruction:
         """The people of one frame. The following frames are read into memory together with it."""
         if frame not in self._block[0]:
-            block = range(frame, frame + _BLOCK)
+            block = range(frame, frame + BLOCK_FRAMES)
             self._block = block, self.frames(block.start, block.stop)
         return self._block[1].at(frame)
 
@@ -382,23 +383,43 @@ def check_files(people: Path, observations: Path | None) -> None:
         table = None if observations is None else ObservationTable.open(observations)
         if table is not None:
             opened.enter_context(table)
-        for start in range(0, rows.count, _CHECKED_ROWS):
-            index = np.arange(start, min(start + _CHECKED_ROWS, rows.count))
+        for start in range(0, rows.count, ROWS_AT_ONCE):
+            index = np.arange(start, min(start + ROWS_AT_ONCE, rows.count))
             rows.read(index, observations=None if table is None else table.read(index))
 
 
 _UNREADABLE = "the result was not written, and the previous files are unchanged"
-_CHECKED_ROWS = 4096
-"""Number of rows that are read at a time to check that a file is readable."""
+
+
+class _Time(BaseModel, strict=True):
+    fps: FiniteFloat | None = None
+
+
+class _Run(BaseModel, strict=True):
+    """Entries of run.json that this program reads again; there may be others."""
+
+    configuration: dict[str, Any] = {}
+    versions: dict[str, Any] = {}
+    inputs: dict[str, Any] = {}
+    people: dict[str, Any] = {}
+    seconds: dict[str, FiniteFloat] = {}
+    time: _Time = _Time()
+    cuts: list[Annotated[int, Field(ge=0)]] = []
+    body: str | None = None
 
 
 def _read_run(file: Path, people_id: object) -> dict[str, Any]:
-    """Content of run.json, which must have this id; empty if there is no file."""
-    run = read_json(file) if file.is_file() else {}
-    with naming(file, "restore it or delete it"):
-        if not isinstance(run, dict):
-            raise ValueError("must hold an object")
-        check_run(run)
+    """The content of run.json, empty if there is none. InputError if it is invalid, or belongs to
+    another run.
+    """
+    run, cure = read_json(file) if file.is_file() else {}, "restore it or delete it"
+    validated(_Run, run, file, cure)
+    with naming(file, cure):
+        check_frames(run)
+        try:
+            json.dumps(run, allow_nan=False)
+        except ValueError:
+            raise ValueError("a number in it is not finite, or too large") from None
     check_id(people_id, run.pop(RUN_ID, None), file)
     return run
 
@@ -408,11 +429,6 @@ def with_body(*columns: Array) -> Mask:
     return np.logical_and.reduce(
         [np.isfinite(each).all(axis=tuple(range(1, each.ndim))) for each in columns]
     )
-
-
-_BLOCK = 128
-"""Number of frames that `OpenedReconstruction.at` reads together; equal to the block size of
-detections."""
 
 
 def count_rows(pieces: Iterable[tuple[NDArray[np.str_], NDArray[np.uint8]]]) -> dict[str, Any]:

@@ -1,9 +1,8 @@
 """The content of run.json: checks it on reading, and merges that of several results."""
 
 import json
-import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -97,53 +96,13 @@ def covered_frames(run: Mapping[str, Any]) -> list[range] | None:
         ) from None
 
 
-def check_run(run: Mapping[str, Any]) -> None:
-    """ValueError if an entry that this program reads again is invalid; other entries may be any
-    finite values.
-    """
-
-    def refuse(name: str, wanted: str, value: object) -> ValueError:
-        text = repr(value)
-        return ValueError(
-            f'"{name}" must be {wanted}, got {text if len(text) <= 40 else text[:40] + "..."}'
-        )
-
-    for key in ("configuration", "versions", "inputs", "seconds", "people", "time"):
-        if not isinstance(run.get(key, {}), dict):
-            raise refuse(key, "an object", run[key])
-    numbers = {f"seconds.{name}": value for name, value in run.get("seconds", {}).items()}
-    if run.get("time", {}).get("fps") is not None:
-        numbers["time.fps"] = run["time"]["fps"]
-    for name, value in numbers.items():
-        if type(value) not in (int, float) or not math.isfinite(value):
-            raise refuse(name, "a number", value)
-    cuts = run.get("cuts", [])
-    if not isinstance(cuts, list) or not all(type(cut) is int and cut >= 0 for cut in cuts):
-        raise refuse("cuts", "a list of frame numbers", cuts)
-    if not isinstance(run.get("body"), str | None):
-        raise refuse("body", "the name of a file or null", run["body"])
+def check_frames(run: Mapping[str, Any]) -> None:
+    """ValueError if a run says that it covered frames of which there cannot be so many."""
     spans = covered_frames(run) or []
     # The length of a range may be too large for `len`.
     count = sum(span.stop - span.start for span in spans)
     if any(span.start < 0 or span.stop < span.start for span in spans) or count > MOST_FRAMES:
-        raise refuse("frames", f"[start, stop] of at most {MOST_FRAMES} frames", run["frames"])
-    for way, value in _leaves(run):
-        if isinstance(value, float) and not math.isfinite(
-            value
-        ):  # 1e999, which JSON cannot store again
-            raise ValueError(f'"{way[:80]}" must be a finite number, got {value}')
-
-
-def _leaves(value: object, way: str = "") -> Iterator[tuple[str, object]]:
-    """All values in nested lists and objects, each with its dotted path of keys and indices."""
-    items = (
-        value.items()
-        if isinstance(value, Mapping)
-        else enumerate(value)
-        if isinstance(value, list)
-        else None
-    )
-    if items is None:
-        yield way, value
-    for key, child in items or ():
-        yield from _leaves(child, f"{way}.{key}" if way else str(key))
+        raise ValueError(
+            f'"frames" must be [start, stop] of at most {MOST_FRAMES} frames, got '
+            f"{str(run['frames'])[:40]}"
+        )

@@ -9,13 +9,13 @@ import numpy as np
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import SKELETONS
 from shapepose_fg.core.storage.files import is_inside, read_toml
+from shapepose_fg.core.validation import validated
 from shapepose_fg.detection2d.boxes import BoxForm, BoxNetwork
 from shapepose_fg.detection2d.download import NamedNetwork, named_networks
 from shapepose_fg.detection2d.heat_maps import HeatMapNetwork
 from shapepose_fg.detection2d.onnx_network import OnnxNetwork
 from shapepose_fg.detection2d.top_down import KeypointForm, TopDownNetwork
 from shapepose_fg.io.skeleton_file import find_skeleton
-from shapepose_fg.io.validation import validated
 
 Network = HeatMapNetwork | TopDownNetwork
 """A network that finds joints in upright pictures. Each has its input (`view`), detections

@@ -1,16 +1,12 @@
 """People in single frames: the model of `body_window.py` without motion, for all rows at once."""
 
 from copy import copy
-from dataclasses import dataclass
-from functools import cache
-from importlib.resources import as_file, files
 
 import numpy as np
 
 from shapepose_fg.body.kernels.solving import solved
 from shapepose_fg.body.model.rotation import exp_so3
 from shapepose_fg.core.arrays import Array, Index, Mask
-from shapepose_fg.core.storage.files import read_json
 from shapepose_fg.estimation.body_window import (
     DAMPING,
     HELD,
@@ -26,10 +22,6 @@ from shapepose_fg.estimation.condensed_graph import frame_systems
 DEVIATION_M = 0.012
 """As `body_window.DEVIATION_M`, for a body whose shape a single frame determines: of 7, 12 and 20
 mm that with which neither simulated nor recorded people are much worse than with the best."""
-USUAL_M = 0.01
-"""Standard deviation of people whom all views see, metres."""
-REJECTED = 0.1
-"""Share of rejected evidence that means as much as a doubled variance."""
 
 
 class BodyFrames(BodyWindow):
@@ -116,45 +108,3 @@ class BodyFrames(BodyWindow):
 
 def _better(new: Around, last: Around) -> Mask:
     return np.asarray(new.cost <= last.cost + 1e-3 * np.abs(last.cost))
-
-
-@dataclass(frozen=True)
-class Doubt:
-    """How much less certain people in single frames are than their graphs, because some of their
-    detections are another person's.
-    """
-
-    scale: float
-    """Factor on all variances."""
-    sigma: float
-    """Exponent of the mean standard deviation of the person's joints, over `USUAL_M`."""
-    rejected: float
-    """Exponent of one plus the share of evidence that gates reject, over `REJECTED`."""
-
-    @classmethod
-    @cache
-    def measured(cls) -> "Doubt":
-        """The numbers that ship, measured by `scripts/fit_covariances.py`."""
-        with as_file(files("shapepose_fg.estimation") / "data" / "covariances.json") as path:
-            return cls(**read_json(path)["doubt"])
-
-    def factors(self, sigma_m: Array, rejected: Array) -> Array:
-        """(T,) factors on variances."""
-        usual = (sigma_m / USUAL_M) ** self.sigma
-        return self.scale * usual * (1 + rejected / REJECTED) ** self.rejected
-
-
-def doubts(marginals: Marginals) -> Array:
-    """(T,) `Doubt.factors` of people in single frames."""
-    return Doubt.measured().factors(*signs_of_doubt(marginals))
-
-
-def signs_of_doubt(marginals: Marginals) -> tuple[Array, Array]:
-    """(T,) mean standard deviation of each person's joints, metres, and (T,) share of the evidence,
-    the weights w_ij of Eq. 1, that gates reject.
-    """
-    window = marginals.window
-    sigma_m = np.sqrt(np.trace(marginals.joints(), axis1=-2, axis2=-1) / 3).mean(axis=1)
-    told = window.config.weight(window.observations.confidence) * window.observations.seen
-    used = (told * window.last.evidence.inlier).sum(axis=(1, 2))
-    return sigma_m, 1 - used / np.maximum(told.sum(axis=(1, 2)), 1e-9)

@@ -16,12 +16,13 @@ from shapepose_fg.core.camera import Views
 from shapepose_fg.core.notes import Problem
 from shapepose_fg.core.observations import Observations, window_rows
 from shapepose_fg.core.reconstruction import Known
-from shapepose_fg.estimation.body_frames import BodyFrames, doubts
+from shapepose_fg.estimation.body_frames import BodyFrames
 from shapepose_fg.estimation.body_window import BodyWindow, Marginals
 from shapepose_fg.estimation.body_window_graph import BodyGraph
 from shapepose_fg.estimation.camera_pose_uncertainty import carried_covariance
 from shapepose_fg.estimation.condensed_graph import gtsam_step
 from shapepose_fg.estimation.contact import feet_of
+from shapepose_fg.estimation.covariance_factors import covariance_factors
 from shapepose_fg.estimation.draft import first_places, joint_targets
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.factor_solution import solve_with_factors
@@ -109,15 +110,12 @@ def solve_bodies(
             if not over_time and len(rows) > 1:  # one of them
                 parts.extend(rows[:, None])
             continue
-        # All covariances of a graph grow by one factor, by which neither solution nor gates change:
-        # over time with the noise of the recording's detector and its lasting errors, in single
-        # frames with doubt about whose detections they are.
-        widen = [noisy * marginals.lasting()] if over_time else doubts(marginals)
+        widen = covariance_factors(marginals, noisy)
         for (place, each), factor in zip(window.apart(marginals), widen, strict=True):
             own = rows[place]
             frames = observations.frame[own].astype(np.int64)
             track = int(observations.track[own[0]])
-            people.append(BodyGraph(each.window, each.state, track, frames, factor, own))
+            people.append(BodyGraph(each.window, each.state, track, frames, float(factor), own))
             spread.append(each.of_bodies)
             found.put(people[-1], each)
 

@@ -56,20 +56,9 @@ standing feet are those with the marginals themselves, which take a twentieth of
 _STRAYS_M = 0.07
 """Standard deviation, m, of an unseen joint of the body at which its own deviation is as large:
 errors of poses that nothing shows are larger than their Gaussian when they are large."""
-_NEW, _LASTING = 0.5, 1.8
-"""Factors on the covariances that new and lasting errors of detections leave (`Marginals.lasting`),
-since residuals show fewer of the lasting ones. With them 95 % regions hold in most recordings
-(docs/evaluation/covariances.md)."""
-_LASTS_S, _LASTS, _PRIOR_COUNT = 1.0, 0.4, 20.0
-"""Time apart, s, at which residuals are compared for lasting errors; the usual share of these, and
-its weight as a number of squared standard deviations."""
-_LOOKS = 8
-"""Number of frames, evenly over the window, from which it is taken how much it averages."""
 STEPS, SETTLED_M = 8, 2e-3
 """Most steps of the solver; it ends when joints move by less on average, metres. GTSAM's last step
 then moves them by a tenth of that."""
-_ANYWHERE = 1e-3
-"""Information on the place and direction of a body in a frame by itself, 1/m² and 1/rad²."""
 HELD = 1e-6
 """Information on every unknown, so that what nothing determines stays where it is."""
 DAMPING = 1e-3
@@ -508,50 +497,6 @@ class Marginals:
         whole[:, 10:, :10], whole[:, :10, 10:] = self.across, self.across.mT
         flat = slope.reshape(T, 3 * J, -1)
         return (flat @ whole).reshape(slope.shape) @ slope.mT
-
-    def lasting(self) -> float:
-        """How many times larger covariances are because detectors' errors last.
-
-        Errors that are new in every frame are averaged over time, and leave the covariances of the
-        window. Those that last are not, and leave what the same views cause in a frame by itself.
-        The share that lasts is measured in the window.
-        """
-        window, last = self.window, self.window.last
-        some = slice(None, None, max(len(window) // _LOOKS, 1))
-        seen = np.asarray(last.evidence.inlier.any(axis=-1))[some]
-        if not seen.any():
-            return 1.0
-        slope, gain = self.slopes[some, ..., 10:], last.gain[some]
-        variance = window.variance[some, ..., None, None]
-        (T, J), N = seen.shape, slope.shape[-1]
-        flat = slope.reshape(T, 3 * J, N)
-        views = flat.mT @ (gain / variance @ slope).reshape(flat.shape)
-        prior = _ANYWHERE * np.eye(N)
-        prior[3:-3, 3:-3] += window.energy.priors.precision
-        shown = np.linalg.inv(views + prior)
-        of_body = (flat @ (shown @ views @ shown)).reshape(slope.shape) @ slope.mT
-        kept = np.eye(3) - gain
-        alone = np.trace(kept @ of_body @ kept.mT + variance * kept, axis1=-2, axis2=-1)
-        over_time = np.trace(self.joints()[some], axis1=-2, axis2=-1)
-        share = self._share_lasting()
-        return _NEW * (1 - share) + _LASTING * share * float(
-            np.exp(np.log(alone / over_time)[seen].mean())
-        )
-
-    def _share_lasting(self) -> float:
-        """Share of the detections' variance that lasts: the correlation of residuals that are
-        `_LASTS_S` apart.
-        """
-        window, evidence = self.window, self.window.last.evidence
-        sigma = np.where(evidence.inlier, window.sigmas_px, np.inf)[..., None]
-        ratio = np.nan_to_num(evidence.residual_px) / sigma
-        later = np.searchsorted(window.times_s, window.times_s + _LASTS_S - 1e-3)
-        now = np.flatnonzero(later < len(window))
-        first, second = ratio[now], ratio[later[now]]
-        both = (first != 0) & (second != 0)
-        product = (first * second)[both].sum() + _PRIOR_COUNT * _LASTS
-        squared = (first**2 + second**2)[both].sum() / 2 + _PRIOR_COUNT
-        return float(np.clip(product / squared, 0.0, 1.0))
 
     def velocities(self) -> Array:
         """(T, J, 3, 3) covariances of the velocities of the joints as in `in_time.velocities`,

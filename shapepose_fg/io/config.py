@@ -16,7 +16,7 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from shapepose_fg.core.bounds import interval_of, range_of, violated
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import read_toml
-from shapepose_fg.io.validation import describe, first_problem
+from shapepose_fg.core.validation import describe, first_problem
 
 T = TypeVar("T")
 

@@ -9,7 +9,7 @@ import numpy as np
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import BIG, read_text
-from shapepose_fg.io.validation import is_number
+from shapepose_fg.core.validation import is_number
 
 MISSING = "-"
 """Placeholder of a missing number in the columns that allow it."""

@@ -12,7 +12,7 @@ from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.joint_names import layouts_called
 from shapepose_fg.core.skeleton import MID_HIP, SKELETONS, Skeleton
 from shapepose_fg.core.storage.files import read_toml
-from shapepose_fg.io.validation import validated
+from shapepose_fg.core.validation import validated
 
 _Pair = Annotated[list[str], Field(min_length=2, max_length=2)]
 _FACE_AND_TOES = {

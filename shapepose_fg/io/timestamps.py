@@ -15,8 +15,8 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_sets import CameraClock, FrameSets, align
 from shapepose_fg.core.frame_times import MOST_FPS, FrameTimes
 from shapepose_fg.core.storage.files import write_content
+from shapepose_fg.core.validation import is_number
 from shapepose_fg.io.number_table import MISSING, read_number_table
-from shapepose_fg.io.validation import is_number
 
 _FRAME, _TIME = "frame", "time_s"
 """Columns with a special meaning; every other column belongs to a camera."""

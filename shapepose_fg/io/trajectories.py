@@ -10,8 +10,8 @@ from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.frame_times import MOST_FPS
 from shapepose_fg.core.rig_file import COVARIANCE, POSE
 from shapepose_fg.core.trajectory import MOST_METRES, UNIT_LENGTH, Trajectory
+from shapepose_fg.core.validation import is_number
 from shapepose_fg.io.number_table import read_number_table
-from shapepose_fg.io.validation import is_number
 
 _STRAY = {"timestamp", "frame", *POSE[1:]}
 """Columns of Stray Scanner's odometry.csv; it may have further ones, some of them empty."""

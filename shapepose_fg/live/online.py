@@ -32,7 +32,7 @@ from shapepose_fg.live.clock import JUMP_S, CommonClock
 from shapepose_fg.live.filtering import Filter
 from shapepose_fg.live.newest_frame import Newest, fed_back, of_poses, people_at
 from shapepose_fg.live.refining import LiveState, Slot, WindowQueue
-from shapepose_fg.live.saving import read_state, setup_id, state_arrays, write_state
+from shapepose_fg.live.saving import read_state, setup_id, write_state
 from shapepose_fg.live.views import MOST_S, ViewsInStep, with_pose
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.setup import Setup
@@ -176,7 +176,7 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
         """
         found = cls(rig, config, skeleton=skeleton, lag_s=lag_s, workers=workers, fitter=fitter)
         try:
-            found._state = read_state(Path(path), found._id, rig, found._filter)
+            found._state = read_state(Path(path), found._id)
             found._show()
         except InputError:
             found.close()
@@ -401,8 +401,7 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
         """
         with self._lock:
             self._collect(wait=True)
-            arrays = state_arrays(self._state)
-        write_state(Path(path), arrays, self._id)
+            write_state(Path(path), self._state, self._id)
 
     def report(self) -> LiveReport:
         """Counts, and the status of each camera."""

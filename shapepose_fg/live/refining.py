@@ -37,8 +37,7 @@ class Slot:
     settled: bool = False
     """Whether the rows of the frame are refined, or being refined."""
     refined: Reconstruction | None = None
-    """Rows refined by the newest window that ends here; later frames are tracked from these. Not
-    saved."""
+    """Rows refined by the newest window that ends here; later frames are tracked from these."""
 
     @property
     def time_s(self) -> float:
@@ -57,11 +56,11 @@ class LiveState:
     views: ViewsInStep
     """Views that wait for the others of their frame."""
     clock: CommonClock[tuple[Any, ...]]
-    """Views that wait until other cameras confirm their time. Not saved."""
+    """Views that wait until other cameras confirm their time."""
     begin: FilterState
-    """The state before the first frame: no tracks, and the next identity. Not saved."""
+    """The state before the first frame: no tracks, and the next identity."""
     without_pose: Counter[int] = field(default_factory=Counter)
-    """By view: the excess of views without a pose over those with one. Not saved."""
+    """By view: the excess of views without a pose over those with one."""
     slots: list[Slot] = field(default_factory=list)
     """The last frames, by time: those not settled, and those that a window includes before them."""
     before: Detections | None = None

@@ -1,7 +1,7 @@
 """Explains the estimate of a joint: contributions of views, body and motion, and contradictions."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,14 +15,12 @@ from shapepose_fg.core.detections import Detections, DetectionSequence
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.joint_names import mirrored
 from shapepose_fg.core.observation_table import Gate, ObservationTable
-from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Known, Reconstruction, sigma_m
+from shapepose_fg.core.validation import validated
 from shapepose_fg.estimation.factor_shares import FactorEvidence, factor_evidence
 from shapepose_fg.estimation.linearisation import inverses, observation_sigmas
 from shapepose_fg.estimation.user_factors import ExtraFactors, functions_of, name_of
 from shapepose_fg.estimation.window_solution import PersonGraph
-from shapepose_fg.estimation.wrong_views import Seen, WrongView, wrong_view
-from shapepose_fg.io.validation import validated
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.explanation import (
     GATES,
@@ -37,12 +35,6 @@ from shapepose_fg.pipeline.solving import Solver, solved_around
 OFF_SIGMA = 3.0
 """Distance of a detection from the prediction by all else, in standard deviations, above which it
 is reported: one in 90 exceeds it by chance."""
-_WINDOW_FRAMES = 48
-"""Number of frames before and after that are used to decide whether a camera is wrong."""
-_ASTRAY_RAD, _BESIDE_RAD, _BIN_RAD = 0.15, 0.03, 0.01
-"""Angle around joints within which unassigned detections are searched for, rad; residual angle for
-a match after subtracting the mode of these shifts; and bin size for the mode. A rolled camera
-shifts only some parts of its picture."""
 _NEAR_M = 0.5
 """Distance from a joint, m, within which an unassigned detection is reported."""
 _APART = 0.5
@@ -135,22 +127,18 @@ def explain(
     number = names.index(joint)
     solver = Solver.of(people, rig)
     graph = solved_around(people, solver, person, frame, extra_factors)
-    near = np.abs(people.frame - frame) <= (_WINDOW_FRAMES if solver.config.temporal else 0)
-    around = _Detections.of(people.rows(near), rig, solver.config, detections)
-    at = int(near[:row].sum())
+    here = people.frame == frame
+    around, at = _Detections.of(people.rows(here), rig, solver.config), int(here[:row].sum())
     views, factors, shares = _view_reasons(around, graph, at, number, solver.config)
-    here, known = people.joints[row, number], np.isfinite(people.joints[row, number]).all()
+    place, known = people.joints[row, number], np.isfinite(people.joints[row, number]).all()
     sigma, when = float(sigma_m(people.covariance[row, number])), float(people.time_s[row])
-    wrong = wrong_view(
-        around.seen, around.people.joints, around.views, solver.config.estimator.observations
-    )
     refused = _refused(around, at, number, detections)
-    findings = _findings(people, told, row, number, views, factors, shares, wrong, refused)
+    findings = _findings(people, told, row, number, views, factors, shares, refused)
     given = {name_of(function) for function in functions_of(extra_factors)}
     missing = tuple(name for name in told.extra_factors if name not in given)
     return Explanation(
         person, joint, frame, when if np.isfinite(when) else None,
-        tuple(here.tolist()) if known else None, sigma if known and np.isfinite(sigma) else None,
+        tuple(place.tolist()) if known else None, sigma if known and np.isfinite(sigma) else None,
         Known(people.known[row, number]).name.lower(), str(people.status[row]), views, *shares,
         findings, factors, missing,
     )  # fmt: skip
@@ -182,88 +170,24 @@ def _row_of(people: Reconstruction, person: int, frame: int | None, time_s: floa
 
 @dataclass(frozen=True)
 class _Detections:
-    """Detections of all people in the surrounding frames, N rows, compared with the reported
-    joints.
-    """
+    """Detections of all people in a frame, N rows."""
 
     people: Reconstruction
     table: ObservationTable
     views: Views
-    seen: Seen
-    """These detections, and unassigned ones near joints."""
+    sigmas_px: Array
+    """(N, J, V) standard deviations of these detections, pixels; 0 without one."""
 
     @classmethod
-    def of(
-        cls,
-        people: Reconstruction,
-        rig: Rig,
-        config: PipelineConfig,
-        detections: DetectionSequence | None,
-    ) -> "_Detections":
+    def of(cls, people: Reconstruction, rig: Rig, config: PipelineConfig) -> "_Detections":
         table = people.observations
         assert table is not None
         rows = table.observations(people.joints, np.nan_to_num(people.time_s))
         views, names = Views.of(rig, rows.time_s), people.joint_names.tolist()
-        pixels = views.pixels(people.joints)[0]
-        if detections is not None:
-            rows = _with_strays(rows, table, views, pixels, detections)
         sigmas = observation_sigmas(
             rows, people.joints, views, config.estimator.observations, names
         )
-        placed = np.asarray(np.isfinite(people.joints).all(axis=-1))[..., None]
-        seen = Seen(pixels - rows.xy, sigmas, np.asarray(rows.seen & placed), table.used)
-        return cls(people, table, views, seen)
-
-
-def _with_strays(
-    rows: Observations,
-    table: ObservationTable,
-    views: Views,
-    pixels: Array,
-    detections: DetectionSequence,
-) -> Observations:
-    """The rows with unassigned detections added for cameras without one: of the same joint, nearest
-    to its position after the most frequent shift in this camera. A misaligned camera has few or no
-    assigned detections.
-    """
-    parts, focal = (
-        list[tuple[Array | Index, ...]](),
-        np.broadcast_to(views.focal, (len(table), len(views))),
-    )
-    for frame in np.unique(
-        table.frame[(table.frame >= 0) & (table.frame < len(detections))]
-    ).tolist():
-        seen, here = detections[frame], np.flatnonzero(table.frame == frame)
-        free = np.flatnonzero(_owner(seen, table, here) < 0)
-        n, k = np.nonzero(table.gate[here][:, seen.joint[free], seen.view[free]] == Gate.NOT_SEEN)
-        row, free = here[n], free[k]
-        place = row, seen.joint[free], seen.view[free]
-        away = (seen.xy[free] - pixels[place]) / focal[row, seen.view[free]][:, None]
-        near = np.linalg.norm(away, axis=-1) < _ASTRAY_RAD
-        parts.append(
-            tuple(column[near] for column in (*place, away, seen.xy[free], seen.confidence[free]))
-        )
-    if len(parts) == 0:
-        return rows
-    row, joint, view, away, at, score = (
-        np.concatenate(column) for column in zip(*parts, strict=True)
-    )
-    xy, confidence = rows.xy.copy(), rows.confidence.copy()
-    for v in np.unique(view).tolist():
-        mine = np.flatnonzero(view == v)
-        off = np.linalg.norm(away[mine] - _commonest(away[mine]), axis=-1)
-        order = np.argsort(-off, kind="stable")  # the nearest is written last
-        mine = mine[order[off[order] < _BESIDE_RAD]]
-        xy[row[mine], joint[mine], v], confidence[row[mine], joint[mine], v] = at[mine], score[mine]
-    return replace(rows, xy=xy, confidence=confidence)
-
-
-def _commonest(ways: Array) -> Array:
-    """(2,) mode of the shifts `ways` (M, 2), radians."""
-    edges = np.arange(-_ASTRAY_RAD, _ASTRAY_RAD + _BIN_RAD, _BIN_RAD)
-    count = np.pad(np.histogram2d(*ways.T, bins=(edges, edges))[0], 1)
-    around = np.lib.stride_tricks.sliding_window_view(count, (3, 3)).sum(axis=(-1, -2))
-    return edges[np.array(np.unravel_index(around.argmax(), around.shape))] + _BIN_RAD / 2
+        return cls(people, table, views, sigmas)
 
 
 def _owner(seen: Detections, table: ObservationTable, rows: Index) -> Index:
@@ -297,7 +221,7 @@ def _view_reasons(
     """
     people, table = all_of_it.people, all_of_it.table
     rows, gates = all_of_it.views.rows(np.array([row])), table.gate[row, joint]
-    sigma, seen = all_of_it.seen.sigmas_px[row, joint], gates != Gate.NOT_SEEN
+    sigma, seen = all_of_it.sigmas_px[row, joint], gates != Gate.NOT_SEEN
     place, evidence = people.joints[row, joint], list[FactorEvidence]()
     solved = [] if graph is None else np.flatnonzero(graph.frames == people.frame[row]).tolist()
     known = None if graph is None or not solved else graph.sources(solved[0], joint)
@@ -421,7 +345,7 @@ def _refused(
         theirs, others = (affinity[ends][owner[other[ends]] == n].sum() for n in (me, owner[k]))
         whose = f"person {people.person[here[owner[k]]]}'s"
         if owner[k] < 0:
-            sigmas, others = all_of_it.seen.sigmas_px[:, joint, view], 0.0
+            sigmas, others = all_of_it.sigmas_px[:, joint, view], 0.0
             usual = sigmas.sum() / max((sigmas > 0).sum(), 1)
             whose = _looks_like(all_of_it, row, joint, view, seen.xy[k], usual, off)
         cause = Cause.FOREIGN if whose else Cause.GATED
@@ -445,7 +369,6 @@ def _findings(
     views: Sequence[ViewReason],
     factors: Sequence[FactorReason],
     shares: tuple[float, float],
-    wrong: WrongView | None,
     refused: Sequence[Finding],
 ) -> tuple[Finding, ...]:
     """Problems of a joint, most serious first."""
@@ -455,15 +378,6 @@ def _findings(
         found.append(Finding(Cause.NOT_SOLVED, (), f"It was not solved: {problem}."))
     told = _checked(people, run, row)
     found += [each for each in told if each.cause == Cause.WRONG_CAMERA]
-    if wrong is not None and all(views[wrong.view].camera not in each.cameras for each in found):
-        name = views[wrong.view].camera
-        (turn, turn_sigma), (shift, shift_sigma) = wrong.turn_deg, wrong.shift_m
-        words = (
-            f"Camera {name} disagrees in everything that it sees around this time: rotated by "
-            f"{turn:.1f} ± {turn_sigma:.1f} degrees and moved by {100 * shift:.0f} ± "
-            f"{100 * shift_sigma:.0f} cm it would fit the others. Check its pose, lens and clock."
-        )
-        found.append(Finding(Cause.WRONG_CAMERA, (name,), words))
     left = [view for view in views if view.gate not in (GATES[Gate.USED], GATES[Gate.NOT_SEEN])]
     suspects = [
         view
@@ -508,8 +422,8 @@ def _findings(
     if len(used) == 0:
         words = (
             f"No camera's detection was used: the body contributes {shares[0]:.0%},"
-            f"{''.join(f' {each.name} {each.share:.0%},' for each in factors)} and and and "
-            "motion from other frames the rest."
+            f"{''.join(f' {each.name} {each.share:.0%},' for each in factors)} and motion from "
+            "other frames the rest."
         )
         found.append(Finding(Cause.PRIOR_ONLY, (), words))
     if len(used) == 1:
@@ -528,22 +442,29 @@ def _problem(people: Reconstruction, told: _Run, row: int, joint: int) -> str:
 
 
 def _checked(people: Reconstruction, told: _Run, row: int) -> list[Finding]:
-    """Cameras that the set-up check excluded from, or doubted in, a row's frame, according to
-    run.json.
+    """What the set-up check found wrong with single cameras, according to run.json: excluded from a
+    row's frame, doubted in it, or used nevertheless.
     """
     found, frame = list[Finding](), people.frame[row]
     for spells, cause, fate in (
         (told.setup.left_out, Cause.WRONG_CAMERA, "left out"),
         (told.setup.doubted, Cause.CONTRADICTION, "doubted"),
     ):
-        cameras = tuple(each.camera for each in spells if each.frames[0] <= frame < each.frames[1])
-        says = "; ".join(each.says for each in told.setup.findings if {*each.cameras} & {*cameras})
-        if cameras:
+        those = tuple(each.camera for each in spells if each.frames[0] <= frame < each.frames[1])
+        says = "; ".join(each.says for each in told.setup.findings if {*each.cameras} & {*those})
+        if those:
             words = (
-                f"In the set-up check, {_cameras(cameras)} "
-                f"{'were' if len(cameras) > 1 else 'was'} {fate}: {says}."
+                f"In the set-up check, {_cameras(those)} "
+                f"{'were' if len(those) > 1 else 'was'} {fate}: {says}."
             )
-            found.append(Finding(cause, cameras, words))
+            found.append(Finding(cause, those, words))
+    judged = {each.camera for each in (*told.setup.left_out, *told.setup.doubted)}
+    assert people.observations is not None
+    for each in told.setup.findings:
+        some = 0 < len(each.cameras) < len(people.observations.view_names)
+        if some and not judged & {*each.cameras}:
+            words = f"The set-up check says: {each.says}."
+            found.append(Finding(Cause.WRONG_CAMERA, tuple(each.cameras), words))
     return found
 
 

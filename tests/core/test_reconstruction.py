@@ -238,7 +238,10 @@ def test_bad_files(tmp_path, kind, sentence):
 def test_bad_run_json(tmp_path):
     people([0]).save(tmp_path)
     (tmp_path / "run.json").write_text("[]")
-    with pytest.raises(InputError, match=r"run.json: must hold an object; restore it or delete it"):
+    with pytest.raises(
+        InputError,
+        match=r"run.json: the file must be an object, got a list of 0; restore it or delete it",
+    ):
         Reconstruction.load(tmp_path)
     (tmp_path / "run.json").unlink()
     assert Reconstruction.load(tmp_path).run == {}
@@ -486,12 +489,12 @@ def test_a_file_that_is_damaged_anywhere_is_one_sentence_or_none(tmp_path, file)
 @pytest.mark.parametrize(
     ("run", "sentence"),
     [
-        ({"configuration": []}, '"configuration" must be an object, got []'),
-        ({"people": 3}, '"people" must be an object, got 3'),
-        ({"seconds": {"vote": "1"}}, "\"seconds.vote\" must be a number, got '1'"),
-        ({"time": {"fps": True}}, '"time.fps" must be a number, got True'),
-        ({"cuts": [1.5]}, '"cuts" must be a list of frame numbers, got [1.5]'),
-        ({"body": 7}, '"body" must be the name of a file or null, got 7'),
+        ({"configuration": []}, "configuration must be an object, got a list of 0"),
+        ({"people": 3}, "people must be an object, got 3"),
+        ({"seconds": {"vote": "1"}}, "seconds.vote must be a number, got text '1'"),
+        ({"time": {"fps": True}}, "time.fps must be a number, got true"),
+        ({"cuts": [1.5]}, "cuts[0] must be a whole number, got 1.5"),
+        ({"body": 7}, "body must be text, got 7"),
         ({"frames": [[0, 1], [2]]}, '"frames" must be [start, stop] or a list of those'),
         (
             {"frames": [0, 10_000_000_000_000]},

@@ -15,6 +15,7 @@ from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.body_window import BodyWindow
 from shapepose_fg.estimation.body_window_graph import BodyGraph, ordering
 from shapepose_fg.estimation.condensed_graph import gtsam_step
+from shapepose_fg.estimation.covariance_factors import covariance_factors, of_lasting_errors
 from shapepose_fg.estimation.graph_covariances import graph_covariances
 from shapepose_fg.estimation.linearisation import ObservationConfig, observation_sigmas
 from shapepose_fg.estimation.motion_model import MotionModel
@@ -103,12 +104,22 @@ def test_covariances_grow_where_errors_last() -> None:
             window, truth, start = _person(seed, lasts=lasts, step_s=0.2)
             state = window.solve(start)
             away, marginals = window.joints(state) - truth, window.covariances(state)
-            factors[lasts].append(marginals.lasting())
+            factors[lasts].append(of_lasting_errors(marginals))
             covariance = factors[lasts][-1] * marginals.joints()
             whitened = np.linalg.solve(covariance, away[..., None])[..., 0]
             inside[lasts].append(np.einsum("tji,tji->tj", away, whitened) < 7.815)
     assert min(factors[True]) > 1.2 * max(factors[False])
     assert all(np.mean(each) > 0.8 for each in inside.values())
+
+
+def test_a_window_with_another_person_s_detections_is_less_sure() -> None:
+    factors = []
+    for frames in (0, 2):
+        window, _, start = _person(0)
+        window.observations.xy[:frames, :8, 0] += 400.0  # another person's arms and head
+        marginals = window.covariances(window.solve(start))
+        factors.append(covariance_factors(marginals, 1.0)[0] / of_lasting_errors(marginals))
+    assert factors[0] < 1.05 and factors[1] > 1.1 * factors[0]
 
 
 def test_marginals_are_those_of_the_graph_and_its_step_moves_nothing() -> None:

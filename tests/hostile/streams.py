@@ -23,7 +23,6 @@ from shapepose_fg.live.inputs import feed
 from shapepose_fg.live.online import OnlineReconstructor
 from shapepose_fg.live.outputs import line_of
 from tests.estimation.test_windows import NobodyFitter
-from tests.hostile.runs import unpack
 from tests.hostile.trying import Prepare
 
 Read = Callable[[], object]
@@ -215,12 +214,11 @@ def live_state(folder: Path, seed: int) -> Read:
     given = lines(seed)
     with _started(seed) as live:
         _push(live, given[:-4])
-        live.save(folder / "state.npz")
-    unpack(folder / "state.npz")
+        live.save(folder / "state")
 
     def read() -> None:
         other = OnlineReconstructor.load(
-            folder / "state.npz", made.rig, workers=1, fitter=NobodyFitter()
+            folder / "state", made.rig, workers=1, fitter=NobodyFitter()
         )
         with other:
             _told(other.people(), "now")

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.validation import describe
 from shapepose_fg.io.config import read_config, toml_text
-from shapepose_fg.io.validation import describe
 from shapepose_fg.pipeline.config import PeopleConfig
 from shapepose_fg.pipeline.pipeline import PipelineConfig
 

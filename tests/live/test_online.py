@@ -152,17 +152,17 @@ def test_a_saved_state_goes_on_as_if_nothing_had_been(start, dance, tmp_path):
     one = start()
     for frame in range(15):
         one.push(dance.recording[frame], frame / 30)
-    one.save(tmp_path / "state.npz")
+    one.save(tmp_path / "state")
     options = {"workers": 1}
-    with OnlineReconstructor.load(tmp_path / "state.npz", dance.scene.rig, **options) as other:
-        other.save(tmp_path / "again.npz")
-        assert (tmp_path / "state.npz").read_bytes() == (tmp_path / "again.npz").read_bytes()
+    with OnlineReconstructor.load(tmp_path / "state", dance.scene.rig, **options) as other:
+        other.save(tmp_path / "again")
+        assert (tmp_path / "state").read_bytes() == (tmp_path / "again").read_bytes()
         for frame in range(15, 22):
             for live in (one, other):
                 live.push(dance.recording[frame], frame / 30)
-        one.save(tmp_path / "state.npz")
-        other.save(tmp_path / "again.npz")
-        assert (tmp_path / "state.npz").read_bytes() == (tmp_path / "again.npz").read_bytes()
+        one.save(tmp_path / "state")
+        other.save(tmp_path / "again")
+        assert (tmp_path / "state").read_bytes() == (tmp_path / "again").read_bytes()
         assert np.array_equal(one.people().joints, other.people().joints, equal_nan=True)
 
 
@@ -170,20 +170,14 @@ def test_a_state_of_something_else_is_refused_in_a_sentence(start, dance, tmp_pa
     live = start()
     for frame in range(3):
         live.push(dance.recording[frame], frame / 30)
-    file = tmp_path / "state.npz"
+    file = tmp_path / "state"
     live.save(file)
     with pytest.raises(InputError, match="saved with other cameras, joints, settings or lag"):
         OnlineReconstructor.load(file, dance.scene.rig, lag_s=0.5, workers=1)
-    arrays = dict(np.load(file))
-    for name, value in (
-        ("identity", arrays["identity"][1:]),
-        ("candidate", arrays["candidate"] + 10**6),
-        ("covariance", arrays["covariance"] * 0),
-        ("before.view", arrays["before.view"].astype(float)),
-        ("seen.pairs", np.repeat(arrays["seen.pairs"][:1], len(arrays["seen.pairs"]), axis=0)),
-    ):
-        np.savez(file, **arrays | {name: value})
-        with pytest.raises(InputError, match=r"state\.npz: .*start without it"):
+    whole = file.read_bytes()
+    for place in (0, 40, len(whole) // 2, len(whole) - 1):
+        file.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
+        with pytest.raises(InputError, match=r"state: cannot be read .*start without it"):
             OnlineReconstructor.load(file, dance.scene.rig, workers=1)
     file.write_bytes(b"no zip")
     with pytest.raises(InputError, match="cannot be read"):

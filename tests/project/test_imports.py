@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[2]
 
 LEVELS = (
     "factors core.arrays core.errors core.rows",
-    "core.storage.files core.decompositions",
+    "core.storage.files core.decompositions core.validation",
     "core.kept_kernels core.bounds",
     "core.compiling",
     "core.compiled",

@@ -14,7 +14,7 @@ from shapepose_fg.cli.terminal import table
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.provenance import versions
 from shapepose_fg.core.storage.files import read_json, write_content
-from shapepose_fg.io.validation import first_problem, key_text
+from shapepose_fg.core.validation import first_problem, key_text
 
 if TYPE_CHECKING:
     from shapepose_fg.cli.reconstruct.run import Ended

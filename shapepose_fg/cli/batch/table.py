@@ -9,8 +9,8 @@ from shapepose_fg.cli.reconstruct.request import Request
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.joint_names import layouts_called
 from shapepose_fg.core.storage.files import is_inside, read_toml
+from shapepose_fg.core.validation import describe
 from shapepose_fg.io.config import config_from
-from shapepose_fg.io.validation import describe
 
 LOG = "log.txt"
 """Name of the log in a recording's folder."""

@@ -11,6 +11,7 @@ import numpy as np
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.lens import Lens
 from shapepose_fg.core.storage.files import LARGE, read_text
+from shapepose_fg.core.validation import is_number
 from shapepose_fg.io.calibration.content import Content
 from shapepose_fg.io.calibration.written import (
     Format,
@@ -20,7 +21,6 @@ from shapepose_fg.io.calibration.written import (
     pose,
     rotation_of,
 )
-from shapepose_fg.io.validation import is_number
 
 FILES = ("cameras.txt", "images.txt")
 _BINARY = ("cameras.bin", "images.bin")

@@ -18,6 +18,7 @@ from shapepose_fg.core.lens import Lens
 from shapepose_fg.core.rig_file import RIG_FORMAT
 from shapepose_fg.core.storage.files import is_inside
 from shapepose_fg.core.trajectory import DRIFT, Trajectory
+from shapepose_fg.core.validation import describe, validated
 from shapepose_fg.io.calibration.content import Content
 from shapepose_fg.io.calibration.written import (
     Format,
@@ -28,7 +29,6 @@ from shapepose_fg.io.calibration.written import (
     intrinsics,
 )
 from shapepose_fg.io.trajectories import read_trajectory
-from shapepose_fg.io.validation import describe, validated
 
 _MATRIX = "write the 3x3 intrinsic matrix row by row, in pixels"
 _CAMERA_FROM_WORLD = "write the 3x4 camera-from-world matrix row by row"

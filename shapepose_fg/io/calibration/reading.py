@@ -11,6 +11,7 @@ import numpy as np
 
 from shapepose_fg.core.camera import Axis, Rig, choose
 from shapepose_fg.core.errors import InputError, naming
+from shapepose_fg.core.validation import describe
 from shapepose_fg.io.calibration.colmap import COLMAP
 from shapepose_fg.io.calibration.content import Content, load
 from shapepose_fg.io.calibration.json_and_toml import JSON_AND_TOML
@@ -19,7 +20,6 @@ from shapepose_fg.io.calibration.written import METRES, Format, Unit, WrittenRig
 from shapepose_fg.io.calibration.xml_files import QUALISYS, VICON
 from shapepose_fg.io.camera_names import listing
 from shapepose_fg.io.trajectories import read_trajectory
-from shapepose_fg.io.validation import describe
 
 FORMATS: tuple[Format, ...] = (*JSON_AND_TOML, QUALISYS, VICON, *OPENCV, COLMAP, ROS)
 """All known formats, in the order in which they are tried."""

@@ -19,8 +19,8 @@ from shapepose_fg.core.decompositions import ROTATION_TOLERANCE, nearest_rotatio
 from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.lens import Lens, padded_distortion
 from shapepose_fg.core.trajectory import Trajectory
+from shapepose_fg.core.validation import describe, numbers
 from shapepose_fg.io.calibration.content import Content
-from shapepose_fg.io.validation import describe, numbers
 
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 """Length of each unit, metres."""

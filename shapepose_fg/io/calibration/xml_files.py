@@ -11,6 +11,7 @@ import numpy as np
 
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.validation import is_number
 from shapepose_fg.io.calibration.content import Content
 from shapepose_fg.io.calibration.written import (
     Format,
@@ -22,7 +23,6 @@ from shapepose_fg.io.calibration.written import (
     rotation_of,
 )
 from shapepose_fg.io.camera_names import listing
-from shapepose_fg.io.validation import is_number
 
 _RESOLUTION = "video_resolution"
 _QTM, _NEXUS = (

@@ -26,6 +26,7 @@ from shapepose_fg.core.storage.files import (
     read_json,
     read_text,
 )
+from shapepose_fg.core.validation import describe, numbers
 from shapepose_fg.io.camera_names import MOST_FRAME, in_order, last_number, numbered
 from shapepose_fg.io.detection_table import BLOCK_FRAMES
 from shapepose_fg.io.detections.people import (
@@ -35,7 +36,6 @@ from shapepose_fg.io.detections.people import (
     frame_blocks,
 )
 from shapepose_fg.io.json_items import JsonItems
-from shapepose_fg.io.validation import describe, numbers
 
 _OPENPOSE, _POSE2SIM, _PICTURES = "OpenPose's JSON", "Pose2Sim's JSON", "MMPose's JSON of pictures"
 _COCO, _ALPHAPOSE, _VIDEO = (

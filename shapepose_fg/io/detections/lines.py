@@ -14,9 +14,9 @@ from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.core.storage.files import parse_json
 from shapepose_fg.core.trajectory import Trajectory
+from shapepose_fg.core.validation import validated
 from shapepose_fg.io.detections.people import OVERSHOOT, joints_of_people
 from shapepose_fg.io.detections.view_streams import undistorted
-from shapepose_fg.io.validation import validated
 
 _CURE = (
     'give {"camera": NAME, "time_s": SECONDS, "people": [{"pose_keypoints_2d": [x, y, score, '

@@ -9,9 +9,9 @@ import numpy as np
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import MIDDLE, read_text
+from shapepose_fg.core.validation import is_number
 from shapepose_fg.io.camera_names import in_order, numbered
 from shapepose_fg.io.detections.people import CameraPeople, frame_blocks
-from shapepose_fg.io.validation import is_number
 
 _YOLO = "YOLO's labels"
 _RERUN = "run yolo pose again with save_txt=True"

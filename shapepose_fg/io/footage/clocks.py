@@ -7,9 +7,9 @@ import numpy as np
 
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_sets import CameraClock
+from shapepose_fg.core.validation import is_number
 from shapepose_fg.io.footage.footage import Footage
 from shapepose_fg.io.footage.places import per_camera
-from shapepose_fg.io.validation import is_number
 
 
 def clocks_of(

@@ -8,17 +8,17 @@ from dataclasses import dataclass
 from enum import StrEnum
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, Field, PositiveInt
 
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import read_json, write_content
+from shapepose_fg.core.validation import validated
 from shapepose_fg.io.footage.places import per_camera
-from shapepose_fg.io.validation import validated
 
 FOOTAGE = "footage.json"
 """Name of the file beside the detections."""
@@ -178,7 +178,7 @@ class CameraFootage:
     """(T,) index of the picture of each frame, counted from 0 in the file; -1 if there is none."""
 
 
-_Size = tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]]
+_Size = tuple[PositiveInt, PositiveInt]
 
 
 class _Camera(BaseModel, extra="forbid"):

@@ -1,0 +1,130 @@
+"""How much larger reported covariances are than those of the graph: errors of detectors last, and
+some detections are another person's.
+
+All covariances of a graph get one factor, by which neither its solution nor its gates change.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import as_file, files
+
+import numpy as np
+
+from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.storage.files import read_json
+from shapepose_fg.estimation.body_window import Marginals
+
+USUAL_M = 0.01
+"""Standard deviation of people whom all views see, metres."""
+REJECTED = 0.1
+"""Share of rejected evidence that means as much as a doubled variance."""
+_NEW, _LASTING = 0.5, 1.8
+"""Factors on the covariances that new and lasting errors of detections leave (`of_lasting_errors`),
+since residuals show fewer of the lasting ones. With them 95 % regions hold in most recordings
+(docs/evaluation/covariances.md)."""
+_LASTS_S, _LASTS, _PRIOR_COUNT = 1.0, 0.4, 20.0
+"""Time apart, s, at which residuals are compared for lasting errors; the usual share of these, and
+its weight as a number of squared standard deviations."""
+_LOOKS = 8
+"""Number of frames, evenly over the window, from which it is taken how much it averages."""
+_ANYWHERE = 1e-3
+"""Information on the place and direction of a body in a frame by itself, 1/m² and 1/rad²."""
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """How much less certain people are than their graphs, because some of their detections are
+    another person's.
+    """
+
+    scale: float
+    """Factor on all variances in single frames."""
+    sigma: float
+    """Exponent of the mean standard deviation of a person's joints in a single frame, over
+    `USUAL_M`."""
+    rejected: float
+    """Exponent of one plus the share of evidence that gates reject, over `REJECTED`."""
+
+    @classmethod
+    @cache
+    def measured(cls) -> "Doubt":
+        """The numbers that ship, measured by `scripts/fit_covariances.py`."""
+        with as_file(files("shapepose_fg.estimation") / "data" / "covariances.json") as path:
+            return cls(**read_json(path)["doubt"])
+
+    def in_frames(self, sigma_m: Array, rejected: Array) -> Array:
+        """(T,) factors on variances in single frames, which show less of who is who."""
+        return self.scale * (sigma_m / USUAL_M) ** self.sigma * self.of_rejected(rejected)
+
+    def of_rejected(self, rejected: Array) -> Array:
+        """Factors on variances for shares of rejected evidence."""
+        return (1 + rejected / REJECTED) ** self.rejected
+
+
+def covariance_factors(marginals: Marginals, noise: float) -> Array:
+    """Factors on variances: (1,) of a person's window, or (T,) of people in single frames.
+
+    `noise` is the standard deviation of the recording's detections over the usual one.
+    """
+    doubt, (sigma_m, told, used) = Doubt.measured(), signs_of_doubt(marginals)
+    if not marginals.window.over_time:
+        return doubt.in_frames(sigma_m, 1 - used / np.maximum(told, 1e-9))
+    rejected = 1 - used.sum(keepdims=True) / max(told.sum(), 1e-9)
+    return noise * of_lasting_errors(marginals) * doubt.of_rejected(rejected)
+
+
+def signs_of_doubt(marginals: Marginals) -> tuple[Array, Array, Array]:
+    """(T,) mean standard deviation of each row's joints, metres; (T,) its evidence, the weights
+    w_ij of Eq. 1, and (T,) the part of it that gates do not reject.
+    """
+    window = marginals.window
+    sigma_m = np.sqrt(np.trace(marginals.joints(), axis1=-2, axis2=-1) / 3).mean(axis=1)
+    told = window.config.weight(window.observations.confidence) * window.observations.seen
+    used = told * window.last.evidence.inlier
+    return sigma_m, told.sum(axis=(1, 2)), used.sum(axis=(1, 2))
+
+
+def of_lasting_errors(marginals: Marginals) -> float:
+    """How many times larger variances of a window are because detectors' errors last.
+
+    Errors that are new in every frame are averaged over time, and leave the covariances of the
+    window. Those that last are not, and leave what the same views cause in a frame by itself. The
+    share that lasts is measured in the window.
+    """
+    window, last = marginals.window, marginals.window.last
+    some = slice(None, None, max(len(window) // _LOOKS, 1))
+    seen = np.asarray(last.evidence.inlier.any(axis=-1))[some]
+    if not seen.any():
+        return 1.0
+    slope, gain = marginals.slopes[some, ..., 10:], last.gain[some]
+    variance = window.variance[some, ..., None, None]
+    (T, J), N = seen.shape, slope.shape[-1]
+    flat = slope.reshape(T, 3 * J, N)
+    views = flat.mT @ (gain / variance @ slope).reshape(flat.shape)
+    prior = _ANYWHERE * np.eye(N)
+    prior[3:-3, 3:-3] += window.energy.priors.precision
+    shown = np.linalg.inv(views + prior)
+    of_body = (flat @ (shown @ views @ shown)).reshape(slope.shape) @ slope.mT
+    kept = np.eye(3) - gain
+    alone = np.trace(kept @ of_body @ kept.mT + variance * kept, axis1=-2, axis2=-1)
+    over_time = np.trace(marginals.joints()[some], axis1=-2, axis2=-1)
+    share = _share_lasting(marginals)
+    return _NEW * (1 - share) + _LASTING * share * float(
+        np.exp(np.log(alone / over_time)[seen].mean())
+    )
+
+
+def _share_lasting(marginals: Marginals) -> float:
+    """Share of the detections' variance that lasts: the correlation of residuals that are
+    `_LASTS_S` apart.
+    """
+    window, evidence = marginals.window, marginals.window.last.evidence
+    sigma = np.where(evidence.inlier, window.sigmas_px, np.inf)[..., None]
+    ratio = np.nan_to_num(evidence.residual_px) / sigma
+    later = np.searchsorted(window.times_s, window.times_s + _LASTS_S - 1e-3)
+    now = np.flatnonzero(later < len(window))
+    first, second = ratio[now], ratio[later[now]]
+    both = (first != 0) & (second != 0)
+    product = (first * second)[both].sum() + _PRIOR_COUNT * _LASTS
+    squared = (first**2 + second**2)[both].sum() / 2 + _PRIOR_COUNT
+    return float(np.clip(product / squared, 0.0, 1.0))
