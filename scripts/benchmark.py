@@ -44,7 +44,7 @@ from shapepose_fg.simulation.detector import DetectorConfig
 from shapepose_fg.simulation.mocap import Mocap
 from shapepose_fg.simulation.sequences import sequence
 
-HERE = Path(__file__).parents[1]
+HERE = Path(__file__).parent.parent
 CASES = {
     "recording": ("short", ()),
     "frame by frame": ("short", ("--no-temporal",)),

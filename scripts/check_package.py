@@ -21,7 +21,7 @@ import time
 import venv
 from pathlib import Path
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parent.parent
 USE = """
 import sys
 from pathlib import Path

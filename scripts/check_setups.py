@@ -5,7 +5,8 @@ detectors.
 
 Simulated rooms with 3 to 6 cameras and 1 to 8 people, 6 s each. In every room the same kinds of
 faults are simulated with a detector of typical errors; detectors with lasting biases are simulated
-without faults. Run it from a clone. docs/evaluation/cameras.md has the results. About a minute
+without faults. Run it from a clone. It prints the tables of docs/evaluation/cameras.md, with --read
+of files that it wrote. About a minute
 and a half per room on one core.
 """
 
@@ -50,9 +51,12 @@ def main() -> None:
     parser.add_argument("--rigs", default="0:20", help="which rooms, first:stop")
     parser.add_argument("--output", type=Path, help="CSV file with a line for each check")
     parser.add_argument("--only", choices=("faults", "biases"))
+    parser.add_argument("--read", nargs="*", type=Path, help="such files, instead of rooms")
     arguments = parser.parse_args()
-    rows, first, stop = list[tuple[object, ...]](), *map(int, arguments.rigs.split(":"))
-    for seed in range(first, stop):
+    rows = list[list[object]]()
+    for file in arguments.read or ():
+        rows += csv.reader(file.open(newline=""))
+    for seed in () if rows else range(*map(int, arguments.rigs.split(":"))):
         rng = np.random.default_rng([seed, 20])
         people, cameras = int(rng.choice([1, 2, 3, 4, 6, 8])), int(rng.integers(3, 7))
         scene = built_in_scene(seed, people=people, cameras=cameras, frames=FRAMES)
@@ -64,31 +68,25 @@ def main() -> None:
             possible = [*found, *(other for f in found[:1] for other in f.instead)]
             first_named, named = each.named_by(found[:1]), each.named_by(possible)
             rows.append(
-                (*room, "fault", each.what, first_named and len(found) == 1, named, _words(found))
+                [*room, "fault", each.what, first_named and len(found) == 1, named, _words(found)]
             )
             print(*rows[-1], flush=True)
         for what, detections in _biased(seen, scene, rng) if arguments.only != "faults" else ():
             found = check_setup(detections, scene.rig).findings
-            rows.append((*room, "sound", what, len(found) > 0, False, _words(found)))
+            rows.append([*room, "sound", what, len(found) > 0, False, _words(found)])
             print(*rows[-1], flush=True)
     if arguments.output is not None:
         with arguments.output.open("w", newline="") as file:
             csv.writer(file).writerows(rows)
-    counts = defaultdict[tuple[object, object], list[tuple[bool, bool]]](list)
-    for *_, kind, what, first_named, named, _said in rows:
-        for name in (what, "all"):
-            counts[kind, name].append((bool(first_named), bool(named)))
-    for (kind, what), each in counts.items():
-        one, either = np.sum(each, axis=0)
-        print(
-            kind,
-            what,
-            len(each),
-            "accused" if kind == "sound" else "named first",
-            one,
-            "named",
-            either,
-        )
+    for kind, titles in (("fault", "named first | named |"), ("sound", "accused |")):
+        counts = defaultdict[str, list[list[bool]]](list)
+        for *_, of, what, first_named, named, _said in rows:
+            for name in (what, f"all {kind}") if of == kind else ():
+                counts[str(name)].append([str(each) == "True" for each in (first_named, named)])
+        print(f"\n| {kind} | checks | {titles}\n|---|{'---|' * titles.count('|')}---|")
+        for name, each in counts.items():
+            told = np.sum(each, axis=0)[: titles.count("|")]
+            print(f"| {name} | {len(each)} | {' | '.join(map(str, told))} |")
 
 
 def _of_several(finding: Finding) -> bool:

@@ -12,7 +12,7 @@ from typing import Any
 
 from packaging.requirements import Requirement
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parent.parent
 PAGE = ROOT / "docs" / "licences.md"
 EXTRAS = (
     "detect",

@@ -24,7 +24,7 @@ from shapepose_fg.simulation.files import truth_of
 from shapepose_fg.simulation.mocap import Mocap
 from shapepose_fg.simulation.sequences import sequence
 
-PAGE = Path(__file__).parents[1] / "docs" / "evaluation" / "angles.md"
+PAGE = Path(__file__).parent.parent / "docs" / "evaluation" / "angles.md"
 FPS, SECONDS = 15.0, 10
 RECORDINGS = {"salsa": (6, 3), "crossing": (4,), "crowd": (6, 4)}
 """Numbers of cameras in front of which each sequence is simulated."""

@@ -32,7 +32,7 @@ from shapepose_fg.simulation.mocap import Mocap
 from shapepose_fg.simulation.sequences import SEQUENCES, Split, sequence
 from shapepose_fg.simulation.training.motions import split_of
 
-PAGE = Path(__file__).parents[1] / "docs" / "evaluation" / "people.md"
+PAGE = Path(__file__).parent.parent / "docs" / "evaluation" / "people.md"
 OVER_TIME = PipelineConfig()
 MODES = {"with time": OVER_TIME, "without time": replace(OVER_TIME, temporal=False)}
 SEGMENTS: dict[Split, dict[str, tuple[int, int]]] = {

@@ -63,14 +63,14 @@ def _distances(dimensions: int) -> _Distances:
         up = np.sin(elevation)[:, None] * ahead + np.cos(elevation)[:, None] * np.array(
             [0.0, 1.0, 0.0]
         )
-        points = np.einsum("npx,nyx->npy", points, np.stack([right, up], axis=1))
+        points = points @ np.stack([right, up], axis=2)
     points = points + _NOISE_M * rng.normal(size=points.shape)
     first, second = np.triu_indices(len(BODY_POINTS), 1)
-    apart = np.linalg.norm(points[:, first] - points[:, second], axis=-1)
-    logs = np.log(np.maximum(apart, 1e-9))
-    logs -= logs.mean(axis=1, keepdims=True)
+    squared = sum(np.square(x[first] - x[second]) for x in points.T)  # fast along the poses
+    logs = np.log(np.maximum(squared, 1e-18)) / 2
+    logs -= logs.mean(axis=0)
     mean, sigma = np.zeros((len(BODY_POINTS),) * 2), np.eye(len(BODY_POINTS))
-    for matrix, values in ((mean, logs.mean(axis=0)), (sigma, logs.std(axis=0))):
+    for matrix, values in ((mean, logs.mean(axis=1)), (sigma, logs.std(axis=1))):
         matrix[first, second] = matrix[second, first] = values
     return _Distances(mean, sigma)
 

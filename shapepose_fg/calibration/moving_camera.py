@@ -12,10 +12,11 @@ from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
+from scipy.special import gammaincinv
 
-from shapepose_fg.calibration.adjustment import Adjusted
+from shapepose_fg.body.model.rotation import hat
+from shapepose_fg.calibration.adjustment import Adjusted, Freedom
 from shapepose_fg.calibration.from_people import Undetermined
 from shapepose_fg.calibration.people import MIN_DEPTH_M, Footage, People
 from shapepose_fg.calibration.refinement import dilution
@@ -23,7 +24,9 @@ from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Camera, Rig, Views
 from shapepose_fg.core.decompositions import nearest_rotation, rigid
 from shapepose_fg.core.detections import DetectionSequence
+from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.trajectory import Trajectory
+from shapepose_fg.estimation.trajectory_graph import ANYWHERE_M
 from shapepose_fg.setup_check.fit import POSE, Q, by_parameters, seen_by
 from shapepose_fg.setup_check.matching import Sightings, follow, median_of
 
@@ -42,12 +45,11 @@ _PEAKS, _TRIED = 3, 60
 """Number of offsets for each pair of tracks, and of all registrations, that are tried."""
 _OTHER_S, _OTHER_DEG = 1.0, 10.0
 """Distances above which two starts are different, s and degrees."""
-_LEAST_SHARE, _LEAST_LEAD, _LEAST_PEOPLE = 0.5, 1.25, 25
+_LEAST_SHARE, _LEAST_LEAD, _LEAST_PEOPLE = 0.7, 1.25, 25
 """Minimum share of the people in view that agree with the start, minimum ratio of their number to
 that of any other start, and minimum number."""
-_KNOT_S, _DRIFT_M, _DRIFT_RAD = 5.0, 0.005, np.radians(0.1)
-"""Time between the knots between which an odometry drifts linearly, s, and minimum drift between
-them, m and rad."""
+_KNOT_S = 3.0
+"""Time between the knots between which an odometry drifts linearly, s."""
 _VIEWS_CHANGE = 0.5
 """Ratio of the correlated errors of a detector that count as one in a camera that moves to those in
 a fixed one; it sees people from changing directions (scripts/check_phones.py)."""
@@ -56,8 +58,9 @@ _DRIFTS = np.log(3.0)
 _LEVEL_RAD, _TILT_RAD = np.radians(6.0), np.radians(0.5)
 """Maximum deviation from the vertical of a log's axis that is along gravity, and the standard
 deviation of that of the world's vertical axis."""
-_STEPS = 12
-"""Maximum number of evaluations in each round of adjustment."""
+_STEPS, _CONVERGED = 15, 0.01
+"""Maximum number of steps in each round of adjustment, and the change of all parameters below which
+it has converged, prior standard deviations."""
 _SAMPLES, _TINY, _LEAST_VARIANCE = 30, 1e-4, 1e-6
 """Number of frames for which the uncertainty of poses is averaged; step of numerical derivatives;
 and minimum share of a parameter's variance that is an error of its own."""
@@ -66,9 +69,8 @@ _WIDTH = 2.385
 _RIGID, _LONG_M, _FEWEST = 0.1, 0.25, 3
 """Maximum relative variation of the distance of two joints of a bone, its minimum, m, and minimum
 number of bones that give the distance of a person."""
-_SIGMA_M, _MOUNT_RAD = 0.03, np.radians(0.5)
-"""Standard deviation of a detected joint from its position by other cameras, m, and of the
-principal point of a lens without calibration, as an angle."""
+_SURE = 0.95
+"""Probability with which the errors of the poses are below the reported bounds."""
 _QUARTERS = rigid(
     Rotation.from_euler("z", [[90 * n] for n in range(4)], degrees=True).as_matrix(),
     np.zeros((4, 3)),
@@ -77,7 +79,7 @@ _QUARTERS = rigid(
 
 
 @dataclass(frozen=True)
-class Placed:
+class Placed(Rows):
     """People at regular moments, in three dimensions, with their tracks."""
 
     time_s: Array
@@ -91,7 +93,7 @@ class Placed:
     track: Index
     """(P,) track of each."""
     spread: Array
-    """(M, P, J, 3) changes of the positions by one standard deviation of each of M independent
+    """(P, J, 3, M) changes of the positions by one standard deviation of each of M independent
     errors of the fixed cameras, metres."""
 
     @classmethod
@@ -111,7 +113,7 @@ class Placed:
         before[other], after[one] = one, other
         lasts = np.maximum(time_s[after] - time_s[before], _STEP_S / 2)[:, None, None]
         velocity = np.nan_to_num((points[after] - points[before]) / lasts)
-        spread = np.zeros((0, *points.shape)) if spread is None else spread
+        spread = np.zeros((*points.shape, 0)) if spread is None else spread
         return cls(time_s, moment, points, velocity, track, spread)
 
     @classmethod
@@ -144,7 +146,7 @@ class Placed:
 
 
 def _moved_by(people: People, found: Adjusted) -> Array:
-    """(M, P, J, 3) changes of people's joints, m, by one standard deviation of each of the M
+    """(P, J, 3, M) changes of people's joints, m, by one standard deviation of each of the M
     independent errors of the cameras that place them.
     """
     rig, size = found.rig, int(np.prod(found.covariance.shape[:2]))
@@ -163,7 +165,7 @@ def _moved_by(people: People, found: Adjusted) -> Array:
     inverse = np.linalg.pinv(np.einsum("pjvri,pjvrk->pjik", by_point, by_point), hermitian=True)
     errors = errors.reshape(len(errors), *found.covariance.shape[:2])[..., :Q]
     missed = np.einsum("pjvrq,mvq->mpjvr", by_camera, errors)
-    return -np.einsum("pjik,pjvrk,mpjvr->mpji", inverse, by_point, missed, optimize=True)
+    return -np.einsum("pjik,pjvrk,mpjvr->pjim", inverse, by_point, missed, optimize=True)
 
 
 @dataclass(frozen=True)
@@ -178,6 +180,8 @@ class Start:
     """Time of the fixed cameras' clock at time 0 of the camera's own, s."""
     focal: float = 1.0
     """Ratio of the focal length to the given one."""
+    centre: Array = field(default_factory=lambda: np.zeros(2))
+    """(2,) shift of the principal point, focal lengths."""
     stretch: float = 1.0
     """Ratio of the world's unit to that of the odometry."""
     knots_s: Array = field(default_factory=lambda: np.zeros(1))
@@ -189,23 +193,32 @@ class Start:
     share: float = 0.0
     """Share of the people in view that agree."""
     sigma_turn_deg: float = np.inf
-    """Standard deviation of the camera's rotations, degrees, errors of the fixed cameras, of the
-    lens and of the drift included."""
+    """Standard deviation of the camera's rotations, degrees, root mean square over the path; errors
+    of the fixed cameras, of the lens and of the drift included."""
     sigma_move_m: float = np.inf
-    """Standard deviation of the camera's positions, metres."""
+    """Standard deviation of the camera's positions, metres, root mean square over the path."""
+    within_deg: float = np.inf
+    """Bound of the root mean square error of the rotations, degrees, with a probability of 95 %."""
+    within_m: float = np.inf
+    """Bound of the root mean square error of the positions, metres, with a probability of 95 %."""
 
     def carrier(self, oTb: Array, own_s: Array) -> Array:
-        """(F, 4, 4) poses of the carrier in the world, from those in its odometry at times (F,)."""
+        """(F, 4, 4) poses of the carrier in the world, along its odometry at times (F,), without
+        the drift: a drift of the rotation turns all later steps.
+        """
         drift = np.stack([np.interp(own_s, self.knots_s, each) for each in self.drift.T], axis=-1)
-        wRo, at = self.wTo[:3, :3], self.stretch * oTb[:, :3, 3]
-        turn = Rotation.from_rotvec(drift[:, :3]).as_matrix()
-        return rigid(turn @ wRo @ oTb[:, :3, :3], at @ wRo.T + self.wTo[:3, 3] + drift[:, 3:])
+        wRo, turn = self.wTo[:3, :3], Rotation.from_rotvec(drift[:, :3]).as_matrix()
+        steps = self.stretch * np.diff(oTb[:, :3, 3], axis=0) @ wRo.T
+        first = self.stretch * wRo @ oTb[0, :3, 3] + self.wTo[:3, 3]
+        path = np.cumsum(np.vstack([first, np.einsum("fij,fj->fi", turn[1:], steps)]), axis=0)
+        return rigid(turn @ wRo @ oTb[:, :3, :3], path + drift[:, 3:])
 
     def of(self, camera: Camera, odometry: Trajectory) -> tuple[Camera, Trajectory]:
         """The camera on its trajectory, in the world and on the clock of the fixed cameras, without
         the drift that is known.
         """
         K = camera.K.copy()
+        K[:2, 2] += K[:2, :2] @ self.centre
         K[[0, 1], [0, 1]] *= self.focal
         wTb = self.carrier(odometry.wTb, odometry.time_s)
         moved = replace(odometry, time_s=odometry.time_s + self.offset_s, wTb=wTb)
@@ -216,7 +229,7 @@ class Start:
         return (
             f"camera {name}: its trajectory starts {self.offset_s:+.3f} s after the first camera; "
             f"{self.share:.0%} of the people in its view agree; its poses are known to "
-            f"{self.within()} (two sigma)"
+            f"{self.within()} ({_SURE:.0%})"
         )
 
     def as_dict(self) -> dict[str, float]:
@@ -226,23 +239,25 @@ class Start:
             "agreeing": round(self.share, 3),
             "sigma_turn_deg": round(self.sigma_turn_deg, 3),
             "sigma_move_mm": round(1e3 * self.sigma_move_m, 1),
+            "within_deg": round(self.within_deg, 3),
+            "within_mm": round(1e3 * self.within_m, 1),
         }
 
     def refusal(self, name: str, most_deg: float, most_m: float) -> str | None:
-        """A sentence on camera `name`, with the cure, if two standard deviations of its poses
-        exceed `most_deg` degrees or `most_m` metres; else None.
+        """A sentence on camera `name`, with the cure, if the bounds of its poses exceed `most_deg`
+        degrees or `most_m` metres; else None.
         """
-        if 2 * self.sigma_turn_deg <= most_deg and 2 * self.sigma_move_m <= most_m:
+        if self.within_deg <= most_deg and self.within_m <= most_m:
             return None
         return (
-            f"camera {name}: its poses are known to {self.within()} only (two sigma), but "
-            f"{most_deg:g} degrees and {1e3 * most_m:g} mm are asked; calibrate the lenses, film "
-            "two people, or accept the cameras as they are"
+            f"camera {name}: its poses are known to {self.within()} only ({_SURE:.0%}), but "
+            f"{most_deg:g} degrees and {1e3 * most_m:g} mm are asked (--tolerance); give the "
+            "lenses of all cameras, film longer or two people, or accept the cameras as they are"
         )
 
     def within(self) -> str:
-        """Two standard deviations of the poses, in words."""
-        return f"{2 * self.sigma_turn_deg:.1f} degrees and {2e3 * self.sigma_move_m:.0f} mm"
+        """The bounds of the poses, in words."""
+        return f"{self.within_deg:.1f} degrees and {1e3 * self.within_m:.0f} mm"
 
 
 @dataclass(frozen=True)
@@ -279,12 +294,13 @@ class Filmed:
         self,
         placed: Placed,
         most_s: float,
-        focal: bool,
+        lens: Freedom,
         sigma_scale: float = 0.0,
     ) -> Start:
-        """The start on which most people agree, up to `most_s` from the fixed cameras' clock;
-        `focal`: whether the focal length and the principal point are unknown, too; `sigma_scale`:
-        standard deviation of the world's scale, as a share.
+        """The start on which most people agree, up to `most_s` from the fixed cameras' clock.
+
+        `lens` has the prior standard deviations of the focal length and of the principal point;
+        `sigma_scale` is that of the world's scale, as a share.
 
         Raises Undetermined, with a sentence, if it is ambiguous.
         """
@@ -305,7 +321,7 @@ class Filmed:
         for each in tried:
             rival = each.agreeing > tried[0].agreeing / 2 and len(best) < _PEAKS
             if rival and all(self._differ(each, other) for other in best):
-                best.append(self._refined(each, placed, most_s, focal, sigma_scale))
+                best.append(self._refined(each, placed, most_s, lens, sigma_scale))
         best.sort(key=lambda each: -each.agreeing)
         if not best or best[0].agreeing < _LEAST_PEOPLE or best[0].share < _LEAST_SHARE:
             raise refuse("no start of its trajectory agrees with the people of the other cameras")
@@ -318,13 +334,13 @@ class Filmed:
     def _differ(self, one: Start, other: Start) -> bool:
         """Whether two starts are different poses or times of the camera."""
         middle = len(self.own_s) // 2
-        a, b = (self._placed(each, [middle])[0, :3, :3] for each in (one, other))
+        a, b = (self._placed(each)[middle, :3, :3] for each in (one, other))
         turn = np.degrees(Rotation.from_matrix(a.T @ b).magnitude())
         return bool(abs(one.offset_s - other.offset_s) > _OTHER_S or turn > _OTHER_DEG)
 
-    def _placed(self, start: Start, frame: Index | list[int]) -> Array:
-        """(N, 4, 4) world from camera in some frames (N,)."""
-        return start.carrier(self._oTb[frame], self.own_s[frame]) @ start.bTc
+    def _placed(self, start: Start) -> Array:
+        """(F, 4, 4) world from camera in all frames."""
+        return start.carrier(self._oTb, self.own_s) @ start.bTc
 
     @cached_property
     def _oTb(self) -> Array:
@@ -381,7 +397,7 @@ class Filmed:
         at = self._seen(start, placed, rows, frame)
         depth = median_of(at[..., 2], 5)
         with np.errstate(divide="ignore", invalid="ignore"):
-            xy = at[..., :2] / at[..., 2:] * start.focal
+            xy = at[..., :2] / at[..., 2:] * start.focal + start.centre
             away = np.linalg.norm(self.rays[frame][..., :2] - xy[:, None], axis=-1)
             away = median_of(away, 5) * depth[:, None] / start.focal
             middle = np.stack([median_of(each, 5) for each in np.moveaxis(xy, 2, 0)], axis=-1)
@@ -396,7 +412,7 @@ class Filmed:
         """(N, J, 3) joints of placed people in the camera, at the times of the frames (N,)."""
         later = self.own_s[frame] + start.offset_s - placed.time_s[rows]
         points = placed.points[rows] + later[:, None, None] * placed.velocity[rows]
-        wTc = self._placed(start, frame)
+        wTc = self._placed(start)[frame]
         return (points - wTc[:, None, :3, 3]) @ wTc[:, :3, :3]
 
     def _judged(self, start: Start, placed: Placed, near_m: float) -> Start:
@@ -406,180 +422,193 @@ class Filmed:
         return replace(start, agreeing=float(agreeing.sum()), share=share)
 
     def _refined(
-        self, start: Start, placed: Placed, most_s: float, focal: bool, sigma_scale: float
+        self, start: Start, placed: Placed, most_s: float, lens: Freedom, sigma_scale: float
     ) -> Start:
         """The start adjusted to the projections of the people that agree."""
-        free = np.array([True] * 6 + [most_s > 0] + [focal] * 3 + [True])
-        lasts, sigma_m, bTc = self.own_s[-1] - self.own_s[0], _SIGMA_M, start.bTc
-        for number, near_m in enumerate(_NEAR_M):
+        unit, centre = (
+            np.hypot(sigma_scale, self.trajectory.drift),
+            lens.centre_px / self.camera.K[0, 0],
+        )
+        clock = [float(most_s > 0)]
+        sigmas = [_TILT_RAD, _TILT_RAD, 1.0, *[ANYWHERE_M] * 3, unit, *[centre] * 2, *clock]
+        for near_m in _NEAR_M:
             rows, frame, person, away, _ = self._matched(start, placed, near_m)
             used = away < near_m
             if used.sum() < _LEAST_PEOPLE:
-                return self._judged(start, placed, near_m)
-            knots = 1 + int(np.ceil(lasts / _KNOT_S)) if number == len(_NEAR_M) - 1 else 1
-            knots_s = np.linspace(self.own_s[0], self.own_s[-1], knots)
-            given = replace(start, bTc=bTc, knots_s=knots_s, drift=np.zeros((knots, 6)))
-            people = (rows[used], frame[used], person[used])
-            fit = _Fit(self, placed, given, free, sigma_m, sigma_scale, *people)
-            start, sigma_m = fit.solved()
+                break
+            count = np.ceil((self.own_s[-1] - self.own_s[0]) / _KNOT_S) * (near_m == _NEAR_M[-1])
+            knots_s = np.linspace(self.own_s[0], self.own_s[-1], 1 + int(count))
+            given = replace(start, centre=np.zeros(2), knots_s=knots_s)
+            frame, rays = frame[used], self.rays[frame[used], person[used]]
+            prior = np.array([*sigmas, lens.focal])
+            start = _Fit(self, given, placed.rows(rows[used]), frame, rays, prior).solved()
         return self._judged(start, placed, _NEAR_M[-1])
 
 
 @dataclass(frozen=True)
 class _Fit:
-    """Adjustment of a start: rotation and translation about the middle of the path, offset, log of
-    the focal length, rotation of the camera about its x and y axes, which is the effect of an
-    unknown principal point, log of the odometry's unit, and its drift at the knots.
+    """Adjustment of a start, of the drift of the odometry and of the errors of the fixed cameras.
+
+    Parameters are in prior standard deviations: rotation and translation in the world about the
+    middle of the path, log of the odometry's unit, principal point, offset, log of the focal
+    length, steps of the drift from knot to knot, and errors of the fixed cameras
+    (`Placed.spread`).
     """
 
     filmed: Filmed
-    placed: Placed
     start: Start
-    free: Mask
-    """(11,) mask of the parameters before the drift that are adjusted."""
-    sigma_m: float
-    """Standard deviation of a joint, across the ray, m."""
-    sigma_scale: float
-    rows: Index
+    """The start before the adjustment."""
+    placed: Placed
+    """(N,) people."""
     frame: Index
-    person: Index
+    """(N,) frames in which the camera sees them."""
+    rays: Array
+    """(N, J, 3) their joints in the camera, at depth 1."""
+    sigmas: Array
+    """(11,) prior standard deviations of the parameters before the drift; 0: fixed."""
+
+    @cached_property
+    def _middle(self) -> Array:
+        """(3,) middle of the path, in the odometry."""
+        return np.asarray(self.filmed._oTb[self.frame, :3, 3].mean(axis=0))
+
+    @cached_property
+    def _level(self) -> "Start":
+        """The start, turned so that an axis of the log that is nearly vertical is vertical."""
+        wRo = self.start.wTo[:3, :3]
+        axis = int(np.argmax(np.abs(wRo[2])))
+        up = [0.0, 0.0, np.sign(wRo[2, axis])]
+        turn = Rotation.align_vectors([up], [wRo[:, axis]])[0]
+        if turn.magnitude() > _LEVEL_RAD:
+            return self.start
+        at = self.start.stretch * (wRo - turn.as_matrix() @ wRo) @ self._middle
+        return replace(self.start, wTo=rigid(turn.as_matrix() @ wRo, self.start.wTo[:3, 3] + at))
 
     def moved(self, x: Array) -> Start:
-        """The start changed by the free parameters, and by the drift at the knots but the first."""
-        every, given, count = np.zeros(len(self.free)), self.start, int(self.free.sum())
-        every[self.free] = x[:count]
-        wRo, middle = given.wTo[:3, :3], self.filmed._oTb[self.frame, :3, 3].mean(axis=0)
-        turn, mount = Rotation.from_rotvec([every[:3], [*every[8:10], 0.0]]).as_matrix()
-        stretch = given.stretch * float(np.exp(every[10]))
-        at = given.wTo[:3, 3] + given.stretch * wRo @ middle + every[3:6]
+        """The start changed by the parameters."""
+        given, each = self._level, self.sigmas * x[: len(self.sigmas)]
+        wRo = given.wTo[:3, :3]
+        turn = Rotation.from_rotvec(each[:3]).as_matrix()
+        stretch = given.stretch * float(np.exp(each[6]))
+        at = given.wTo[:3, 3] + given.stretch * wRo @ self._middle + each[3:6]
+        steps = self._steps * x[len(each) :][: self._steps.size].reshape(self._steps.shape)
         return replace(
             given,
-            wTo=rigid(turn @ wRo, at - stretch * turn @ wRo @ middle),
-            bTc=given.bTc @ rigid(mount, np.zeros(3)),
-            offset_s=given.offset_s + every[6],
-            focal=given.focal * float(np.exp(every[7])),
+            wTo=rigid(turn @ wRo, at - stretch * turn @ wRo @ self._middle),
+            centre=given.centre + each[7:9],
+            offset_s=given.offset_s + each[9],
+            focal=given.focal * float(np.exp(each[10])),
             stretch=stretch,
-            drift=self._drift(x[count:]),
+            drift=np.vstack([np.zeros(6), np.cumsum(steps, axis=0)]),
         )
-
-    def _drift(self, x: Array) -> Array:
-        """(K, 6) drift at the knots, from steps in standard deviations."""
-        drift = np.zeros((len(self.start.knots_s), 6))
-        drift[1:, self._kinds] = np.cumsum(x.reshape(-1, len(self._kinds)) * self._steps, axis=0)
-        return drift
-
-    @cached_property
-    def _axis(self) -> int:
-        """Axis of the log that is next to the vertical."""
-        return int(np.argmax(np.abs(self.start.wTo[2, :3])))
-
-    @cached_property
-    def _level(self) -> bool:
-        """Whether the log has an axis along gravity: one is vertical within a few degrees."""
-        return bool(abs(self.start.wTo[2, self._axis]) > np.cos(_LEVEL_RAD))
-
-    @cached_property
-    def _kinds(self) -> list[int]:
-        """Rotations and translations that drift; gravity keeps two of the former."""
-        return [2, 3, 4, 5] if self._level else list(range(6))
 
     @cached_property
     def _steps(self) -> Array:
-        """(K - 1, D) standard deviations of the drift between knots."""
-        filmed, own_s, knots_s = self.filmed, self.filmed.own_s, self.start.knots_s
-        grown = np.cumsum(filmed.trajectory.drifted(filmed._oTb, own_s)[:, [0, 3], [0, 3]], axis=0)
-        moved = np.diff(filmed.trajectory.at(knots_s)[:, :3, 3], axis=0)
-        turn, move = (np.diff(np.interp(knots_s, own_s[1:], each)) for each in grown.T)
-        turn = turn + _DRIFT_RAD**2
-        move = move + turn * (moved**2).sum(axis=1) + _DRIFT_M**2
-        return np.sqrt(np.stack([turn] * 3 + [move] * 3, axis=-1))[:, self._kinds]
-
-    def solved(self) -> tuple[Start, float]:
-        """The adjusted start, and the standard deviation of a joint."""
-        filmed, free = self.filmed, int(self.free.sum())
-        rays = filmed.rays[self.frame, self.person]
-        known = np.isfinite(rays[..., 0] + self.placed.points[self.rows][..., 0])
-        count = _VIEWS_CHANGE * dilution(self.placed.time_s[self.rows])
-        mount = np.flatnonzero(np.isin(np.flatnonzero(self.free), (8, 9)))
-        sigma_scale = np.hypot(self.sigma_scale, filmed.trajectory.drift)
-
-        def data(now: Start, placed: Placed) -> Array:
-            at = filmed._seen(now, placed, self.rows, self.frame)
-            depth = np.maximum(at[known][:, 2:], MIN_DEPTH_M)
-            return np.ravel(rays[known][:, :2] / now.focal * depth - at[known][:, :2])
-
-        def residuals(x: Array) -> Array:
-            now = self.moved(x)
-            tilt = now.wTo[:2, self._axis] / _TILT_RAD * self._level
-            unit = np.log(now.stretch) / sigma_scale
-            priors = [x[mount] / _MOUNT_RAD, tilt, [unit], x[free:]]
-            away = data(now, self.placed) / self.sigma_m
-            return np.concatenate([away, np.sqrt(count) * np.concatenate(priors)])
-
-        def loss(square: Array) -> Array:
-            """Cauchy's kernel for the joints only, and its derivatives."""
-            rho = np.stack([square, np.ones_like(square), np.zeros_like(square)])
-            z = square[:joints] / _WIDTH**2
-            rho[:, :joints] = [_WIDTH**2 * np.log1p(z), 1 / (1 + z), -1 / (_WIDTH * (1 + z)) ** 2]
-            return rho
-
-        begin, joints = np.zeros(free + self._steps.size), 2 * int(known.sum())
-        fit = least_squares(residuals, begin, x_scale=0.01, loss=loss, max_nfev=_STEPS)  # type: ignore[arg-type]
-        sigma = float(self.sigma_m * np.median(np.abs(fit.fun[:joints])) / 0.6745)
-        robust = np.stack([loss(fit.fun**2)[n, :joints] for n in (1, 2)])
-        weight = np.sqrt(np.maximum(robust[0] + 2 * robust[1] * fit.fun[:joints] ** 2, 0.0))
-        information = fit.jac.T @ fit.jac / count
-        kinds = np.r_[np.full(free, -1), np.tile(np.array(self._kinds) // 3, len(self._steps))]
-        level, covariance = _drift_levels(information, fit.x, kinds)
-        now = self.moved(x := covariance @ information @ fit.x)
-        missed = data(now, self.placed)
-        # A constant error of the fixed cameras changes all joints, and so the parameters.
-        into = covariance @ fit.jac[:joints].T * weight / count / self.sigma_m
-        others = [replace(self.placed, points=self.placed.points + e) for e in self.placed.spread]
-        changed = [into @ (data(now, each) - missed) for each in others]
-        errors = [covariance, *(np.outer(each, each) for each in changed)]
-        turn, move = self._spread(x, np.sum(errors, axis=0), level)
-        sigmas = {"sigma_turn_deg": np.degrees(turn), "sigma_move_m": move}
-        return replace(now, **sigmas), sigma
-
-    def _spread(self, x: Array, covariance: Array, level: Array) -> tuple[float, float]:
-        """Standard deviations of the camera's poses, rad and m, root mean square over the path, for
-        a covariance of the parameters `x`.
+        """(K - 1, 6) standard deviations of the drift between knots; gravity keeps two rotations
+        of a levelled log.
         """
-        frames = np.unique(np.linspace(0, len(self.filmed.own_s) - 1, _SAMPLES).astype(np.intp))
-        poses = self.filmed._placed(self.moved(x), frames)
-        changes = np.empty((len(frames), 6, len(x)))
-        for n, step in enumerate(_TINY * np.eye(len(x))):
-            other = self.filmed._placed(self.moved(x + step), frames)
-            turn = Rotation.from_matrix(poses[:, :3, :3].mT @ other[:, :3, :3]).as_rotvec()
-            changes[..., n] = np.hstack([turn, other[:, :3, 3] - poses[:, :3, 3]]) / _TINY
-        variance = np.einsum("fpn,nm,fpm->fp", changes, covariance, changes).mean(axis=0)
-        if len(self._steps) > 0:  # a random walk deviates from the line between two knots
-            steps = self._steps * level[np.array(self._kinds) // 3]
-            variance[self._kinds] += (steps**2).mean(axis=0) / 6
-        return float(np.sqrt(variance[:3].sum())), float(np.sqrt(variance[3:].sum()))
+        filmed, own_s, knots_s = self.filmed, self.filmed.own_s, self.start.knots_s
+        grown = np.einsum("fii->if", filmed.trajectory.drifted(filmed._oTb, own_s)).cumsum(axis=1)
+        variance = np.diff([np.interp(knots_s, own_s[1:], each) for each in grown]).T
+        variance[:, :2] *= self._level is self.start
+        return np.sqrt(variance)
+
+    def _poses(self, x: Array) -> tuple[Array, Array]:
+        """Poses of the camera in all frames (F, 4, 4), and their derivatives (F, 6, P) by the
+        parameters: rotations about the camera's axes, and translations in the world.
+        """
+        poses = self.filmed._placed(self.moved(x))
+        slopes = np.zeros((len(poses), 6, len(x)))
+        for n in range(len(self.sigmas) + self._steps.size):
+            other = self.filmed._placed(self.moved(x + _TINY * (np.arange(len(x)) == n)))
+            turn = poses[:, :3, :3].mT @ other[:, :3, :3]
+            slopes[:, :3, n] = (turn - turn.mT)[:, [2, 0, 1], [1, 2, 0]] / 2 / _TINY
+            slopes[:, 3:, n] = (other - poses)[:, :3, 3] / _TINY
+        return poses, slopes
+
+    def _away(self, x: Array) -> tuple[Array, Array]:
+        """(N, J, 2) distances of joints across the rays, m, NaN if unknown, and derivatives (N, J,
+        2, P) by the parameters.
+        """
+        now, placed, modes = self.moved(x), self.placed, len(x) - self.placed.spread.shape[-1]
+        later = self.filmed.own_s[self.frame] + now.offset_s - placed.time_s
+        moved = later[:, None, None] * placed.velocity + placed.spread @ x[modes:]
+        poses, slopes = (each[self.frame] for each in self._poses(x))
+        cRw = poses[:, None, :3, :3].mT
+        at = (placed.points + moved - poses[:, None, :3, 3]) @ poses[:, :3, :3]
+        rays, depth = (self.rays[..., :2] - now.centre) / now.focal, at[..., 2:]
+        across = np.concatenate([np.broadcast_to(-np.eye(2), (*rays.shape, 2)), rays[..., None]], 3)
+        by_pose = np.concatenate([hat(at), np.broadcast_to(-cRw, (*at.shape, 3))], axis=3)
+        J = across @ by_pose @ slopes[:, None]
+        J[..., 7:9] -= self.sigmas[7:9] * depth[..., None] / now.focal * np.eye(2)
+        J[..., 9] += self.sigmas[9] * (across @ cRw @ placed.velocity[..., None])[..., 0]
+        J[..., 10] -= self.sigmas[10] * rays * depth
+        J[..., modes:] = across @ cRw @ placed.spread
+        return rays * depth - at[..., :2], J
+
+    def solved(self) -> Start:
+        """The adjusted start; standard deviations of joints are estimated in each step."""
+        drift, modes = np.tile([0, 0, 0, 1, 1, 1], len(self._steps)), self.placed.spread.shape[-1]
+        kinds = np.concatenate([np.full(len(self.sigmas), -1), drift, np.full(modes, -1)])
+        x = np.zeros(len(kinds))
+        count = _VIEWS_CHANGE * dilution(np.unique(self.placed.time_s))
+        for _ in range(_STEPS):
+            away, J = self._away(x)
+            every = np.abs(away).swapaxes(0, 1).reshape(away.shape[1], -1)
+            sigma = _TINY + median_of(every, 1)[:, None] / 0.6745
+            away, J = np.nan_to_num(away / sigma), np.nan_to_num(J / sigma[..., None])
+            weighted = J / (count * (1 + (away / _WIDTH) ** 2))[..., None]
+            information = np.tensordot(weighted, J, ([0, 1, 2], [0, 1, 2]))
+            step = np.linalg.solve(
+                information + np.eye(len(x)), np.einsum("njcp,njc->p", weighted, away) + x
+            )
+            x = x - step
+            if np.abs(step).max() < _CONVERGED:
+                break
+        covariance = _with_drift(information, x, kinds)
+        x = covariance @ (information @ x + x)
+        slopes = self._poses(x)[1]
+        slopes = slopes[np.linspace(0, len(slopes) - 1, _SAMPLES).astype(np.intp)]
+        (turn, turn_most), (move, move_most) = (
+            _root_mean_square(slopes[:, part], covariance) for part in np.split(np.arange(6), 2)
+        )
+        return replace(
+            self.moved(x),
+            sigma_turn_deg=float(np.degrees(turn)),
+            sigma_move_m=move,
+            within_deg=float(np.degrees(turn_most)),
+            within_m=move_most,
+        )
 
 
-def _drift_levels(information: Array, x: Array, kinds: Index) -> tuple[Array, Array]:
-    """Most probable ratios (2,) of the drift's rotations and translations to their standard
-    deviations, and the covariance of all parameters `x` for these.
-
-    `information` includes a unit prior on the parameters that are rotations (0 in `kinds`) or
-    translations (1). The ratios' prior is log-normal; parameters are integrated out.
+def _root_mean_square(slopes: Array, covariance: Array) -> tuple[float, float]:
+    """Root mean square of the errors `slopes` (F, 3, P) x, for x of a `covariance`, and the bound
+    of it with the probability `_SURE`: the squares have about a gamma distribution.
     """
+    errors = np.einsum("fpn,fpm->nm", slopes, slopes) @ covariance / len(slopes)
+    mean, scale = float(np.trace(errors)), 2 * float((errors * errors.T).sum() / np.trace(errors))
+    return mean**0.5, float(scale * gammaincinv(mean / scale, _SURE)) ** 0.5
+
+
+def _with_drift(information: Array, x: Array, kinds: Index) -> Array:
+    """Covariance of the parameters `x`, for the most probable ratios of the drift's rotations and
+    translations to their standard deviations.
+
+    Parameters have a unit prior that `information` does not include; they are rotations (0 in
+    `kinds`) or translations (1) of the drift, or others (-1). The ratios' prior is log-normal;
+    parameters are integrated out.
+    """
+    both = information @ x + x
 
     def judged(ratio: Array) -> tuple[float, Array]:
         sigma = np.where(kinds < 0, 1.0, ratio[kinds])
-        inverse = np.linalg.pinv(information + np.diag(1 / sigma**2 - 1), hermitian=True)
-        both = information @ x
+        inverse = np.asarray(np.linalg.inv(information + np.diag(1 / sigma**2)), np.float64)
         prior = 0.5 * float((np.log(ratio) ** 2).sum()) / _DRIFTS**2
         spread = float(0.5 * np.linalg.slogdet(inverse)[1] - np.log(sigma).sum())
-        fit = 0.5 * float(both @ inverse @ both)
-        return spread + fit - prior, np.asarray(inverse, dtype=np.float64)
+        return spread + 0.5 * float(both @ inverse @ both) - prior, inverse
 
-    ratios = list(product(np.exp(_DRIFTS * np.linspace(-2, 1, 13)), repeat=2))
-    best = max(map(np.array, ratios), key=lambda each: judged(each)[0])
-    return best, judged(best)[1]
+    ratios = product(np.exp(_DRIFTS * np.linspace(-2, 1, 13)), repeat=2)
+    return max(map(judged, map(np.array, ratios)), key=lambda each: each[0])[1]
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Tracks people in the pictures of one camera, without knowledge of the other cameras."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import correlate1d
@@ -119,15 +119,12 @@ def on_one_clock(
 
     `following` (S,) is the sighting of the same person in the next frame (`next_of`).
     """
-    whole = np.floor(shift).astype(np.intp)
-    part = (shift - whole)[sightings.view]
-    rows = np.flatnonzero((part == 0) | (following >= 0))
-    view, frame = sightings.view[rows], sightings.frame[rows] - whole[sightings.view[rows]]
-    frame = frame - frame.min(initial=np.iinfo(np.intp).max)
+    seen = _resampled(sightings, following, sightings.frame - shift[sightings.view])
+    view, frame = seen.view, seen.frame - seen.frame.min(initial=np.iinfo(np.intp).max)
     ends = [(int(frame[view == v].min()), int(frame[view == v].max())) for v in np.unique(view)]
     begin, end = sorted(first for first, _ in ends)[1:2], sorted(last for _, last in ends)[-2:-1]
     span = range(begin[0], end[0] + 1) if begin else range(0)
-    return OneClock(skeleton, _interpolated(sightings, rows, following, part[rows], frame), span)
+    return OneClock(skeleton, replace(seen, frame=frame), span)
 
 
 def at_regular_times(sightings: Sightings, time_s: Array | None, fps: float) -> Sightings:
@@ -137,25 +134,26 @@ def at_regular_times(sightings: Sightings, time_s: Array | None, fps: float) -> 
     """
     if time_s is None:
         return sightings
-    following = next_of(sightings)
     begin = time_s[sightings.frame, sightings.view] * fps
+    return _resampled(sightings, next_of(sightings), begin)
+
+
+def _resampled(sightings: Sightings, following: Index, begin: Array) -> Sightings:
+    """The sightings at times `begin` (S,) at whole times, interpolated linearly between a sighting
+    and the `following` one (S,); `frame` is then the whole time.
+    """
     end = np.where(following < 0, begin + 2 * _SAME_TIME, begin[following])
     first, last = (np.ceil(each - _SAME_TIME).astype(np.intp) for each in (begin, end))
     rows = np.repeat(np.arange(len(first)), np.maximum(last - first, 0))
     number = first[rows] + np.arange(len(rows)) - np.searchsorted(rows, rows)
     part = ((number - begin[rows]) / (end - begin)[rows]).clip(0.0, 1.0)
-    return _interpolated(sightings, rows, following, np.where(following[rows] < 0, 0, part), number)
-
-
-def _interpolated(
-    sightings: Sightings, rows: Index, following: Index, part: Array, frame: Index
-) -> Sightings:
-    """The sightings of some `rows` (N,), moved by a `part` (N,) towards `following` (S,)."""
-    far = np.where(part == 0, rows, following[rows])
-    near, other = sightings.rows(rows), sightings.rows(far)
+    part = np.where(following[rows] < 0, 0.0, part)
+    near, other = (
+        sightings.rows(each) for each in (rows, np.where(part == 0, rows, following[rows]))
+    )
     xy = (1 - part)[:, None, None] * near.xy + part[:, None, None] * other.xy
     confidence = np.minimum(near.confidence, other.confidence)
-    return Sightings(frame, near.view, xy, np.where(np.isfinite(xy[..., 0]), confidence, 0.0))
+    return Sightings(number, near.view, xy, np.where(np.isfinite(xy[..., 0]), confidence, 0.0))
 
 
 def next_of(sightings: Sightings) -> Index:

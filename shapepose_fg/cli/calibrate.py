@@ -35,6 +35,7 @@ from shapepose_fg.cli.terminal import note, progress, show, show_json, table
 from shapepose_fg.core.errors import InputError, naming
 
 if TYPE_CHECKING:
+    from shapepose_fg.calibration.adjustment import Freedom
     from shapepose_fg.calibration.from_people import Calibrated
     from shapepose_fg.calibration.moving_camera import Start
     from shapepose_fg.core.arrays import Array
@@ -129,7 +130,7 @@ def calibrate(
     ),
     tolerance: str = option(
         _CAMERAS,
-        "Largest error of the poses of a camera that moves, two sigma; a worse one is refused.",
+        "Largest error of the poses of a camera that moves (95 %); a worse one is refused.",
         "0.6,25",
         metavar="DEG,MM",
     ),
@@ -177,7 +178,8 @@ def calibrate(
     )
     known = Freedom(focal=focal * _FILE_OFF * (seen.calibration is not None))
     rig = whole.without([camera.name for camera in whole.cameras if camera.carrier])
-    lens = [guess if name in guessed else known for name in rig.names]
+    lenses = {name: guess if name in guessed else known for name in whole.names}
+    lens = [lenses[name] for name in rig.names]
     if len(rig) < 2:
         raise InputError(f"--trajectory: at least 2 cameras must stand still, got {len(rig)}")
     measured = Measured(stature, _distances(distance or [], rig.names))
@@ -206,7 +208,7 @@ def calibrate(
                 seen,
                 rate,
                 0.0 if times is None else most,
-                guessed if seen.calibration is None else set(whole.names) if focal else set(),
+                lenses,
             )
         except Undetermined as error:
             note(*error.problems, f"{output} is not written: the cameras are not determined")
@@ -273,10 +275,10 @@ def _with_moving(
     seen: LensOptions,
     rate: RateOptions,
     most: float,
-    guessed: set[str],
+    lenses: "dict[str, Freedom]",
 ) -> "tuple[Rig, Array, dict[str, Start]]":
     """The rig `whole` with the fixed cameras as calibrated in `rig`, and with moving ones, whose
-    start is found, with the lens of those in `guessed`; the times (T, V) of frames, from 0 on; and
+    start is found, with the freedom of their `lenses`; the times (T, V) of frames, from 0 on; and
     the starts of the moving ones.
 
     `time_s` (T, W) are the times of the fixed cameras' frames.
@@ -293,16 +295,16 @@ def _with_moving(
     placed, starts = None, dict[str, "Start"]()
     for name in trajectories:
         given = whole.only([name])
-        placed = placed or Placed.by_cameras(
-            recording, whole.only(rig.names), found.adjusted, time_s
-        )
+        if placed is None:
+            fixed = whole.only(rig.names)
+            placed = Placed.by_cameras(recording, fixed, found.adjusted, time_s)
         with tempfile.TemporaryDirectory(prefix="shapepose-fg-") as folder:
             own, known, _ = rate.part(seen.detections, seen.skeleton, given, Path(folder), True)
             own_s = own_times(own, known, 1)[:, 0]
             odometry = trajectories[name].from_start(own_s)
             filmed = Filmed.of(own, given.cameras[0], odometry, own_s)
             starts[name] = start = filmed.started(
-                placed, most, name in guessed, found.world.sigma_scale
+                placed, most, lenses[name], found.world.sigma_scale
             )
         cameras[name], trajectories[name] = start.of(given.cameras[0], odometry)
         columns[name] = own_s + start.offset_s

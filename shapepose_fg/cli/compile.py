@@ -18,7 +18,7 @@ def compile_kernels() -> None:
     from shapepose_fg.core.compiling import compile_beside
     from shapepose_fg.core.kept_kernels import kept_folder, wanted_folder
 
-    package = Path(__file__).parents[1]
+    package = Path(__file__).parent.parent
     if kept_folder() != wanted_folder():
         raise InputError(
             f"{wanted_folder()}: cannot be written; set NUMBA_CACHE_DIR to a writable folder"

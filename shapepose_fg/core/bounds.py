@@ -23,6 +23,9 @@ Repeats = Annotated[int, Interval(ge=1, le=100)]
 """A number of repetitions, 1 or more."""
 RepeatsOrNone = Annotated[int, Interval(ge=0, le=100)]
 """A number of repetitions, 0 or more."""
+MOST_NUMBER = 2**53 - 1
+"""The highest number of a frame or a person: the largest integer up to which doubles represent all
+integers."""
 Axis = Literal["x", "-x", "y", "-y", "z", "-z"]
 """A world axis, used to name the up direction of a calibration."""
 Unit = Literal["m", "cm", "mm"]

@@ -8,8 +8,17 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from typing import Annotated, Any, ClassVar
 
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import (
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    NonNegativeInt,
+    PositiveInt,
+    TypeAdapter,
+    ValidationError,
+)
 
+from shapepose_fg.core.bounds import MOST_NUMBER
 from shapepose_fg.core.detections import Input
 
 
@@ -29,9 +38,7 @@ class Problem:
     """Description of the problem."""
 
 
-_Count = Annotated[int, Field(ge=0, lt=2**53)]
-_Number = Annotated[float, Field(allow_inf_nan=False)]
-_Rows = Annotated[int, Field(gt=0)]
+_Count = Annotated[NonNegativeInt, Field(le=MOST_NUMBER)]
 _Frames = dict[str, list[_Count]]
 
 
@@ -42,9 +49,9 @@ class Notes:
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
     frames: _Count = 0
     """Number of frames that the notes are about."""
-    seconds: dict[str, _Number] = field(default_factory=dict)
+    seconds: dict[str, FiniteFloat] = field(default_factory=dict)
     """Time per stage, s, summed over all processes."""
-    evidence: dict[_Count, tuple[_Number, _Rows]] = field(default_factory=dict)
+    evidence: dict[_Count, tuple[FiniteFloat, PositiveInt]] = field(default_factory=dict)
     """By track: sum of the evidence (`Observations.evidence`) of its rows, and number of these
     rows."""
     probable: dict[str, _Count] = field(default_factory=dict)

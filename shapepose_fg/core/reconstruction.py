@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, Field, FiniteFloat
 
 from shapepose_fg.core.arrays import Array, Mask, Whole
+from shapepose_fg.core.bounds import MOST_NUMBER
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError, naming, optional
 from shapepose_fg.core.observation_table import ObservationTable
@@ -30,7 +31,7 @@ from shapepose_fg.core.rig_file import CAMERAS, is_replaceable, write_rig
 from shapepose_fg.core.run_summary import check_frames, merged_run
 from shapepose_fg.core.shapes import SubjectShapes
 from shapepose_fg.core.skeleton import BODY_25, check_joint_names
-from shapepose_fg.core.storage.files import read_json
+from shapepose_fg.core.storage.files import BLOCK_FRAMES, ROWS_AT_ONCE, read_json
 from shapepose_fg.core.storage.schema import Column, Table, code_names
 from shapepose_fg.core.validation import validated
 
@@ -78,9 +79,6 @@ class Known(IntEnum):
 
 BODY = ("betas", "global_orient", "body_pose", "transl")
 """The columns of a result that describe the body."""
-MOST_NUMBER = 2**53 - 1
-"""The highest number of a frame or a person: the largest integer up to which doubles represent all
-integers."""
 _LATER: Any = None
 """Default of a column that is not given: unknown values."""
 
@@ -337,7 +335,7 @@ class OpenedReconstruction(ExitStack):
     def at(self, frame: int) -> Reconstruction:
         """The people of one frame. The following frames are read into memory together with it."""
         if frame not in self._block[0]:
-            block = range(frame, frame + _BLOCK)
+            block = range(frame, frame + BLOCK_FRAMES)
             self._block = block, self.frames(block.start, block.stop)
         return self._block[1].at(frame)
 
@@ -385,14 +383,12 @@ def check_files(people: Path, observations: Path | None) -> None:
         table = None if observations is None else ObservationTable.open(observations)
         if table is not None:
             opened.enter_context(table)
-        for start in range(0, rows.count, _CHECKED_ROWS):
-            index = np.arange(start, min(start + _CHECKED_ROWS, rows.count))
+        for start in range(0, rows.count, ROWS_AT_ONCE):
+            index = np.arange(start, min(start + ROWS_AT_ONCE, rows.count))
             rows.read(index, observations=None if table is None else table.read(index))
 
 
 _UNREADABLE = "the result was not written, and the previous files are unchanged"
-_CHECKED_ROWS = 4096
-"""Number of rows that are read at a time to check that a file is readable."""
 
 
 class _Time(BaseModel, strict=True):
@@ -433,11 +429,6 @@ def with_body(*columns: Array) -> Mask:
     return np.logical_and.reduce(
         [np.isfinite(each).all(axis=tuple(range(1, each.ndim))) for each in columns]
     )
-
-
-_BLOCK = 128
-"""Number of frames that `OpenedReconstruction.at` reads together; equal to the block size of
-detections."""
 
 
 def count_rows(pieces: Iterable[tuple[NDArray[np.str_], NDArray[np.uint8]]]) -> dict[str, Any]:

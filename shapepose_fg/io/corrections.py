@@ -9,11 +9,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, Field, NonNegativeInt
 
+from shapepose_fg.core.bounds import MOST_NUMBER
 from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.provenance import checksums
-from shapepose_fg.core.reconstruction import MOST_NUMBER, Reconstruction
+from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.result_files import OBSERVATIONS, PEOPLE, RUN
 from shapepose_fg.core.storage.files import inside, read_json, write_content
 from shapepose_fg.core.validation import validated
@@ -29,7 +30,7 @@ _CURE = (
     "again"
 )
 
-Number = Annotated[int, Field(ge=0, le=MOST_NUMBER)]
+Number = Annotated[NonNegativeInt, Field(le=MOST_NUMBER)]
 
 
 class _Edit(BaseModel, strict=True, extra="forbid"):

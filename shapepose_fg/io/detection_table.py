@@ -10,10 +10,9 @@ import numpy as np
 from shapepose_fg.core.arrays import Index
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.skeleton import Skeleton
+from shapepose_fg.core.storage.files import BLOCK_FRAMES as BLOCK_FRAMES
 from shapepose_fg.core.storage.kept_arrays import Arrays, KeptArrays
 
-BLOCK_FRAMES = 128
-"""Number of frames that are read and stored together."""
 _KEPT: dict[str, Any] = {
     "view": np.int16,
     "joint": np.int16,

@@ -12,7 +12,8 @@ from shapepose_fg.core.storage.files import (
     MIDDLE,
     bounded,
     has_long_number,
-    not_json,
+    parse_json,
+    read_text,
     text_pieces,
     unique_keys,
 )
@@ -75,7 +76,7 @@ class JsonItems:
         going = not (may_end and text.peek() == "}" and text.next_of("}"))
         while going:
             if text.peek() != '"':
-                raise text.refuse("Expecting property name enclosed in double quotes")
+                raise text.refused()
             key = text.value()
             text.next_of(":")
             if key in self.others or key == self.key:
@@ -95,11 +96,8 @@ class _Text:
     """A JSON text of which only the part that has not been decoded is in memory."""
 
     def __init__(self, path: Path) -> None:
-        self._path = path
-        self._pieces = text_pieces(path)
+        self._path, self._pieces = path, text_pieces(path)
         self._left, self._at = "", 0
-        self._lines, self._column = 0, 0
-        self._over = False
         self._decoder = json.JSONDecoder(object_pairs_hook=lambda pairs: unique_keys(pairs, path))
 
     def peek(self) -> str:
@@ -116,8 +114,7 @@ class _Text:
         """Skip the next character, which must be one of `characters`."""
         found = self.peek()
         if found == "" or found not in characters:
-            wanted = "," if "," in characters else characters
-            raise self.refuse(f"Expecting {wanted!r} delimiter")
+            raise self.refused()
         self._at += 1
         return found
 
@@ -136,16 +133,9 @@ class _Text:
                 )
                 if cut and self._more():
                     continue
-                raise self.refuse(error.msg, error.pos) from None
-            except InputError:
-                raise
-            except (
-                ValueError,
-                RecursionError,
-            ) as error:  # of 5,000 digits, or 10,000 open brackets
-                raise InputError(
-                    f"{self._path}: cannot be read as JSON ({error}); write the file again"
-                ) from None
+                raise self.refused() from None
+            except (ValueError, RecursionError) as error:  # 5,000 digits, or 10,000 open brackets
+                raise error if isinstance(error, InputError) else self.refused() from None
             number = isinstance(value, int | float) and end >= len(self._left) - len("e-")
             if number and self._more():  # the number may continue
                 continue
@@ -154,41 +144,32 @@ class _Text:
             return bounded(value, self._path, numbers=long)
 
     def end(self) -> None:
-        """Raise InputError if any text is left."""
+        """The text must end here."""
         if self.peek() != "":
-            raise self.refuse("Extra data")
+            raise self.refused()
 
-    def refuse(self, problem: str, at: int | None = None) -> InputError:
-        """An error at a position of the text in memory, by default at the beginning of the next
-        value.
-        """
-        at = self._at if at is None else at
-        line = self._lines + self._left.count("\n", 0, at) + 1
-        begin = self._left.rfind("\n", 0, at)
-        column = at - begin if begin >= 0 else self._column + at + 1
-        return not_json(
-            self._path, line, column, problem, rest=self._left[at:] if self._over else None
-        )
+    def refused(self) -> InputError:
+        """The error of the whole file, which is read again for it."""
+        try:
+            parse_json(read_text(self._path), self._path)
+        except InputError as error:
+            return error
+        return InputError(f"{self._path}: the file changed while it was read; start again")
 
     def _more(self) -> bool:
-        """Read as much text again as is in memory, and drop decoded text; returns whether there was
-        more.
+        """Read on, at least as much as is waiting, so that a long value is decoded few times; False
+        at the end.
         """
-        done, left = self._left[: self._at], len(self._left) - self._at
-        breaks = done.count("\n")
-        if left > MIDDLE:
-            problem = f"one value has over {MIDDLE >> 20} MiB"
+        left = self._left[self._at :]
+        if len(left) > MIDDLE:
             raise InputError(
-                f"{self._path}: line {self._lines + breaks + 1}: {problem}; write the file again"
+                f"{self._path}: one value has over {MIDDLE >> 20} MiB; write the file again"
             )
-        parts, wanted = [self._left[self._at :]], max(left, 1)
+        parts, wanted = [left], max(len(left), 1)
         while wanted > 0 and (piece := next(self._pieces, None)) is not None:
             parts.append(piece)
             wanted -= len(piece)
         if len(parts) == 1:
-            self._over = True
             return False
-        self._lines += breaks
-        self._column = len(done) - 1 - done.rfind("\n") if breaks else self._column + len(done)
         self._left, self._at = "".join(parts), 0
         return True

@@ -7,14 +7,14 @@ about the cameras and the marginal likelihood of the residuals, for each of seve
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Views
-from shapepose_fg.setup_check.evidence import triangulate
-from shapepose_fg.setup_check.fit import TURN, Q, by_parameters, seen_by
+from shapepose_fg.setup_check.evidence import Look, Structure, observed, triangulate
+from shapepose_fg.setup_check.fit import TURN, Q, by_parameters, placing, seen_by
 from shapepose_fg.setup_check.matching import median_over
 
 LEVELS = (0.005, 0.01, 0.02, 0.04, 0.08)
@@ -29,8 +29,6 @@ joint; real ones are 0.3 to 3."""
 _INDEPENDENT = 0.1
 """Share of independent detections: errors of a person's joints, and of consecutive frames, are
 correlated."""
-_WEAK = 1e-6
-"""Relative information added to each joint's position, since two rays may be parallel."""
 
 
 @dataclass(frozen=True)
@@ -73,20 +71,13 @@ class Residuals:
         """Build residuals from the arrays of `observed`. Robust weights use each residual's
         deviation from its median over the person's frames.
         """
-        xy, confidence, size = seen
-        scale, lasting = np.nan_to_num(size, nan=1.0)[:, None, :, None], np.zeros_like(xy)
-        for _ in range(4):
-            structure = triangulate(xy - lasting, confidence, size, views, 4)
-            used = (structure.weight > 0) & np.isfinite(structure.miss_px) & (structure.depth > 0)
-            away = (xy - lasting - seen_by(structure.points, views)[0]) / scale
-            away[~used] = np.nan
-            for each in range(_count(person)):
-                mine = person == each
-                lasting[mine] += median_over(away[mine]) * scale[mine]
+        structure, away = _with_biases(seen, views, person)
+        used = np.isfinite(away[..., 0])
         used &= used.sum(axis=-1, keepdims=True) >= 2
         weight = _INDEPENDENT * np.where(used, structure.weight, 0.0)
         points = np.where(used.any(axis=-1)[..., None], structure.points, 0.0)
-        return cls(np.nan_to_num(xy), weight, scale[:, 0, :, 0], points, person, part)
+        size = np.nan_to_num(structure.size_px, nan=1.0)
+        return cls(np.nan_to_num(seen[0]), weight, size, points, person, part)
 
     @property
     def parts(self) -> int:
@@ -146,9 +137,7 @@ class Residuals:
             projected, at, by_point = seen_by(points, views)
             r = (self.xy - projected)[..., None] * root
             A = (by_point @ views.cTw[:, :, :3] * root).reshape(N, J, 2 * V, 3)
-            H = A.swapaxes(2, 3) @ A
-            H += np.eye(3) * (_WEAK * np.trace(H, axis1=2, axis2=3)[..., None, None] + 1e-300)
-            inverse = np.linalg.inv(H) @ A.swapaxes(2, 3)
+            inverse = placing(A)
             points = points + (inverse @ r.reshape(N, J, 2 * V, 1))[..., 0]
         there = self.weight[..., None] > 0
         middle = np.where(there, self.xy, 0.0).sum(axis=1) / np.maximum(there.sum(axis=1), 1)
@@ -234,6 +223,42 @@ class Residuals:
             )
             found.append(Marginal(rest[:-1, :-1], rest[:-1, -1], likely))
         return found
+
+
+def _with_biases(
+    seen: tuple[Array, Array, Array], views: Views, person: Index
+) -> tuple[Structure, Array]:
+    """Triangulated joints of the arrays of `observed`, beside lasting biases, and the residuals
+    (N, J, V, 2), as shares of the size, with these; NaN where not used.
+
+    A bias is the median residual over the frames of a person, joint and view.
+    """
+    xy, confidence, size = seen
+    scale, lasting = np.nan_to_num(size, nan=1.0)[:, None, :, None], np.zeros_like(xy)
+    for _ in range(4):
+        structure = triangulate(xy - lasting, confidence, size, views, 4)
+        used = (structure.weight > 0) & np.isfinite(structure.miss_px) & (structure.depth > 0)
+        away = (xy - seen_by(structure.points, views)[0]) / scale
+        away[~used] = np.nan
+        for each in range(_count(person)):
+            mine = person == each
+            lasting[mine] = median_over(away[mine]) * scale[mine]
+    return structure, away
+
+
+def without_biases(look: Look) -> Look:
+    """The look without the lasting bias of each joint in each view that people have in common.
+
+    Such a bias along the motion of a person looks like an offset in time.
+    """
+    groups = look.groups()
+    if len(groups) == 0:
+        return look
+    seen = observed(groups, look.sightings)
+    common = median_over(_with_biases(seen, look.views, np.zeros(len(groups), np.intp))[1])
+    every = look.evidence.sightings
+    xy = every.xy - every.size_px[:, None, None] * common.swapaxes(0, 1)[every.view]
+    return replace(look, evidence=replace(look.evidence, sightings=replace(every, xy=xy)))
 
 
 def _count(number: Index) -> int:

@@ -18,6 +18,7 @@ from shapepose_fg.core.trust import BELIEVED, Trust
 from shapepose_fg.io.footage.footage import glance, open_footage
 from shapepose_fg.io.footage.placement import read_used_footage
 from shapepose_fg.io.footage.places import VIDEOS, find_footage
+from shapepose_fg.setup_check.biases import without_biases
 from shapepose_fg.setup_check.evidence import Evidence, Look, gather
 from shapepose_fg.setup_check.exclusion import trust_of
 from shapepose_fg.setup_check.findings import SURE, Finding, Kind, one_of
@@ -261,7 +262,8 @@ def _sound(look: Look, detections: DetectionSequence, rig: Rig) -> Diagnosis | N
         return None
     problem = Problem.of(look)
     refined = replace(look, views=problem.relaxed())
-    remaining, build = lags(refined), build_of(refined.structure()[1].points, detections.skeleton)
+    remaining = lags(without_biases(refined))
+    build = build_of(refined.structure()[1].points, detections.skeleton)
     unlikely = sum(each.finding.sure for each in problem.causes if each.finding is not None)
     odd = unlikely > _UNLIKELY or any(lag.exceeds(_NEARLY) for lag in remaining)
     if (
@@ -289,7 +291,8 @@ def _all_mistakes(
         trust = trust_of(findings, given, look, frames)
         return Diagnosis(tuple(findings), given, look, trust=trust)
     problem = Problem.of(look)
-    remaining = lags(refined := replace(look, views=problem.relaxed()))
+    refined = replace(look, views=problem.relaxed())
+    remaining = lags(without_biases(refined))
     for _ in range(_MOST_FINDINGS):
         late = [
             view for view, lag in enumerate(remaining) if abs(lag.frames) >= 2 and lag.is_offset
@@ -302,7 +305,8 @@ def _all_mistakes(
             break
         look, problem = settled
         findings = _with_late(findings, view, int(look.lag[view] - before))
-        remaining = lags(refined := replace(look, views=problem.relaxed()))
+        refined = replace(look, views=problem.relaxed())
+        remaining = lags(without_biases(refined))
     known = {view for finding in findings for view in finding.cameras}
     unfit = _unfit(look, known)
     known |= {view for finding in unfit for view in finding.cameras}
@@ -365,7 +369,8 @@ def _settled(look: Look, view: int, frames: int) -> tuple[Look, Problem]:
     for _ in range(_LAG_ROUNDS):
         look = look.later(view, frames)
         problem = Problem.of(look)
-        more = lag_of(replace(look, views=problem.relaxed()), view, _LAG_NEAR)
+        refined = replace(look, views=problem.relaxed())
+        more = lag_of(without_biases(refined), view, _LAG_NEAR)
         frames = more.frames
         if frames == 0 or more.gain < 0:
             break

@@ -44,6 +44,8 @@ _ROUNDS = 4
 """Number of rounds of matching and fitting."""
 _STEPS = 4
 """Number of steps between matchings."""
+_WEAK = 1e-6
+"""Relative information added to each joint's position, since two rays may be parallel."""
 CORNER = np.array([-0.5, -0.5])
 """Coordinates of a picture's corner, px; the origin is the centre of the first pixel."""
 
@@ -303,6 +305,15 @@ def by_parameters(xy: Array, at: Array, by_point: Array, views: Views) -> Array:
     J[..., TURN], J[..., MOVE] = np.cross(at[..., None, :], by_point), by_point
     J[..., CENTRE], J[..., FOCAL] = np.eye(2), (xy - views.K[:, :2, 2])[..., None]
     return J
+
+
+def placing(A: Array) -> Array:
+    """(..., 3, m) map from residuals (..., m) to the motion of a point that reduces them most, for
+    their derivatives A (..., m, 3) by its position.
+    """
+    H = A.mT @ A
+    H += np.eye(3) * (_WEAK * np.trace(H, axis1=-2, axis2=-1)[..., None, None] + 1e-300)
+    return np.linalg.solve(H, A.mT)
 
 
 def difference(cTw: Array, other: Array) -> tuple[float, float]:

@@ -28,7 +28,7 @@ orientation."""
 _SURE = 6.0
 """Minimum gain in log-likelihood over the best constant rotation."""
 _ROUNDS = 2
-"""Number of rounds in which a rotation and its frames are fitted alternately."""
+"""Number of rounds in which a rotation and its matches are fitted alternately."""
 _PARTED, _POOR = 0.3, 0.5
 """Criteria for two cameras, with rays that only need to intersect, to stop agreeing: the drop of
 the score, and the maximum score after it."""
@@ -134,26 +134,18 @@ def motions(look: Look, view: int, rng: np.random.Generator) -> Iterator[tuple[F
         before = max(before, likelihood(lasting, worth, len(columns)))
     ends, late = np.intersect1d(others.frame, seen.frame)[[0, -1]], split.after < split.before
 
-    def bumped(at: int) -> Share:
-        return lambda frame: ((frame >= at) == late).astype(np.float64)
+    def bumped(frame: Index) -> Array:
+        return ((frame >= split.at) == late).astype(np.float64)
 
     def drifted(frame: Index) -> Array:
         along = (frame - ends[0]) / (ends[1] - ends[0])
         return np.asarray(along if late else 1 - along)
 
-    at, turn = split.at, np.zeros(3)
-    for _ in range(_ROUNDS):
-        turn = _turn(others, seen, camera, bumped(at), turn, rng)
-        at = _step(others, seen, camera, turn, late)
-    bump = Finding(Kind.BUMPED, (view,), frames=(at, None) if late else (None, at))
-    turns = (
-        _turn(others, seen, camera, bumped(at), turn, rng),
-        _turn(others, seen, camera, drifted, np.zeros(3), rng),
-    )
-    for finding, share, turn, freedom in (
-        (bump, bumped(at), turns[0], 4),
-        (Finding(Kind.DRIFTING, (view,)), drifted, turns[1], 3),
+    for finding, share, freedom in (
+        (Finding(Kind.BUMPED, (view,), frames=split.frames), bumped, 4),
+        (Finding(Kind.DRIFTING, (view,)), drifted, 3),
     ):
+        turn = _turn(others, seen, camera, share, rng)
         after = match(others, warped(seen, camera, share(seen.frame)[:, None] * turn), camera).score
         gain = likelihood(after, worth, freedom) - before
         amount = float(np.rad2deg(np.linalg.norm(turn)))
@@ -172,23 +164,17 @@ def _as_if_still(look: Look, view: int, share: Share, turn: Array) -> Look:
 
 
 def _turn(
-    others: Others,
-    seen: Sightings,
-    camera: Pinhole,
-    share: Share,
-    turn: Array,
-    rng: np.random.Generator,
+    others: Others, seen: Sightings, camera: Pinhole, share: Share, rng: np.random.Generator
 ) -> Array:
-    """(3,) the rotation, starting at `turn` or at that of single people, of which the camera has a
-    share in each frame.
+    """(3,) the rotation of which the camera has a share in each frame, started at that of single
+    people.
     """
     near, far = others.rows(share(others.frame) > 0.5), seen.rows(share(seen.frame) > 0.5)
     if min(len(near), len(far)) == 0:
-        return turn
+        return np.zeros(3)
     shares = share(far.frame)
-    if not turn.any():
-        sole = fit.best_of(near, far, camera, list(fit.tries(near, far, rng)), fit.turned_to)
-        turn = np.zeros(3) if sole is None else _turn_between(camera, sole) / shares.mean()
+    sole = fit.best_of(near, far, camera, list(fit.tries(near, far, rng)), fit.turned_to)
+    turn = np.zeros(3) if sole is None else _turn_between(camera, sole) / shares.mean()
     for _ in range(_ROUNDS):
         still = warped(far, camera, shares[:, None] * turn)
         turn = turn + _turn_between(camera, fit.refined(near, still, camera, TURN)) / shares.mean()
@@ -198,15 +184,3 @@ def _turn(
 def _turn_between(camera: Pinhole, other: Pinhole) -> Array:
     """(3,) rotation vector from one camera to another."""
     return log_so3(other.cTw[:, :3] @ camera.cTw[:, :3].T)
-
-
-def _step(others: Others, seen: Sightings, camera: Pinhole, turn: Array, late: bool) -> int:
-    """The frame at which the camera was turned; `late`: it fits before."""
-    frames = np.unique(others.frame)
-    worth = np.zeros((2, len(frames)))
-    for row, share in enumerate((1.0 - late, float(late))):
-        found = match(others, warped(seen, camera, np.tile(share * turn, (len(seen), 1))), camera)
-        place = np.searchsorted(frames, others.frame[found.person])
-        worth[row] = np.bincount(place, 1 - found.error / GATE, minlength=len(frames))
-    total = np.append(0.0, np.cumsum(worth[0])) + np.append(np.cumsum(worth[1][::-1])[::-1], 0.0)
-    return int(frames[min(int(np.argmax(total)), len(frames) - 1)])

@@ -17,11 +17,16 @@ from shapepose_fg.core.camera import Views
 from shapepose_fg.setup_check.biases import Marginal, Residuals
 from shapepose_fg.setup_check.evidence import Look, observed
 from shapepose_fg.setup_check.findings import Finding, Kind
-from shapepose_fg.setup_check.fit import CENTRE, FOCAL, POSE, TURN, Q, changed, difference
+from shapepose_fg.setup_check.fit import CENTRE, FOCAL, MOVE, POSE, TURN, Q, changed, difference
 from shapepose_fg.setup_check.matching import followed
 
-ONE = {Kind.TURNED: TURN, Kind.MOVED: POSE, Kind.FOCAL: FOCAL, Kind.PRINCIPAL_POINT: CENTRE}
-"""Small mistakes of a single camera, and their parameters."""
+ONE = {
+    Kind.TURNED: [TURN],
+    Kind.MOVED: [POSE, MOVE],
+    Kind.FOCAL: [FOCAL],
+    Kind.PRINCIPAL_POINT: [CENTRE],
+}
+"""Small mistakes of a single camera, and their parameters; a moved camera may be turned, or not."""
 _TURN, _MOVE, _FOCAL = np.deg2rad(3.0), 0.05, 0.1
 """Standard deviations of a small mistake of a camera: a rotation, or an equivalent shift of the
 principal point, rad; a translation, as a share of the people's distance; the logarithm of the focal
@@ -158,17 +163,16 @@ class Problem:
         """Mistakes of a single camera; `starts` are the cameras with each mistake approximately
         corrected.
         """
-        found = []
-        for kind, views in starts.items():
-            which, sigma = ONE[kind], self._usual(view)[ONE[kind]]
-            directions = self.residuals.camera(view, which)
-            for _ in range(1 if views is self.given else 2):
+        found, tried = [], [(kind, which) for kind in starts for which in ONE[kind]]
+        for kind, which in tried:
+            views = self.given if which is MOVE else starts[kind]  # others are fitted with turns
+            directions, sigma = self.residuals.camera(view, which), self._usual(view)[which]
+            for _ in range(1 if starts[kind] is self.given else 2):
                 before = _between(self.given, views, view)[which]
                 likely, change = self._likelihood(directions, sigma, views, before)
                 views = _moved(views, view, which, change)
-            found.append(
-                Cause(named(kind, view, self.given, views), likely + self._rare(kind), views)
-            )
+            likely += self._rare(kind) - float(np.log(len(ONE[kind])))
+            found.append(Cause(named(kind, view, self.given, views), likely, views))
         return found
 
     def biases(self) -> Iterator[Cause]:

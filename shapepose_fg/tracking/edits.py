@@ -12,7 +12,8 @@ from enum import StrEnum
 import numpy as np
 
 from shapepose_fg.core.arrays import Mask, Whole
-from shapepose_fg.core.reconstruction import MOST_NUMBER, Reconstruction
+from shapepose_fg.core.bounds import MOST_NUMBER
+from shapepose_fg.core.reconstruction import Reconstruction
 
 Solve = Callable[[Reconstruction], Reconstruction]
 """Solves rows of some people again from their `observations`; the same people, maybe in other

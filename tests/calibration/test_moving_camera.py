@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from shapepose_fg.calibration.adjustment import Freedom
 from shapepose_fg.calibration.from_people import Undetermined
 from shapepose_fg.calibration.moving_camera import Filmed, Placed
 from shapepose_fg.core.camera import Camera
@@ -60,7 +61,7 @@ MOST_S = 20.0
 
 @pytest.fixture(scope="module")
 def start(walk, filmed):
-    return filmed.started(walk, MOST_S, False)
+    return filmed.started(walk, MOST_S, Freedom())
 
 
 def test_the_start_is_found_anywhere(filmed, start):
@@ -79,13 +80,14 @@ def test_the_start_is_found_anywhere(filmed, start):
 
 def test_it_is_refused_if_it_is_less_sure_than_asked_or_the_fixed_cameras_are(walk, filmed, start):
     """The sentence has the figures and the cure; errors of the fixed cameras count."""
-    sigmas = np.array([start.sigma_turn_deg, start.sigma_move_m])
-    said = start.refusal("phone", *(1.9 * sigmas))
+    bounds = np.array([start.within_deg, start.within_m])
+    assert start.within_deg > start.sigma_turn_deg and start.within_m > start.sigma_move_m
+    said = start.refusal("phone", *(0.9 * bounds))
     assert said is not None and "camera phone: its poses are known to" in said
-    assert "are asked; calibrate the lenses" in said
-    assert start.refusal("phone", *(2.1 * sigmas)) is None
-    shifted = replace(walk, spread=np.full((1, *walk.points.shape), 0.05))
-    other = filmed.started(shifted, MOST_S, False)
+    assert "are asked (--tolerance); give the lenses" in said
+    assert start.refusal("phone", *(1.1 * bounds)) is None
+    shifted = replace(walk, spread=np.full((*walk.points.shape, 1), 0.05))
+    other = filmed.started(shifted, MOST_S, Freedom())
     assert other.sigma_move_m == pytest.approx(np.hypot(start.sigma_move_m, 0.0866), rel=0.1)
 
 
@@ -102,7 +104,7 @@ def test_the_drift_and_the_unit_of_an_odometry_are_found(walk, filmed):
     turn = Rotation.from_rotvec(np.radians(1.5) * part[:, None] * up).as_matrix()
     at = 1.02 * log.wTb[:, :3, 3] + 0.15 * part[:, None] * up
     drifted = replace(filmed, trajectory=replace(log, wTb=rigid(turn @ log.wTb[:, :3, :3], at)))
-    start = drifted.started(walk, MOST_S, False)
+    start = drifted.started(walk, MOST_S, Freedom())
     found = start.of(drifted.camera, drifted.trajectory)[1].wTb @ start.bTc
     away = np.linalg.norm(found[:, :3, 3] - path(OWN_S)[:, :3, 3], axis=1)
     turned = Rotation.from_matrix(found[:, :3, :3].mT @ path(OWN_S)[:, :3, :3]).magnitude()
@@ -112,7 +114,18 @@ def test_the_drift_and_the_unit_of_an_odometry_are_found(walk, filmed):
 
 def test_an_unknown_focal_length_is_found_too(walk, filmed):
     wrong = replace(filmed, rays=filmed.rays * [1.06, 1.06, 1.0])
-    assert wrong.started(walk, MOST_S, True).focal == pytest.approx(1.06, abs=0.015)
+    start = wrong.started(walk, MOST_S, Freedom(focal=0.2, centre_px=8.0))
+    assert start.focal == pytest.approx(1.06, abs=0.015)
+
+
+def test_an_unknown_principal_point_is_found_and_does_not_turn_the_camera(walk, filmed):
+    """Found as a rotation of the camera instead, it would be off by 1.6 degrees."""
+    wrong = replace(filmed, rays=filmed.rays + np.array([0.02, -0.02, 0.0]))
+    start = wrong.started(walk, MOST_S, Freedom(centre_px=20.0))
+    camera, odometry = start.of(filmed.camera, filmed.trajectory)
+    turn = (odometry.wTb @ camera.bTc)[:, :3, :3].mT @ path(OWN_S)[:, :3, :3]
+    assert np.degrees(Rotation.from_matrix(turn).magnitude()).max() < 0.8
+    np.testing.assert_allclose(camera.K[:2, 2] - K[:2, 2], [20, -20], atol=6)
 
 
 def test_a_log_of_another_walk_and_people_who_stand_are_refused(walk, filmed):
@@ -121,11 +134,11 @@ def test_a_log_of_another_walk_and_people_who_stand_are_refused(walk, filmed):
     still[:, :3, 3] += np.cumsum(rng.normal(0, 0.05, (len(OWN_S), 3)), axis=0)
     other = replace(filmed, trajectory=replace(filmed.trajectory, wTb=still))
     with pytest.raises(Undetermined, match="camera phone: ") as refused:
-        other.started(walk, MOST_S, False)
+        other.started(walk, MOST_S, Freedom())
     assert "; film the people" in str(refused.value)
     standing = Placed.of(walk.time_s, walk.moment, walk.points[walk.moment * 0])
     with pytest.raises(Undetermined, match="camera phone: "):
-        filmed.started(standing, MOST_S, False)
+        filmed.started(standing, MOST_S, Freedom())
     nobody = replace(filmed, own_s=filmed.own_s[:3], rays=filmed.rays[:3])
     with pytest.raises(Undetermined, match="camera phone: too few people are seen"):
-        nobody.started(walk, MOST_S, False)
+        nobody.started(walk, MOST_S, Freedom())

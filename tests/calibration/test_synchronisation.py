@@ -198,10 +198,6 @@ def test_the_command_writes_what_reconstruct_takes(
     "command",
     [
         "synchronise --calibration rig.json --detections detection --most 8 --output same.csv",
-        (
-            "calibrate --calibration rig.json --detections detection --most 8 --times same.csv "
-            "--output new.json"
-        ),
         "reconstruct --calibration rig.json --detections detection --synchronise --output "
         "results --no-report --preset fast",
     ],

@@ -251,8 +251,7 @@ def test_what_was_used_is_read_back(tmp_path):
         (text.replace('"letterbox"', '"folded"'), r"cameras\[0\]\.placement must be"),
         (
             text.replace("960", "0"),
-            r"cameras\[0\]\.picture_size\[0\] is not valid: input should be greater than or equal"
-            r" to 1",
+            r"cameras\[0\]\.picture_size\[0\] must be greater than 0, got 0",
         ),
         (text[:50], "is not JSON"),
     ):

@@ -3,7 +3,6 @@
 """
 
 import json
-import re
 
 import pytest
 
@@ -99,12 +98,7 @@ def test_mistakes_are_told_as_of_a_whole_file(tmp_path, piece, text):
         read_json(file)
     with pytest.raises(InputError) as caught:
         list(JsonItems(file, ("wanted",)))
-    told, expected = str(caught.value), str(whole.value)
-    assert ("too early" in told) == ("too early" in expected)
-    if "too early" in told:  # `json` tells the last character, or the one behind it
-        told, expected = (re.sub(r"column \d+", "column", each) for each in (told, expected))
-    # What was expected there is said in fewer words; where it is, is the same.
-    assert told.split(" is not JSON: ")[0] == expected.split(" is not JSON: ")[0]
+    assert str(caught.value) == str(whole.value)
 
 
 def test_text_that_is_none(tmp_path, piece):
@@ -123,5 +117,5 @@ def test_long_numbers(tmp_path, piece):
 def test_one_value_that_does_not_end(tmp_path, monkeypatch):
     monkeypatch.setattr(json_items, "MIDDLE", 2**20)
     (tmp_path / "long.json").write_text('[1,\n"' + "x" * 2**22)
-    with pytest.raises(InputError, match="line 2: one value has over 1 MiB"):
+    with pytest.raises(InputError, match="one value has over 1 MiB"):
         list(JsonItems(tmp_path / "long.json", ()))

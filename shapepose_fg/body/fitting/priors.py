@@ -5,10 +5,10 @@ Both priors were learnt from motion capture (`body/data/*.md`).
 
 from dataclasses import dataclass, replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 
+from shapepose_fg.body.model.smpl_file import DATA
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.skeleton import Skeleton
@@ -19,7 +19,6 @@ NUM_ANGLES = 69
 NUM_MOVING = 3 + NUM_ANGLES + 3
 """Number of moving parameters: rotation of the root, the other 69 angles, position of the root."""
 
-_DATA = Path(__file__).parents[1] / "data"
 _CURE = "install the package again"
 _SAMPLES = 2000
 _MARGIN, _NOISE_M = 1.25, 0.05
@@ -72,7 +71,7 @@ class PosePrior:
     def default() -> "PosePrior":
         """The prior that ships with the package (read once)."""
         data = read_npz(
-            _DATA / "pose_prior.npz",
+            DATA / "pose_prior.npz",
             ("means", "covariances", "lower", "upper", "provenance"),
             _CURE,
         )
@@ -146,7 +145,7 @@ class MotionPrior:
     def default() -> "MotionPrior":
         """The prior that ships with the package (read once)."""
         data = read_npz(
-            _DATA / "motion_prior.npz", ("acceleration", "velocity", "provenance"), _CURE
+            DATA / "motion_prior.npz", ("acceleration", "velocity", "provenance"), _CURE
         )
         return MotionPrior(data["acceleration"], data["velocity"], str(data["provenance"]))
 

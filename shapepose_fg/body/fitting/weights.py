@@ -15,12 +15,13 @@ from safetensors.numpy import save
 from shapepose_fg.body.fitting.network import NetworkConfig, UpdateNetwork
 from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.body.model.smpl_file import DATA
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, slots
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import open_regular, user_cache, write_content
 
-_DEFAULT = Path(__file__).parents[1] / "data" / "fitter.safetensors"
+_DEFAULT = DATA / "fitter.safetensors"
 _FORMAT = "shapepose-fg fitter 1"
 _KINDS = ("F32", "F64")
 """Supported number types, by their safetensors names."""

@@ -16,12 +16,17 @@ from numpy.typing import NDArray
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model.rotation import exp_so3
 from shapepose_fg.body.model.skinned_points import SkinnedPoints, contract
-from shapepose_fg.body.model.smpl_file import NUM_BETAS, SMPL_PARENTS, SmplArrays, read_smpl_file
+from shapepose_fg.body.model.smpl_file import (
+    DATA,
+    NUM_BETAS,
+    SMPL_PARENTS,
+    SmplArrays,
+    read_smpl_file,
+)
 from shapepose_fg.body.model.target_skeletons import slots
 from shapepose_fg.core.arrays import Array, Index, Real
 from shapepose_fg.core.skeleton import BODY_25, SMPL_24
 
-_DEFAULT_FILE = Path(__file__).parents[1] / "data" / "open_body.npz"
 _SHAPES = {"betas": (NUM_BETAS,), "global_orient": (3,), "body_pose": (23, 3), "transl": (3,)}
 
 
@@ -110,7 +115,7 @@ class BodyModel:
     @cache
     def default() -> "BodyModel":
         """The open body of the package; read once."""
-        return BodyModel.load(_DEFAULT_FILE)
+        return BodyModel.load(DATA / "open_body.npz")
 
     @classmethod
     def load(cls, path: str | Path, *, keypoint_regressor: Real | None = None) -> "BodyModel":

@@ -23,7 +23,7 @@ from shapepose_fg.body.kernels.rows import Limbs, Work
 from shapepose_fg.body.model.smpl_file import SMPL_PARENTS
 from shapepose_fg.core.arrays import Array, Index
 
-NUM_BONES = 24
+NUM_BONES = len(SMPL_PARENTS)
 NUM_COLUMNS = 10 + 3 * NUM_BONES + 3
 """Number of columns of a Jacobian: betas, global_orient, body_pose, transl."""
 _EVERY = 10 + 3 * np.arange(NUM_BONES)

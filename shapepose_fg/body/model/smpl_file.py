@@ -14,6 +14,8 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import BODY_25, SMPL_24
 from shapepose_fg.core.storage.npz import read_npz
 
+DATA = Path(__file__).parent.parent / "data"
+"""Folder of the built-in body, its priors and the weights of its fitter."""
 NUM_BETAS = 10
 """Number of shape components in use; a file may have more."""
 SMPL_PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21)

@@ -21,6 +21,10 @@ SMALL, MIDDLE, BIG, LARGE = 2**20, 2**26, 2**28, 2**32
 times of a recording; detections of a recording."""
 PIECE = SMALL
 """Number of bytes that are read at a time from files that may be larger than memory."""
+BLOCK_FRAMES = 128
+"""Number of frames that are read and stored together."""
+ROWS_AT_ONCE = 4096
+"""Number of rows of a table, or lines of a file, that are processed at once."""
 MOST_DEPTH = 64
 """Maximum depth of nested lists and objects: no format needs a fifth of it, and libyaml's loader is
 recursive."""
@@ -172,7 +176,12 @@ def parse_json(text: str, path: Path | str) -> Any:
     try:
         value = json.loads(text, object_pairs_hook=lambda pairs: unique_keys(pairs, path))
     except json.JSONDecodeError as error:
-        raise not_json(path, error.lineno, error.colno, error.msg, rest=text[error.pos :]) from None
+        cut = error.msg.startswith("Unterminated") or _BROKEN_OFF.fullmatch(text, error.pos)
+        ends = " (the file ends too early)" if cut else ""
+        raise InputError(
+            f"{path}: line {error.lineno} column {error.colno} is not JSON: {error.msg}{ends}; "
+            "correct it or write the file again"
+        ) from None
     except InputError:
         raise
     except (
@@ -188,20 +197,6 @@ def parse_json(text: str, path: Path | str) -> Any:
 def not_text(path: Path, byte: int) -> InputError:
     """The error for a file that is not UTF-8 text at `byte`."""
     return InputError(f"{path}: byte {byte} is not UTF-8 text; check the path")
-
-
-def not_json(
-    path: Path | str, line: int, column: int, problem: str, *, rest: str | None
-) -> InputError:
-    """An error about JSON text at a line and column, counted from 1; `rest` is the text from there
-    on, if known.
-    """
-    cut = rest is not None and (problem.startswith("Unterminated") or _BROKEN_OFF.fullmatch(rest))
-    ends = " (the file ends too early)" if cut else ""
-    return InputError(
-        f"{path}: line {line} column {column} is not JSON: {problem}{ends}; correct it or write "
-        "the file again"
-    )
 
 
 def has_long_number(text: str, start: int = 0, stop: int | None = None) -> bool:

@@ -17,11 +17,8 @@ from numpy.typing import DTypeLike, NDArray
 
 from shapepose_fg.core.arrays import Index
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.storage.files import PIECE, open_regular
+from shapepose_fg.core.storage.files import BIG, PIECE, open_regular
 
-SMALL_BYTES = 2**28
-"""Maximum total size of the arrays of a small file, bytes, independent of their compression: NaN
-compresses 1000 to 1."""
 MOST_PACKED = 50
 """Maximum compression ratio of larger files; measured coordinates hardly compress at all."""
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
@@ -259,7 +256,7 @@ def _check_members(members: Sequence[zipfile.ZipInfo], size: int) -> None:
     if len({member.filename for member in members}) < len(members):
         raise ValueError("an array occurs twice")
     total = sum(member.file_size for member in members)
-    if total > max(SMALL_BYTES, MOST_PACKED * size):
+    if total > max(BIG, MOST_PACKED * size):
         raise ValueError(
             f"its arrays would be {total >> 20} MiB large, {total // max(size, 1)} times the file"
         )

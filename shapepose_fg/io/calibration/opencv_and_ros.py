@@ -13,6 +13,7 @@ import numpy as np
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.lens import Lens
+from shapepose_fg.core.storage.files import SMALL
 from shapepose_fg.io.calibration.content import Content, load
 from shapepose_fg.io.calibration.written import (
     Format,
@@ -23,8 +24,6 @@ from shapepose_fg.io.calibration.written import (
     rotation_of,
 )
 
-_MOST = 2**20
-"""Maximum number of values of all cameras together."""
 _ASK = {
     "unit": "pass --unit, the unit of the board's squares",
     "up": "pass --up (z or -z if the board lay on the floor; -y if the first camera was level)",
@@ -81,7 +80,7 @@ def _read_multiview(content: Content) -> WrittenRig | None:
     if content.syntax != "OpenCV" or not {"Rs", "Ts", "Ks"} <= content.value.keys():
         return None
     nodes = Node(content.value, str(content.path), _AGAIN)
-    flat = nodes.needed("Ks", most=_MOST)
+    flat = nodes.needed("Ks", most=SMALL)
     count = len(flat) // 9
     if count == 0 or len(flat) != 9 * count:
         raise nodes.refuse("Ks", "must hold 9 numbers per camera")
@@ -93,7 +92,7 @@ def _read_multiview(content: Content) -> WrittenRig | None:
     sizes = nodes.needed("image_sizes", 2 * count).reshape(count, 2)
     models, ids = nodes.numbers("models", count), content.value.get("cam_ids")
     fisheye = np.zeros(count, dtype=bool) if models is None else models == cv2.CALIB_MODEL_FISHEYE
-    numbers = nodes.needed("distortions", most=_MOST)
+    numbers = nodes.needed("distortions", most=SMALL)
     # All coefficients are in one list: four per fisheye camera, and an equal number for each other
     # camera.
     plain = (len(numbers) - 4 * fisheye.sum()) / max(1, (~fisheye).sum())

@@ -11,8 +11,8 @@ import numpy as np
 
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.errors import InputError, optional
-from shapepose_fg.core.storage.files import SMALL, open_regular
-from shapepose_fg.core.storage.npz import MOST_PACKED, SMALL_BYTES, read_npy_header
+from shapepose_fg.core.storage.files import BIG, SMALL, open_regular
+from shapepose_fg.core.storage.npz import MOST_PACKED, read_npy_header
 from shapepose_fg.io.camera_names import MOST_FRAME
 from shapepose_fg.io.detection_table import BLOCK_FRAMES
 from shapepose_fg.io.detections.csv_people import BLAZEPOSE, body_parts, taken
@@ -327,7 +327,7 @@ def _numbers(path: Path, dataset: Any) -> Array:
 
 def _check_size(path: Path, count: float, shape: tuple[int, ...]) -> None:
     """InputError if the file is too small for this number of values."""
-    if 8 * count > max(SMALL_BYTES, MOST_PACKED * path.stat().st_size):
+    if 8 * count > max(BIG, MOST_PACKED * path.stat().st_size):
         raise InputError(
             f"{path}: its arrays {shape} are too large; export a part of the recording"
         )

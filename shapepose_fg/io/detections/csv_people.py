@@ -12,7 +12,7 @@ import numpy as np
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import SKELETONS
-from shapepose_fg.core.storage.files import open_regular, text_pieces
+from shapepose_fg.core.storage.files import ROWS_AT_ONCE, open_regular, text_pieces
 from shapepose_fg.core.validation import is_number
 from shapepose_fg.io.camera_names import MOST_FRAME, last_number, match_names
 from shapepose_fg.io.detections.people import CameraPeople, PeopleBlock
@@ -21,8 +21,6 @@ _DEEPLABCUT, _CALISCOPE = "DeepLabCut's CSV", "Caliscope's CSV"
 _RERUN = "write the detections again, in pixels"
 BLAZEPOSE = SKELETONS["BLAZEPOSE_33"].keypoint_count
 """Number of MediaPipe's points of the body; those of hands and face follow."""
-_LINES = 4096
-"""Number of lines that are processed together."""
 
 
 def head_of(path: Path) -> list[str]:
@@ -66,7 +64,7 @@ def read_deeplabcut(path: Path) -> CameraPeople:
     width = count + 1
 
     blocks, first, last = list[PeopleBlock](), 0, -1
-    while len(some := list(islice(rows, _LINES))) > 0:
+    while len(some := list(islice(rows, ROWS_AT_ONCE))) > 0:
         numbers = np.array([[_frame(path, line, row[0])] for line, row in some], dtype=np.intp)[
             :, 0
         ]
@@ -148,7 +146,7 @@ def _points(path: Path) -> Array:
         )
     columns = [names.index(each) for each in ("sync_index", who, what, "img_loc_x", "img_loc_y")]
     parts = []
-    while len(some := list(islice(rows, _LINES))) > 0:
+    while len(some := list(islice(rows, ROWS_AT_ONCE))) > 0:
         values = np.array([_numbers(path, line, row, len(names)) for line, row in some])[:, columns]
         bad = ~np.isfinite(values).all(axis=1) | (values[:, :3] != np.round(values[:, :3])).any(
             axis=1

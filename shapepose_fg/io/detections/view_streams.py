@@ -47,10 +47,7 @@ class ViewCandidates:
         return self if keep.all() else ViewCandidates(self.frame[keep], self.seen.only(keep))
 
 
-_NONE = np.zeros(0, dtype=np.intp)
-_NOTHING = ViewCandidates.of(
-    _NONE, _NONE, np.zeros((0, 2)), np.zeros(0), np.zeros((0, 2), np.intp), np.zeros(0)
-)
+_NOTHING = ViewCandidates(Detections.empty().view, Detections.empty())
 
 
 @dataclass(frozen=True)

@@ -18,12 +18,10 @@ from shapepose_fg.biomechanics.joint_angles import joint_angles
 from shapepose_fg.core.arrays import Index
 from shapepose_fg.core.errors import optional
 from shapepose_fg.core.reconstruction import OpenedReconstruction
-from shapepose_fg.core.storage.files import write_atomically
+from shapepose_fg.core.storage.files import ROWS_AT_ONCE, write_atomically
 from shapepose_fg.io.export.registry import Job, Written
 from shapepose_fg.io.export.take import Take
 
-_GROUP_ROWS = 4096
-"""Number of rows in a group of Parquet: about 20 MB, which readers load separately."""
 _OBSERVED = "observations."
 """Prefix of the Parquet columns from observations.npz."""
 
@@ -104,8 +102,8 @@ def write_parquet(opened: OpenedReconstruction, rows: Index | None, folder: Path
 
     def write(stream: Any) -> None:
         with parquet.ParquetWriter(stream, schema, compression="zstd") as writer:
-            for start in range(0, len(rows), _GROUP_ROWS):
-                columns, _ = _columns(opened, rows[start : start + _GROUP_ROWS])
+            for start in range(0, len(rows), ROWS_AT_ONCE):
+                columns, _ = _columns(opened, rows[start : start + ROWS_AT_ONCE])
                 typed = zip(columns.values(), schema, strict=True)
                 arrays = [array(values, field.type) for values, field in typed]
                 writer.write_table(arrow.Table.from_arrays(arrays, schema=schema))

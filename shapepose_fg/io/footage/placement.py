@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from enum import StrEnum
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, Field, PositiveInt
 
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig
@@ -178,7 +178,7 @@ class CameraFootage:
     """(T,) index of the picture of each frame, counted from 0 in the file; -1 if there is none."""
 
 
-_Size = tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]]
+_Size = tuple[PositiveInt, PositiveInt]
 
 
 class _Camera(BaseModel, extra="forbid"):

@@ -19,8 +19,6 @@ _ALONE = ("geometry_msgs/PoseStamped", "geometry_msgs/PoseWithCovarianceStamped"
 KINDS = tuple(map(type_name, (TREE, _WITH_CHILD, *_ALONE)))
 """Types of messages with poses."""
 _STATIC = "tf_static"
-_TURN_THEN_WAY = np.array([3, 4, 5, 0, 1, 2])
-"""Indices that reorder ROS covariances (translation, rotation) to rotation, translation."""
 
 
 class Frames:
@@ -188,9 +186,8 @@ def _covariance(numbers: Any, pose: Array, place: str) -> Array | None:
     """
     if numbers is None:
         return None
-    parents = np.array(list(numbers), dtype=np.float64).reshape(6, 6)[
-        np.ix_(_TURN_THEN_WAY, _TURN_THEN_WAY)
-    ]
+    # ROS lists translation before rotation.
+    parents = np.roll(np.array(list(numbers), dtype=np.float64).reshape(6, 6), 3, axis=(0, 1))
     if not parents.any() or parents[3, 3] == -1:
         return None
     if not np.isfinite(parents).all() or np.linalg.eigvalsh(parents)[0] < -1e-9 * max(

@@ -189,36 +189,14 @@ def draw_detections(picture: Picture, xy: Array, used: Mask, colours: Whole) -> 
     others as red crosses.
     """
     reach = max(2, stroke_of(picture.shape[1::-1]))
-    there = np.isfinite(xy).all(axis=1)
-    drawn = _fine(xy[there]).tolist(), used[there].tolist(), colours[there].tolist()
-    for (x, y), good, colour in zip(*drawn, strict=True):
-        arm = reach << _FINE
+    there = np.isfinite(xy).all(axis=1) & (np.abs(xy) < 30000).all(axis=1)
+    drawn = np.rint(xy[there]).astype(int).tolist(), used[there].tolist(), colours[there]
+    for at, good, colour in zip(*drawn, strict=True):
+        kind, size, pens = cv2.MARKER_TILTED_CROSS, 3 * reach, (max(3, reach), max(1, reach // 2))
         if good:
-            box = ((x - arm, y - arm), (x + arm, y + arm))
-            cv2.rectangle(picture, *box, _DARK, 3, cv2.LINE_AA, _FINE)
-            light = tuple((np.asarray(colour) + 255) / 2)
-            cv2.rectangle(picture, *box, light, 1, cv2.LINE_AA, _FINE)
-        else:
-            arm = round(1.5 * arm)
-            for width, paint in ((max(3, reach), _DARK), (max(1, reach // 2), GATED)):
-                cv2.line(
-                    picture,
-                    (x - arm, y - arm),
-                    (x + arm, y + arm),
-                    paint,
-                    width,
-                    cv2.LINE_AA,
-                    _FINE,
-                )
-                cv2.line(
-                    picture,
-                    (x - arm, y + arm),
-                    (x + arm, y - arm),
-                    paint,
-                    width,
-                    cv2.LINE_AA,
-                    _FINE,
-                )
+            kind, size, pens = cv2.MARKER_SQUARE, 2 * reach, (3, 1)
+        for width, paint in zip(pens, (_DARK, (colour + 255) / 2 if good else GATED), strict=True):
+            cv2.drawMarker(picture, at, tuple(paint), kind, size, width, cv2.LINE_AA)
 
 
 def draw_label(

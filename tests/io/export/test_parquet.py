@@ -48,7 +48,7 @@ def same(table, people: Reconstruction) -> None:
 def test_all_columns_come_back_in_groups_of_rows(saved, tmp_path, monkeypatch):
     people = Reconstruction.load(saved)
     people.save(tmp_path)
-    monkeypatch.setattr(tables, "_GROUP_ROWS", 7)
+    monkeypatch.setattr(tables, "ROWS_AT_ONCE", 7)
     table, about = exported(tmp_path)
     same(table, people)
     assert arrow_parquet.ParquetFile(tmp_path / "export" / "people.parquet").num_row_groups == -(
