@@ -177,8 +177,8 @@ def errors_over_time(marginals: Marginals, truth: np.ndarray) -> Columns:
 
 
 def new_errors(seed: int) -> Iterator[Columns]:
-    """`errors_over_time` of a person who swings arm and leg, with detections whose errors are new in
-    every frame.
+    """`errors_over_time` of a person who swings arm and leg, with detections whose errors are new
+    in every frame.
     """
     rng = np.random.default_rng(seed)
     rig = ring_of_cameras(3 + seed % 3, rng)
