@@ -14,9 +14,8 @@ from itertools import combinations, product
 import numpy as np
 from scipy.signal import fftconvolve
 
-from shapepose_fg.calibration.pairwise import fast_part
 from shapepose_fg.calibration.relative import relative
-from shapepose_fg.calibration.tracks import FASTEST, Tracks
+from shapepose_fg.calibration.tracks import FASTEST, Tracks, fast_part
 from shapepose_fg.core.arrays import Array
 
 _STEP_S = 0.04
@@ -130,9 +129,7 @@ def _rises(tracks: Tracks, step: int, fps: float) -> list[tuple[int, Array]]:
     """
     values = tracks.speed[:, :, 1] / tracks.size[:, None]
     known = np.abs(values) < FASTEST / fps  # false for NaN
-    (values,) = fast_part(
-        (np.where(known, values, 0.0),), known, tracks.track, tracks.track, _BRISK_S * fps
-    )
+    values = fast_part(values, known, tracks.track, _BRISK_S * fps)
     kept = np.flatnonzero(tracks.frame % step == 0)
     _, first = np.unique(tracks.track[kept], return_index=True)
     begins = (tracks.frame[kept] // step)[first]

@@ -7,8 +7,8 @@ from itertools import combinations
 
 import numpy as np
 
-from shapepose_fg.calibration.pairwise import Pairwise, fast_part
-from shapepose_fg.calibration.tracks import FAST_S, FASTEST, Tracks, block_frames
+from shapepose_fg.calibration.pairwise import Pairwise
+from shapepose_fg.calibration.tracks import FAST_S, FASTEST, Tracks, block_frames, fast_part
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Views
 from shapepose_fg.setup_check.evidence import triangulate
@@ -58,12 +58,9 @@ class InSpace:
         """
         tracks, views, shift, fps = pairwise.tracks, pairwise.views, pairwise.shift, pairwise.fps
         step = max(1, round(fps / 15))
-        low = min(
-            int((each.frame - at).min(initial=0)) for each, at in zip(tracks, shift, strict=True)
-        )
-        high = max(
-            int((each.frame - at).max(initial=0)) for each, at in zip(tracks, shift, strict=True)
-        )
+        frames = [each.frame - at for each, at in zip(tracks, shift, strict=True)]
+        low = min(int(each.min(initial=0)) for each in frames)
+        high = max(int(each.max(initial=0)) for each in frames)
         every = np.arange(low, high + 1, step)
         busy = sum(len(each.frame) for each in tracks) / max(high - low, 1)
         count = min(len(every), int(_MOST_PLACED / max(busy, 1.0)))
@@ -71,11 +68,8 @@ class InSpace:
         none = np.zeros(0, np.intp)
         time, view, track, xy = [none], [none], [none], [np.zeros((0, tracks[0].rays.shape[1], 2))]
         for v, each in enumerate(tracks):
-            stop = np.append(each.first[1:], len(each.frame)) - 1
-            inside = (times[:, None] + shift[v] >= each.frame[each.first]) & (
-                times[:, None] + shift[v] < each.frame[stop]
-            )
-            row, which = np.nonzero(inside)
+            now = times[:, None] + shift[v]
+            row, which = np.nonzero((now >= each.frame[each.first]) & (now < each.lasts))
             time.append(row)  # frames of sightings are 0 or more
             view.append(np.full(len(row), v))
             track.append(which)
@@ -197,9 +191,8 @@ class InSpace:
         each /= size[rows, view][:, None, None]
         length = np.linalg.norm(each, axis=-1)
         known = (length[0] < GATE / 2) & (length[1:] < FASTEST / self.fps).all(axis=0)
-        miss, calm, fast = fast_part(
-            tuple(each), known[..., None], whom, whom, FAST_S * self.fps / self.step
-        )
+        width = FAST_S * self.fps / self.step
+        miss, calm, fast = (fast_part(part, known[..., None], whom, width) for part in each)
         if not known.any():
             return 0.0, np.full(blocks, np.inf)
         length = np.linalg.norm(miss, axis=-1)

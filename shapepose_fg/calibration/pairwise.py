@@ -6,12 +6,11 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
 
 from shapepose_fg.body.model.rotation import hat
 from shapepose_fg.calibration.relative import Together
-from shapepose_fg.calibration.tracks import FAST_S, Tracks, block_frames
-from shapepose_fg.core.arrays import Array, Index, Mask
+from shapepose_fg.calibration.tracks import FAST_S, Tracks, block_frames, fast_part
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Views
 from shapepose_fg.setup_check.matching import centres_of
 from shapepose_fg.setup_check.offset_scan import normals
@@ -80,12 +79,11 @@ class Pairwise:
                     continue
                 width = 3.8 * np.median(np.abs(miss[known]))
                 pace = max(float(np.median(np.diff(self.tracks[a].frame[rows]))), 1.0)
-                both = (
-                    np.where(known, np.clip(miss, -width, width), 0.0),
-                    np.where(known, change, 0.0),
+                who = self.tracks[a].track[rows] * len(self.tracks[b].first) + track
+                miss, change = (
+                    fast_part(each, known, who, FAST_S * self.fps / pace)
+                    for each in (np.clip(miss, -width, width), change)
                 )
-                smooth = FAST_S * self.fps / pace
-                miss, change = fast_part(both, known, self.tracks[a].track[rows], track, smooth)
                 width = 3.8 * np.median(np.abs(miss[known]))
                 weight = np.where(known, 1 / (1 + (miss / width) ** 2), 0.0) / width**2
                 own, score = (weight * change**2).sum(), (weight * change * miss).sum(axis=1)
@@ -108,27 +106,3 @@ class Pairwise:
             inverse = np.linalg.inv(H[1:, 1:])
             covariance[1:, 1:] = inverse @ (S.T @ S) @ inverse * len(S) / (len(S) - V)
         return shift, covariance
-
-
-def fast_part(
-    values: tuple[Array, ...], known: Mask, one: Index, other: Index, width: float
-) -> tuple[Array, ...]:
-    """Values (N, J) minus their local means over time, per track: this removes
-    correlated errors.
-    """
-    result = tuple(each.copy() for each in values)
-    edges = np.flatnonzero((np.diff(one) != 0) | (np.diff(other) != 0)) + 1
-    for start, stop in zip([0, *edges], [*edges, len(one)], strict=True):
-        there = known[start:stop]
-        for each in result:
-            each[start:stop] = np.where(there, without_means(each[start:stop], there, width), 0.0)
-    return result
-
-
-def without_means(values: Array, known: Mask, width: float) -> Array:
-    """Values (T, ...) minus local means of the `known` ones, with a Gaussian window of `width`
-    steps.
-    """
-    weight = gaussian_filter1d(known.astype(np.float64), width, axis=0, mode="constant")
-    mean = gaussian_filter1d(np.where(known, values, 0.0), width, axis=0, mode="constant")
-    return values - mean / np.maximum(weight, 1e-9)

@@ -4,9 +4,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import correlate1d
+from scipy.ndimage import correlate1d, gaussian_filter1d
 
-from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.skeleton import Skeleton
@@ -229,3 +229,18 @@ def block_frames(fps: float, lasts: float) -> float:
     frames.
     """
     return max(1.0, min(FAST_S * fps, lasts / 12))
+
+
+def fast_part(values: Array, known: Mask, track: Index, width: float) -> Array:
+    """Values (N, ...) minus local means of the `known` ones over the rows of a track (N,), with a
+    Gaussian window of `width` rows; 0 where unknown. This removes correlated errors.
+    """
+    result = np.zeros_like(values)
+    for rows in np.split(np.arange(len(track)), np.flatnonzero(np.diff(track)) + 1):
+        there, here = known[rows], np.where(known[rows], values[rows], 0.0)
+        weight, total = (
+            gaussian_filter1d(each, width, axis=0, mode="constant")
+            for each in (there.astype(np.float64), here)
+        )
+        result[rows] = np.where(there, here - total / np.maximum(weight, 1e-9), 0.0)
+    return result
