@@ -1,38 +1,56 @@
-"""Fit how uncertain people in single frames are (`Doubt` of `estimation/covariance_factors.py`) to
-the errors in simulated recordings, and average the noise laws learnt from them
-(`estimation/noise_law.py`).
+"""Fit how much larger covariances are than those of the graph (`Doubt` and `Lasting` of
+`estimation/covariance_factors.py`) to the errors in simulated recordings, and average the noise
+laws learnt from them (`estimation/noise_law.py`).
 
     python scripts/fit_covariances.py --mocap cmu_smpl24.npz --output covariances.json
 
-Crowds, crossings and pairs with two to six cameras, 4 s each, every frame by itself; a quarter of
-an hour on one core. The mean log score of the true joint under its Gaussian is maximised. Joints
-seen by two or more views and by one have fixed shares in it, and errors beyond `FAR` have little
-influence. Finally, covariances are scaled so that 95 % regions hold 95 %: errors have heavier tails
-than a Gaussian.
+Crowds, crossings and pairs with two to six cameras, 4 s each, every frame by itself and over time;
+half an hour on one core. The mean log score of the true joint under its Gaussian is maximised.
+In single frames joints seen by two or more views and by one have fixed shares in it; over time the
+recordings and people whose detections have new errors in every frame count half each. Errors beyond
+`FAR` have little influence. Finally, covariances are scaled so that 95 % regions of the recordings
+hold 95 %: errors have heavier tails than a Gaussian.
 """
 
 import argparse
 import json
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 from unittest.mock import patch
 
 import numpy as np
 from scipy.optimize import minimize
 from scipy.stats import chi2
 
+sys.path.insert(0, str(Path(__file__).parent.parent))
+
+from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.frame_times import FrameTimes
+from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.estimation import body_solution
-from shapepose_fg.estimation.covariance_factors import Doubt, covariance_factors, signs_of_doubt
+from shapepose_fg.estimation.body_window import Marginals
+from shapepose_fg.estimation.covariance_factors import (
+    Doubt,
+    Lasting,
+    covariance_factors,
+    signs_of_doubt,
+    signs_of_lasting,
+)
 from shapepose_fg.estimation.noise_law import NoiseLaw
-from shapepose_fg.evaluation.metrics import match_people
+from shapepose_fg.evaluation.metrics import Matches, match_people
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.pipeline import reconstruct
-from shapepose_fg.simulation import built_in_scene, simulate
+from shapepose_fg.simulation import Scene, built_in_scene, simulate
 from shapepose_fg.simulation.mocap import Mocap
+from shapepose_fg.simulation.scene import ring_of_cameras
 from shapepose_fg.simulation.sequences import SEQUENCES, Split, sequence
+from tests.pipeline.test_fast_limbs import seen, swinging
 
+Columns = tuple[Any, ...]
 CASES: tuple[tuple[str, Split, int, int], ...] = (
     ("crowd", "tune", 7001, 3), ("crossing", "tune", 7002, 3), ("crowd", "tune", 7003, 4),
     ("crossing", "tune", 7004, 4), ("two", "tune", 7005, 2), ("crowd", "tune", 7006, 3),
@@ -41,7 +59,8 @@ CASES: tuple[tuple[str, Split, int, int], ...] = (
     ("salsa", "tune", 7013, 4), ("salsa", "tune", 7014, 6),
 )  # fmt: skip
 """Scene, split, seed, number of cameras."""
-FRAMES, FPS = 120, 30.0
+FRAMES, FPS, NEW = 120, 30.0, 9
+"""Length and rate of the recordings, and number of people whose errors are new in every frame."""
 FAR = 30.0
 """Squared Mahalanobis distance beyond which the loss grows only logarithmically."""
 REJECTED_POWER = 1.5
@@ -59,13 +78,24 @@ def main() -> None:
     parser.add_argument("--output", type=Path, required=True, help="JSON file to be written")
     arguments = parser.parse_args()
     mocap = Mocap.load(arguments.mocap)
-    laws = list[NoiseLaw]()
-    parts = [part for case in CASES for part in errors(*case, mocap, laws)]
-    columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
+    laws, frames, windows = list[NoiseLaw](), list[Columns](), list[Columns]()
+    for case in CASES:
+        scene, seed = scene_of(*case, mocap), case[2]
+        given = simulate(scene, seed=seed), scene.rig, FrameTimes.from_fps(FPS, len(scene))
+        solved, people = solutions(*given, scene.cuts, temporal=False)
+        laws.append(NoiseLaw.from_dict(people.run["noise_law"]))
+        frames += (errors_in_frames(each, scene.keypoints) for each in solved)
+        solved, _ = solutions(*given, scene.cuts, temporal=True)
+        windows += (errors_over_time(each, scene.keypoints) for each in solved)
+    new = [part for seed in range(NEW) for part in new_errors(seed)]
+    columns = [np.concatenate(column) for column in zip(*frames, strict=True)]
+    doubt = fitted(*columns)
     content = {
-        "about": f"scripts/fit_covariances.py: {len(columns[0])} joints of simulated people",
+        "about": f"scripts/fit_covariances.py: {len(columns[0])} joints of simulated people in "
+        f"single frames, {sum(len(squared) for squared, *_ in windows)} over time",
         "noise": mean_law(laws),
-        "doubt": asdict(fitted(*columns)),
+        "doubt": asdict(doubt),
+        "lasting": asdict(fitted_over_time(windows, new, doubt)),
     }
     arguments.output.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
@@ -82,45 +112,81 @@ def mean_law(laws: list[NoiseLaw]) -> dict:
     ).as_dict()
 
 
-def errors(
-    name: str, split: Split, seed: int, cameras: int, mocap: Mocap, laws: list[NoiseLaw]
-) -> Iterator[tuple[np.ndarray, ...]]:
-    """For joints that views see, in each window: squared Mahalanobis distance of the true one under
-    the graph's covariance, number of views, and the person's signs of doubt.
-    """
+def scene_of(name: str, split: Split, seed: int, cameras: int, mocap: Mocap) -> Scene:
+    """The people and cameras of a case."""
     if name == "two":
-        scene = built_in_scene(seed, people=2, cameras=cameras, frames=FRAMES, fps=FPS)
-    else:
-        config = replace(SEQUENCES[name], seed=seed)
-        whole = sequence(name, split, mocap, cameras=cameras, until=FRAMES, fps=FPS, config=config)
-        scene = whole.part(range(FRAMES))
-    detections, solved = simulate(scene, seed=seed), []
+        return built_in_scene(seed, people=2, cameras=cameras, frames=FRAMES, fps=FPS)
+    config = replace(SEQUENCES[name], seed=seed)
+    whole = sequence(name, split, mocap, cameras=cameras, until=FRAMES, fps=FPS, config=config)
+    return whole.part(range(FRAMES))
+
+
+def solutions(
+    detections: DetectionSequence,
+    rig: Rig,
+    times: FrameTimes,
+    cuts: Sequence[int] = (),
+    *,
+    temporal: bool,
+) -> tuple[list[Marginals], Reconstruction]:
+    """The solved windows, or batches of single frames, and the result."""
+    solved = list[Marginals]()
     with patch.object(
         body_solution,
         "covariance_factors",
         lambda each, noise: solved.append(each) or covariance_factors(each, noise),
     ):
-        people = reconstruct(
-            detections,
-            scene.rig,
-            PipelineConfig(temporal=False),
-            times=FrameTimes.from_fps(FPS, len(detections)),
-            cuts=scene.cuts,
-        )
-    laws.append(NoiseLaw.from_dict(people.run["noise_law"]))
-    for marginals in solved:
-        window, joints = marginals.window, marginals.window.joints(marginals.state)
-        found = match_people(window.observations.frame, joints, scene.keypoints)
-        off = (joints[found.row] - scene.keypoints[found.frame, found.person])[..., None]
-        squared = (off.mT @ np.linalg.solve(marginals.joints()[found.row], off))[..., 0, 0]
-        views = window.last.evidence.inlier[found.row].sum(axis=-1)
-        sigma_m, told, used = signs_of_doubt(marginals)
-        signs = (
-            np.repeat(each[found.row, None], 25, 1)
-            for each in (sigma_m, 1 - used / np.maximum(told, 1e-9))
-        )
-        seen = views > 0
-        yield tuple(each[seen] for each in (squared, views, *signs))
+        config = PipelineConfig(temporal=temporal)
+        people = reconstruct(detections, rig, config, times=times, cuts=cuts)
+    return solved, people
+
+
+def squared_errors(marginals: Marginals, truth: np.ndarray) -> tuple[Matches, np.ndarray]:
+    """Rows that are one of the true people (F, P, J, 3), and the squared Mahalanobis distances of
+    their joints under the graph's covariance.
+    """
+    joints = marginals.window.joints(marginals.state)
+    found = match_people(marginals.window.observations.frame, joints, truth)
+    off = (joints[found.row] - truth[found.frame, found.person])[..., None]
+    squared = off.mT @ np.linalg.solve(marginals.joints()[found.row], off)
+    return found, squared[..., 0, 0]
+
+
+def errors_in_frames(marginals: Marginals, truth: np.ndarray) -> Columns:
+    """For joints that views see: squared distance, number of views, and the person's signs of
+    doubt.
+    """
+    found, squared = squared_errors(marginals, truth)
+    views = marginals.window.last.evidence.inlier[found.row].sum(axis=-1)
+    sigma_m, told, used = signs_of_doubt(marginals)
+    rejected = 1 - used / np.maximum(told, 1e-9)
+    signs = (np.repeat(each[found.row, None], 25, 1) for each in (sigma_m, rejected))
+    seen = views > 0
+    return tuple(each[seen] for each in (squared, views, *signs))
+
+
+def errors_over_time(marginals: Marginals, truth: np.ndarray) -> Columns:
+    """For joints that views see: squared distances; for the window: share of rejected evidence, and
+    signs of lasting errors.
+    """
+    found, squared = squared_errors(marginals, truth)
+    seen = marginals.window.last.evidence.inlier[found.row].any(axis=-1)
+    _, told, used = signs_of_doubt(marginals)
+    rejected = 1 - used.sum() / max(told.sum(), 1e-9)
+    return squared[seen], rejected, *map(np.array, signs_of_lasting(marginals))
+
+
+def new_errors(seed: int) -> Iterator[Columns]:
+    """`errors_over_time` of a person who swings arm and leg, with detections whose errors are new
+    in every frame.
+    """
+    rng = np.random.default_rng(seed)
+    rig = ring_of_cameras(3 + seed % 3, rng)
+    fps = (10, 30, 60)[seed % 3]
+    truth = swinging(np.arange(3 * fps) / fps, rng.uniform(0.5, 3.0))
+    times = FrameTimes.from_fps(fps, len(truth))
+    for each in solutions(seen(rig, truth, rng), rig, times, temporal=True)[0]:
+        yield errors_over_time(each, truth[:, None])
 
 
 def fitted(
@@ -131,9 +197,7 @@ def fitted(
 
     def loss(numbers: np.ndarray) -> float:
         factor = Doubt(np.exp(numbers[0]), numbers[1], REJECTED_POWER).in_frames(sigma_m, rejected)
-        off = squared / factor
-        off = np.where(off > FAR, FAR * (1 + np.log(np.maximum(off, FAR) / FAR)), off)
-        return float((share * (off + 3 * np.log(factor))).sum())
+        return float((share * (limited(squared / factor) + 3 * np.log(factor))).sum())
 
     numbers = minimize(loss, (0.0, 1.0), method="Nelder-Mead").x
     power = float(numbers[1])
@@ -142,6 +206,35 @@ def fitted(
     at = np.searchsorted(np.cumsum(share[order]) / share.sum(), 0.95)
     scale = off[order][at] / chi2.ppf(0.95, 3)
     return Doubt(round(float(scale), 2), round(power, 2), REJECTED_POWER)
+
+
+def fitted_over_time(windows: list[Columns], new: list[Columns], doubt: Doubt) -> Lasting:
+    """The numbers of least loss over windows of recordings and of people with new errors, half
+    each, scaled for 95 % of the joints in recordings.
+    """
+
+    def off(numbers: np.ndarray, parts: list[Columns]) -> Iterator[tuple[np.ndarray, float]]:
+        """Squared distances by window, under the widened covariances, and the factor."""
+        for squared, rejected, share, alone in parts:
+            factor = Lasting(*np.exp(numbers)).factor(share, alone) * doubt.of_rejected(rejected)
+            yield squared / factor, float(factor)
+
+    def loss(numbers: np.ndarray) -> float:
+        total = 0.0
+        for parts in (windows, new):
+            each = [(limited(part) + 3 * np.log(by)).sum() for part, by in off(numbers, parts)]
+            total += sum(each) / sum(len(squared) for squared, *_ in parts)
+        return total
+
+    numbers = minimize(loss, (0.0, 0.0), method="Nelder-Mead").x
+    every = np.concatenate([part for part, _ in off(numbers, windows)])
+    scale = np.quantile(every, 0.95) / chi2.ppf(0.95, 3)
+    return Lasting(*np.round(np.exp(numbers) * scale, 2).tolist())
+
+
+def limited(squared: np.ndarray) -> np.ndarray:
+    """Squared distances whose influence ends at `FAR`."""
+    return np.where(squared > FAR, FAR * (1 + np.log(np.maximum(squared, FAR) / FAR)), squared)
 
 
 if __name__ == "__main__":

@@ -50,7 +50,7 @@ _LEAST_SHARE, _LEAST_LEAD, _LEAST_PEOPLE = 0.7, 1.25, 25
 that of any other start, and minimum number."""
 _KNOT_S = 3.0
 """Time between the knots between which an odometry drifts linearly, s."""
-_VIEWS_CHANGE = 0.5
+_VIEWS_CHANGE = 0.7
 """Ratio of the correlated errors of a detector that count as one in a camera that moves to those in
 a fixed one; it sees people from changing directions (scripts/check_phones.py)."""
 _DRIFTS = np.log(3.0)
@@ -565,12 +565,15 @@ class _Fit:
             x = x - step
             if np.abs(step).max() < _CONVERGED:
                 break
-        covariance = _with_drift(information, x, kinds)
+        ratio, covariance = _with_drift(information, x, kinds)
         x = covariance @ (information @ x + x)
         slopes = self._poses(x)[1]
+        # A random walk deviates from the line between two knots.
+        between = (self._steps * np.repeat(ratio, 3)).T ** 2 / 6 / max(len(self._steps), 1)
         slopes = slopes[np.linspace(0, len(slopes) - 1, _SAMPLES).astype(np.intp)]
         (turn, turn_most), (move, move_most) = (
-            _root_mean_square(slopes[:, part], covariance) for part in np.split(np.arange(6), 2)
+            _root_mean_square(slopes[:, part], covariance, float(between[part].sum()))
+            for part in np.split(np.arange(6), 2)
         )
         return replace(
             self.moved(x),
@@ -581,18 +584,20 @@ class _Fit:
         )
 
 
-def _root_mean_square(slopes: Array, covariance: Array) -> tuple[float, float]:
-    """Root mean square of the errors `slopes` (F, 3, P) x, for x of a `covariance`, and the bound
-    of it with the probability `_SURE`: the squares have about a gamma distribution.
+def _root_mean_square(slopes: Array, covariance: Array, more: float) -> tuple[float, float]:
+    """Root mean square of the errors `slopes` (F, 3, P) x, for x of a `covariance`, with `more`
+    variance of independent errors, and the bound of it with the probability `_SURE`: the squares
+    have about a gamma distribution.
     """
     errors = np.einsum("fpn,fpm->nm", slopes, slopes) @ covariance / len(slopes)
     mean, scale = float(np.trace(errors)), 2 * float((errors * errors.T).sum() / np.trace(errors))
-    return mean**0.5, float(scale * gammaincinv(mean / scale, _SURE)) ** 0.5
+    bound = scale * float(gammaincinv(mean / scale, _SURE))
+    return (mean + more) ** 0.5, (bound + more) ** 0.5
 
 
-def _with_drift(information: Array, x: Array, kinds: Index) -> Array:
-    """Covariance of the parameters `x`, for the most probable ratios of the drift's rotations and
-    translations to their standard deviations.
+def _with_drift(information: Array, x: Array, kinds: Index) -> tuple[Array, Array]:
+    """Most probable ratios (2,) of the drift's rotations and translations to their standard
+    deviations, and the covariance of the parameters `x` for these.
 
     Parameters have a unit prior that `information` does not include; they are rotations (0 in
     `kinds`) or translations (1) of the drift, or others (-1). The ratios' prior is log-normal;
@@ -600,15 +605,15 @@ def _with_drift(information: Array, x: Array, kinds: Index) -> Array:
     """
     both = information @ x + x
 
-    def judged(ratio: Array) -> tuple[float, Array]:
+    def judged(ratio: Array) -> tuple[float, Array, Array]:
         sigma = np.where(kinds < 0, 1.0, ratio[kinds])
         inverse = np.asarray(np.linalg.inv(information + np.diag(1 / sigma**2)), np.float64)
         prior = 0.5 * float((np.log(ratio) ** 2).sum()) / _DRIFTS**2
         spread = float(0.5 * np.linalg.slogdet(inverse)[1] - np.log(sigma).sum())
-        return spread + 0.5 * float(both @ inverse @ both) - prior, inverse
+        return spread + 0.5 * float(both @ inverse @ both) - prior, ratio, inverse
 
     ratios = product(np.exp(_DRIFTS * np.linspace(-2, 1, 13)), repeat=2)
-    return max(map(judged, map(np.array, ratios)), key=lambda each: each[0])[1]
+    return max(map(judged, map(np.array, ratios)), key=lambda each: each[0])[1:]
 
 
 @dataclass(frozen=True)

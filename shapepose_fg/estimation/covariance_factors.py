@@ -7,6 +7,7 @@ All covariances of a graph get one factor, by which neither its solution nor its
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import as_file, files
+from typing import Any
 
 import numpy as np
 
@@ -18,10 +19,6 @@ USUAL_M = 0.01
 """Standard deviation of people whom all views see, metres."""
 REJECTED = 0.1
 """Share of rejected evidence that means as much as a doubled variance."""
-_NEW, _LASTING = 0.5, 1.8
-"""Factors on the covariances that new and lasting errors of detections leave (`of_lasting_errors`),
-since residuals show fewer of the lasting ones. With them 95 % regions hold in most recordings
-(docs/evaluation/covariances.md)."""
 _LASTS_S, _LASTS, _PRIOR_COUNT = 1.0, 0.4, 20.0
 """Time apart, s, at which residuals are compared for lasting errors; the usual share of these, and
 its weight as a number of squared standard deviations."""
@@ -29,6 +26,29 @@ _LOOKS = 8
 """Number of frames, evenly over the window, from which it is taken how much it averages."""
 _ANYWHERE = 1e-3
 """Information on the place and direction of a body in a frame by itself, 1/m² and 1/rad²."""
+
+
+@dataclass(frozen=True)
+class Lasting:
+    """How errors of detections that are new in a frame, and those that last, add up in a window."""
+
+    new: float
+    """Factor on the variances that errors leave which are new in every frame."""
+    lasting: float
+    """Factor on the variances that errors leave which last. It is larger, since residuals show
+    fewer of these."""
+
+    @classmethod
+    @cache
+    def measured(cls) -> "Lasting":
+        """The numbers that ship, measured by `scripts/fit_covariances.py`."""
+        return cls(**_measured()["lasting"])
+
+    def factor(self, share: Array | float, alone: Array | float) -> Array | float:
+        """Factor on the variances of a window, for the share of errors that last, and how many
+        times larger variances are that the same views leave in a frame by itself.
+        """
+        return self.new * (1 - share) + self.lasting * share * alone
 
 
 @dataclass(frozen=True)
@@ -49,8 +69,7 @@ class Doubt:
     @cache
     def measured(cls) -> "Doubt":
         """The numbers that ship, measured by `scripts/fit_covariances.py`."""
-        with as_file(files("shapepose_fg.estimation") / "data" / "covariances.json") as path:
-            return cls(**read_json(path)["doubt"])
+        return cls(**_measured()["doubt"])
 
     def in_frames(self, sigma_m: Array, rejected: Array) -> Array:
         """(T,) factors on variances in single frames, which show less of who is who."""
@@ -59,6 +78,12 @@ class Doubt:
     def of_rejected(self, rejected: Array) -> Array:
         """Factors on variances for shares of rejected evidence."""
         return (1 + rejected / REJECTED) ** self.rejected
+
+
+@cache
+def _measured() -> dict[str, Any]:
+    with as_file(files("shapepose_fg.estimation") / "data" / "covariances.json") as path:
+        return read_json(path)
 
 
 def covariance_factors(marginals: Marginals, noise: float) -> Array:
@@ -70,7 +95,8 @@ def covariance_factors(marginals: Marginals, noise: float) -> Array:
     if not marginals.window.over_time:
         return doubt.in_frames(sigma_m, 1 - used / np.maximum(told, 1e-9))
     rejected = 1 - used.sum(keepdims=True) / max(told.sum(), 1e-9)
-    return noise * of_lasting_errors(marginals) * doubt.of_rejected(rejected)
+    lasting = Lasting.measured().factor(*signs_of_lasting(marginals))
+    return noise * lasting * doubt.of_rejected(rejected)
 
 
 def signs_of_doubt(marginals: Marginals) -> tuple[Array, Array, Array]:
@@ -84,18 +110,17 @@ def signs_of_doubt(marginals: Marginals) -> tuple[Array, Array, Array]:
     return sigma_m, told.sum(axis=(1, 2)), used.sum(axis=(1, 2))
 
 
-def of_lasting_errors(marginals: Marginals) -> float:
-    """How many times larger variances of a window are because detectors' errors last.
+def signs_of_lasting(marginals: Marginals) -> tuple[float, float]:
+    """The share of a window's errors that last, and how many times larger than those of the window
+    the variances are that the same views leave in a frame by itself.
 
-    Errors that are new in every frame are averaged over time, and leave the covariances of the
-    window. Those that last are not, and leave what the same views cause in a frame by itself. The
-    share that lasts is measured in the window.
+    Errors that are new in every frame are averaged over time, those that last are not.
     """
     window, last = marginals.window, marginals.window.last
     some = slice(None, None, max(len(window) // _LOOKS, 1))
     seen = np.asarray(last.evidence.inlier.any(axis=-1))[some]
     if not seen.any():
-        return 1.0
+        return 1.0, 1.0
     slope, gain = marginals.slopes[some, ..., 10:], last.gain[some]
     variance = window.variance[some, ..., None, None]
     (T, J), N = seen.shape, slope.shape[-1]
@@ -108,10 +133,7 @@ def of_lasting_errors(marginals: Marginals) -> float:
     kept = np.eye(3) - gain
     alone = np.trace(kept @ of_body @ kept.mT + variance * kept, axis1=-2, axis2=-1)
     over_time = np.trace(marginals.joints()[some], axis1=-2, axis2=-1)
-    share = _share_lasting(marginals)
-    return _NEW * (1 - share) + _LASTING * share * float(
-        np.exp(np.log(alone / over_time)[seen].mean())
-    )
+    return _share_lasting(marginals), float(np.exp(np.log(alone / over_time)[seen].mean()))
 
 
 def _share_lasting(marginals: Marginals) -> float:

@@ -15,7 +15,7 @@ from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.body_window import BodyWindow
 from shapepose_fg.estimation.body_window_graph import BodyGraph, ordering
 from shapepose_fg.estimation.condensed_graph import gtsam_step
-from shapepose_fg.estimation.covariance_factors import covariance_factors, of_lasting_errors
+from shapepose_fg.estimation.covariance_factors import Lasting, covariance_factors, signs_of_lasting
 from shapepose_fg.estimation.graph_covariances import graph_covariances
 from shapepose_fg.estimation.linearisation import ObservationConfig, observation_sigmas
 from shapepose_fg.estimation.motion_model import MotionModel
@@ -71,6 +71,10 @@ def _person(
     return window, truth, free + 0.05 * rng.normal(size=free.shape)
 
 
+def _lasting(marginals) -> float:
+    return float(Lasting.measured().factor(*signs_of_lasting(marginals)))
+
+
 def test_joints_are_nearer_the_truth_than_their_views_alone() -> None:
     window, truth, start = _person(0)
     joints = window.joints(window.solve(start))
@@ -104,7 +108,7 @@ def test_covariances_grow_where_errors_last() -> None:
             window, truth, start = _person(seed, lasts=lasts, step_s=0.2)
             state = window.solve(start)
             away, marginals = window.joints(state) - truth, window.covariances(state)
-            factors[lasts].append(of_lasting_errors(marginals))
+            factors[lasts].append(_lasting(marginals))
             covariance = factors[lasts][-1] * marginals.joints()
             whitened = np.linalg.solve(covariance, away[..., None])[..., 0]
             inside[lasts].append(np.einsum("tji,tji->tj", away, whitened) < 7.815)
@@ -118,7 +122,7 @@ def test_a_window_with_another_person_s_detections_is_less_sure() -> None:
         window, _, start = _person(0)
         window.observations.xy[:frames, :8, 0] += 400.0  # another person's arms and head
         marginals = window.covariances(window.solve(start))
-        factors.append(covariance_factors(marginals, 1.0)[0] / of_lasting_errors(marginals))
+        factors.append(covariance_factors(marginals, 1.0)[0] / _lasting(marginals))
     assert factors[0] < 1.05 and factors[1] > 1.1 * factors[0]
 
 
