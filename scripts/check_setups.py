@@ -55,7 +55,8 @@ def main() -> None:
     arguments = parser.parse_args()
     rows = list[list[object]]()
     for file in arguments.read or ():
-        rows += csv.reader(file.open(newline=""))
+        lines = file.read_text(encoding="utf-8").splitlines()
+        rows += [list[object](line) for line in csv.reader(lines)]
     for seed in () if rows else range(*map(int, arguments.rigs.split(":"))):
         rng = np.random.default_rng([seed, 20])
         people, cameras = int(rng.choice([1, 2, 3, 4, 6, 8])), int(rng.integers(3, 7))
