@@ -306,7 +306,7 @@ class Filmed:
         """
         cure = (
             "film the people whom the other cameras see for half a minute while they walk about, "
-            "and check its log and its field of view"
+            "and check its log, its field of view and the measured distance"
         )
 
         def refuse(why: str) -> Undetermined:

@@ -78,21 +78,21 @@ def align(clocks: Sequence[CameraClock], has_clock: bool, cure: str = "check --s
     picture = np.column_stack([place for place, _ in nearest])
     notes = list[str]()
     for each, (place, off) in zip(clocks, nearest, strict=True):
-        missing, misfit = np.flatnonzero(place < 0), 1e3 * off[place >= 0]
+        missing, misfit, found = np.flatnonzero(place < 0), 1e3 * off[place >= 0], list[str]()
         if left_out := _left_out(each, place, slowest):
-            what = "frames without a picture of every camera are left out"
-            notes.append(f"camera {each.name}: {what}, {left_out}")
+            found.append(f"frames without a picture of every camera are left out, {left_out}")
         if len(missing) > 0:
-            notes.append(
-                f"camera {each.name}: {len(missing)} of {len(moment)} synchronised frames have "
-                f"no picture within half a frame (the first is frame {missing[0]}); they are "
-                "read as frames without people"
+            found.append(
+                f"{len(missing)} of {len(moment)} synchronised frames have no picture within half "
+                f"a frame (the first is frame {missing[0]}) and are read as frames without people"
             )
         if has_clock and misfit.max(initial=0.0) > 1e3 * _MISFIT_S:
-            notes.append(
-                f"camera {each.name}: pictures are up to {misfit.max():.1f} ms from the time of "
-                f"their synchronised frame ({misfit.mean():.1f} ms on average)"
+            found.append(
+                f"pictures are up to {misfit.max():.1f} ms from the time of their synchronised "
+                f"frame ({misfit.mean():.1f} ms on average)"
             )
+        if found:
+            notes.append(f"camera {each.name}: {'; '.join(found)}")
     time_s = None
     if has_clock:
         taken = [
