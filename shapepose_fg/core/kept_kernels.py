@@ -14,14 +14,13 @@ import sys
 import tempfile
 import uuid
 from collections.abc import Callable
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from types import FunctionType
 from typing import Any, cast
 
 import numba
 from llvmlite.binding import get_host_cpu_features, get_host_cpu_name
-from numba.core.runtime.nrt import rtsys
 
 from shapepose_fg.core.storage.files import user_cache
 
@@ -129,20 +128,9 @@ def kept_in(folder: Path, function: Any, njit: Callable[[Any], Any]) -> Any:
     copy.__qualname__ = function.__qualname__
     given, NUMBA.CACHE_DIR = NUMBA.CACHE_DIR, ""
     try:
-        compiled = njit(copy)
+        return njit(copy)
     finally:
         NUMBA.CACHE_DIR = given
-    compiled._cache.load_overload = partial(_load, compiled._cache)
-    return compiled
-
-
-def _load(cache: Any, signature: Any, target: Any) -> Any:
-    """Numba's `Cache.load_overload` without the registries of all functions that it can compile,
-    whose import takes a third of a second; if it has to compile, it loads them itself.
-    """
-    rtsys.initialize(target)
-    with cache._guard_against_spurious_io_errors():
-        return cache._load_overload(signature, target)
 
 
 @cache
