@@ -18,7 +18,7 @@ from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.errors import InputError, naming, optional
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.core.storage.files import MIDDLE, SMALL, open_regular
+from shapepose_fg.core.storage.files import open_regular
 from shapepose_fg.core.trajectory import LONGEST_GAP_S, Trajectory
 from shapepose_fg.io.camera_names import listing
 from shapepose_fg.io.detections.lines import view_of
@@ -28,9 +28,11 @@ from shapepose_fg.io.ros.poses import KINDS, Frames, frame_of, stamp_ns
 from shapepose_fg.io.ros.topics import PeopleTopics
 
 _DETECTIONS = "shapepose_msgs/Detections"
-_CHUNK = MIDDLE
-"""Maximum size of a decompressed chunk, bytes, and of the window of zstd; ROS 2 writes chunks of
-one million bytes."""
+_CHUNK = 2**26
+"""Maximum size of a decompressed chunk, bytes; ROS 2 writes chunks of one million bytes."""
+_WINDOW, _MOST_RECORDS = 2**27, 2**19
+"""Maximum window size of zstd, bytes (the default of its command-line program); and maximum number
+of records of a chunk, which are all in memory."""
 _CURE = f"give MCAP with ROS 2 messages {type_name(_DETECTIONS)}"
 _CURE_POSES = "give MCAP with ROS 2 messages of /tf, odometry or poses"
 _LOOK_S = 0.1
@@ -257,7 +259,7 @@ def _messages(stream: IO[bytes]) -> Iterator[tuple[Any, Any, Any]]:
 
 def _unpacked(chunk: Any) -> bytes:
     """The records of a chunk. ValueError for more than `_CHUNK` bytes (not decompressed further),
-    for more than `SMALL` records, and for records that extend beyond the chunk.
+    for more than `_MOST_RECORDS` records, and for records that extend beyond the chunk.
     """
     lz4, zstd = optional("lz4.frame", "ros"), optional("zstandard", "ros")
     claims = {
@@ -272,7 +274,9 @@ def _unpacked(chunk: Any) -> bytes:
         data = lz4.LZ4FrameDecompressor().decompress(chunk.data, max_length=_CHUNK + 1)
     elif chunk.compression == "zstd":
         data = (
-            zstd.ZstdDecompressor(max_window_size=_CHUNK).stream_reader(chunk.data).read(_CHUNK + 1)
+            zstd.ZstdDecompressor(max_window_size=_WINDOW)
+            .stream_reader(chunk.data)
+            .read(_CHUNK + 1)
         )
     else:
         data = chunk.data
@@ -281,7 +285,7 @@ def _unpacked(chunk: Any) -> bytes:
     at = count = 0
     while at < len(data):
         at, count = at + 9 + int.from_bytes(data[at + 1 : at + 9], "little"), count + 1
-        if at > len(data) or count > SMALL:
+        if at > len(data) or count > _MOST_RECORDS:
             raise ValueError(
                 "a record ends beyond its chunk"
                 if at > len(data)
