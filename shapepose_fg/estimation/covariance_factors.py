@@ -6,14 +6,12 @@ All covariances of a graph get one factor, by which neither its solution nor its
 
 from dataclasses import dataclass
 from functools import cache
-from importlib.resources import as_file, files
-from typing import Any
 
 import numpy as np
 
 from shapepose_fg.core.arrays import Array
-from shapepose_fg.core.storage.files import read_json
 from shapepose_fg.estimation.body_window import Marginals
+from shapepose_fg.estimation.noise_law import shipped_covariances
 
 USUAL_M = 0.01
 """Standard deviation of people whom all views see, metres."""
@@ -42,7 +40,7 @@ class Lasting:
     @cache
     def measured(cls) -> "Lasting":
         """The numbers that ship, measured by `scripts/fit_covariances.py`."""
-        return cls(**_measured()["lasting"])
+        return cls(**shipped_covariances()["lasting"])
 
     def factor(self, share: Array | float, alone: Array | float) -> Array | float:
         """Factor on the variances of a window, for the share of errors that last, and how many
@@ -69,7 +67,7 @@ class Doubt:
     @cache
     def measured(cls) -> "Doubt":
         """The numbers that ship, measured by `scripts/fit_covariances.py`."""
-        return cls(**_measured()["doubt"])
+        return cls(**shipped_covariances()["doubt"])
 
     def in_frames(self, sigma_m: Array, rejected: Array) -> Array:
         """(T,) factors on variances in single frames, which show less of who is who."""
@@ -78,12 +76,6 @@ class Doubt:
     def of_rejected(self, rejected: Array) -> Array:
         """Factors on variances for shares of rejected evidence."""
         return (1 + rejected / REJECTED) ** self.rejected
-
-
-@cache
-def _measured() -> dict[str, Any]:
-    with as_file(files("shapepose_fg.estimation") / "data" / "covariances.json") as path:
-        return read_json(path)
 
 
 def covariance_factors(marginals: Marginals, noise: float) -> Array:

@@ -47,6 +47,13 @@ _ROUNDS = 40
 """Number of iterations of expectation maximisation."""
 
 
+@cache
+def shipped_covariances() -> dict[str, Any]:
+    """The numbers that `scripts/fit_covariances.py` measured."""
+    with as_file(files("shapepose_fg.estimation") / "data" / "covariances.json") as path:
+        return read_json(path)
+
+
 @dataclass(frozen=True)
 class NoiseLaw:
     """Error distribution in K ranges of scores: a Gaussian core and a share of gross errors."""
@@ -75,8 +82,7 @@ class NoiseLaw:
     @cache
     def shipped(cls) -> "NoiseLaw":
         """The mean law of simulated recordings (`scripts/fit_covariances.py`)."""
-        with as_file(files("shapepose_fg.estimation") / "data" / "covariances.json") as path:
-            return cls.from_dict(read_json(path)["noise"])
+        return cls.from_dict(shipped_covariances()["noise"])
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> "NoiseLaw":
