@@ -5,7 +5,7 @@ A world is a global hypothesis: a set of tracks that share no detection. People 
 several frames, tracked from there forwards and backwards, and the tracks that explain most are
 selected (`track_selection.py`). The selected people are then joined in one world in the frames that
 show them best, and tracked again from there, so that they no longer take each other's detections.
-People with evidence throughout are tracked once; alternatives are sought in what they leave.
+Alternatives are sought in what people with evidence throughout leave.
 """
 
 from collections.abc import Iterable, Sequence
@@ -42,8 +42,8 @@ again, and the best different one: on ten simulated recordings, most before thre
 PLACED_M = 0.2
 """Standard deviation below which a track's joint has a known position, m."""
 _PLAIN, _PLAIN_S = 0.25, 0.3
-"""Minimum evidence per second, over any window of `_PLAIN_S` s, with which a person is tracked only
-once; in simulated crowds, alternatives are found only for people with less."""
+"""Minimum evidence per second, over any window of `_PLAIN_S` s, of a person to whom no
+alternatives are sought; in simulated crowds, they are found only for people with less."""
 _SAME_M = 0.02
 """Maximum distance between joints of two worlds with the same detections for these to
 be merged, m."""
@@ -145,7 +145,7 @@ def explained(
     found = Hypotheses.concatenate(
         [found, follow_worlds(tracker, rest, _seeds(tracker, rest.frames), keep)]
     )
-    before = 0.0
+    before, rest = 0.0, Rest.of(frames)
     for _ in range(_ROUNDS):
         best, *others = found.account.ways(found.world, on_trial=True)
         if best.evidence_s.sum() <= (1 + _GAIN) * before:
@@ -153,9 +153,7 @@ def explained(
         before = float(best.evidence_s.sum())
         unlike = (way for way in others if found.account.agreement(best, way) < _ALIKE)
         ways = (best, *islice(unlike, 1))
-        again = [
-            seed for way in ways for seed in _restarts(tracker, rest, times, found, way, plain)
-        ]
+        again = [seed for way in ways for seed in _restarts(tracker, frames, times, found, way)]
         found = Hypotheses.concatenate([found, follow_worlds(tracker, rest, again, keep)])
     return found, found.account.choose(found.world)
 
@@ -252,30 +250,27 @@ def _seed(
 
 def _restarts(
     tracker: Tracker,
-    rest: Rest,
+    frames: Sequence[Input],
     times: Array,
     found: Hypotheses,
     chosen: SelectedTracks,
-    plain: NDArray[np.bool_],
 ) -> list[Seed]:
-    """Worlds of all selected people but the first, `plain` ones, each from the frame of a
-    `_RESTART_S` interval that shows them best.
+    """Worlds of all selected people, each from the frame of a `_RESTART_S` interval that shows them
+    best.
     """
-    T = len(times)
-    again = chosen.rows(~np.isin(chosen.hypothesis, np.flatnonzero(plain)))
-    placed = np.isfinite(found.places[again.hypothesis]).all(axis=-1).any(axis=-1)
-    there = np.array([again.during(t) for t in range(T)]).T & placed
-    share = found.weight[again.hypothesis].sum(axis=(2, 3))
+    T = len(frames)
+    placed = np.isfinite(found.places[chosen.hypothesis]).all(axis=-1).any(axis=-1)
+    there = np.array([chosen.during(t) for t in range(T)]).T & placed
+    share = found.weight[chosen.hypothesis].sum(axis=(2, 3))
     worth = np.where(there, share, -0.5).sum(axis=0)
     parts = np.array_split(np.arange(T), min(T, max(1, round((times[-1] - times[0]) / _RESTART_S))))
     seeds = []
     for part in parts:
         key = int(part[worth[part].argmax()])
-        who = again.hypothesis[there[:, key]]
+        who = chosen.hypothesis[there[:, key]]
         if len(who) > 0:
-            index, own = rest.index[key], found.candidate[who, key].astype(np.intp)
-            own = np.where(own >= 0, np.searchsorted(index[:-1], own), -1)
-            seeds.append(_seed(tracker, rest.frames, key, found.places[who, key], own))
+            own = found.candidate[who, key].astype(np.intp)
+            seeds.append(_seed(tracker, frames, key, found.places[who, key], own))
     return seeds
 
 
