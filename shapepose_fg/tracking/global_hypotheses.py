@@ -136,8 +136,8 @@ def explained(
         times_of(frames),
         np.full((len(carried), len(tracker.skeleton), len(frames[0].rig)), -1),
     )
-    on = Seed(-1, carried, unseen, backwards=False)
-    found = follow_worlds(tracker, Rest.of(frames), [on], keep)
+    on, everything = Seed(-1, carried, unseen, backwards=False), Rest.of(frames)
+    found = follow_worlds(tracker, everything, [on], keep)
     plain = _plain(found, times)
     if plain.all():
         return found, found.account.choose(found.world)
@@ -145,7 +145,7 @@ def explained(
     found = Hypotheses.concatenate(
         [found, follow_worlds(tracker, rest, _seeds(tracker, rest.frames), keep)]
     )
-    before, rest = 0.0, Rest.of(frames)
+    before = 0.0
     for _ in range(_ROUNDS):
         best, *others = found.account.ways(found.world, on_trial=True)
         if best.evidence_s.sum() <= (1 + _GAIN) * before:
@@ -154,7 +154,7 @@ def explained(
         unlike = (way for way in others if found.account.agreement(best, way) < _ALIKE)
         ways = (best, *islice(unlike, 1))
         again = [seed for way in ways for seed in _restarts(tracker, frames, times, found, way)]
-        found = Hypotheses.concatenate([found, follow_worlds(tracker, rest, again, keep)])
+        found = Hypotheses.concatenate([found, follow_worlds(tracker, everything, again, keep)])
     return found, found.account.choose(found.world)
 
 
