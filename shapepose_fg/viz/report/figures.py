@@ -168,19 +168,18 @@ CURVES = (
     "elbow_flexion",
 )  # fmt: skip
 """Angles that the report draws, of both sides."""
-_DRAWN_PEOPLE, _DRAWN_FRAMES = 8, 80
-"""Maximum numbers of people with curves, and of frames of each, so that the page stays small and
-quick to make: 2 ms per row."""
 
 
 def angle_curves(people: Reconstruction, up: Axis, model: BodyModel) -> dict[int, list[Curve]]:
     """The curves of the people with the most rows, by number of the person."""
     numbers, counts = np.unique(people.person, return_counts=True)
     drawn = dict[int, list[Curve]]()
-    for who in np.sort(numbers[np.argsort(-counts, kind="stable")[:_DRAWN_PEOPLE]]).tolist():
+    # Maximum numbers of people with curves, and of frames of each, so that the page stays small and
+    # quick to make: 2 ms per row.
+    for who in np.sort(numbers[np.argsort(-counts, kind="stable")[:8]]).tolist():
         rows = np.flatnonzero(people.person == who)
         rows = rows[np.argsort(people.frame[rows], kind="stable")]
-        rows = rows[:: -(-len(rows) // _DRAWN_FRAMES)]
+        rows = rows[:: -(-len(rows) // 80)]
         angles = joint_angles(people.rows(rows), up, model)
         drawn[who] = [
             Curve.of(name, angles, people.frame[rows])
