@@ -41,7 +41,9 @@ class _Distances(BaseModel, strict=True):
 
 
 class CameraEntry(BaseModel, strict=True):
-    """The entry of run.json about the detections of a camera (`UsedDetections`)."""
+    """The entry of run.json about the detections of a camera, as `setup_check.report.CameraUse`
+    writes it.
+    """
 
     camera: str = ""
     offered: int | None = None

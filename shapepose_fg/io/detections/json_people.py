@@ -279,7 +279,7 @@ def _lists(folder: Path) -> list[Path]:
 
 
 def _known(item: Any) -> bool:
-    """Whether this is an item of a list in one of the programs' formats."""
+    """Whether `item` of a JSON list is a person, or a picture's people, in a supported format."""
     return isinstance(item, dict) and ("image_id" in item or "instances" in item)
 
 

@@ -28,7 +28,7 @@ its 12,488 vertices, which a page can draw in every frame."""
 
 @dataclass(frozen=True)
 class Scene:
-    """Data of a page, and the frames of the recording in it."""
+    """What the 3D scene of a report page draws, and in which frames of the recording."""
 
     data: dict[str, Any]
     """The data for the page's script: plain values for JSON."""
