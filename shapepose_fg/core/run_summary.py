@@ -153,6 +153,11 @@ def covered_frames(run: Mapping[str, Any]) -> list[range] | None:
         ) from None
 
 
+def has_identities(run: Mapping[str, Any]) -> bool:
+    """Whether people of a run were followed over time, so that their numbers are identities."""
+    return bool(run.get("configuration", {}).get("temporal", True))
+
+
 def check_frames(run: Mapping[str, Any]) -> None:
     """ValueError if a run says that it covered frames of which there cannot be so many."""
     spans = covered_frames(run) or []

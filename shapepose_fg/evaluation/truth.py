@@ -17,7 +17,7 @@ from shapepose_fg.core.frame_times import spans_of
 from shapepose_fg.core.joint_names import keypoint_names, layouts_called
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.result_files import PEOPLE
-from shapepose_fg.core.run_summary import covered_frames
+from shapepose_fg.core.run_summary import covered_frames, has_identities
 from shapepose_fg.core.skeleton import SMPL_24
 from shapepose_fg.core.storage.files import MIDDLE, read_bytes, read_json
 from shapepose_fg.core.storage.npz import NpzFile, read_npz
@@ -99,7 +99,7 @@ def people_of(result: Reconstruction) -> PlainPeople:
         tuple(result.joint_names.tolist()),
         result.covariance,
         covered_frames(result.run),
-        identified=bool(result.run.get("configuration", {}).get("temporal", True)),
+        identified=has_identities(result.run),
     )
 
 

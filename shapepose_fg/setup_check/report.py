@@ -17,6 +17,7 @@ from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.reconstruction import Reconstruction, Status
+from shapepose_fg.core.run_summary import has_identities
 from shapepose_fg.core.trust import BELIEVED, Spell, Trust, trust_in
 from shapepose_fg.setup_check.diagnosis import Build, Diagnosis, diagnose
 from shapepose_fg.setup_check.evidence import Look, left_out
@@ -394,7 +395,7 @@ def _left_out(table: ObservationTable, rig: Rig) -> tuple[Array, Array]:
 
 def _speeds(people: Reconstruction) -> Iterator[str]:
     """Warning on implausible speeds of people, if rows have identities."""
-    if not people.run.get("configuration", {}).get("temporal", True):
+    if not has_identities(people.run):
         return
     hips = [
         place
@@ -475,7 +476,7 @@ def _unseen(
     if len(people) == 0 or len(frames) == 0:
         return []
     fps = people.run.get("time", {}).get("fps")
-    alone = not people.run.get("configuration", {}).get("temporal", True)
+    alone = not has_identities(people.run)
     rows = np.searchsorted(frames, people.frame[np.isin(people.frame, frames)])
     per_frame = np.bincount(rows, minlength=len(frames))
     return unseen(

@@ -5,7 +5,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from shapepose_fg.core.run_summary import RunEntries, covered_frames
+from shapepose_fg.core.run_summary import RunEntries, covered_frames, has_identities
 from shapepose_fg.core.validation import validated
 from shapepose_fg.estimation.noise_law import NoiseLaw
 from shapepose_fg.pipeline.config import PipelineConfig
@@ -38,7 +38,7 @@ def told_by(run: Run) -> dict[str, Any]:
         "time": _time(entries.seconds),
         "configured": "configuration" in run,
         "noise": _noise(run),
-        "over_time": entries.configuration.get("temporal", True),
+        "over_time": has_identities(run),
         "changed": _changed_settings(entries.configuration),
         "versions": [(name, _text(value)) for name, value in entries.versions.items()],
         "inputs": [(name, _text(value)) for name, value in entries.inputs.items()],
