@@ -29,7 +29,7 @@ def make_camera(K: ArrayLike, wTc: ArrayLike) -> gtsam.PinholeCameraCal3_S2:
     """
     pose = np.asarray(wTc, dtype=np.float64)
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
-        raise ValueError(f"wTc must be a finite (4, 4) matrix, got {pose.shape}")
+        raise ValueError(f"wTc must be a (4, 4) matrix of finite numbers, got {pose}")
     return gtsam.PinholeCameraCal3_S2(gtsam.Pose3(pose), make_calibration(K))
 
 

@@ -34,8 +34,6 @@ _SMPL_JOINT_KEYPOINTS = {
 """SMPL joints for keypoints."""
 _HEIGHT_M = (0.4, 3.0)
 """Range of body heights, m, from a newborn to above any adult; detects templates in other units."""
-_SUM_TOLERANCE = 0.02
-"""Tolerance for row sums of regressors, which are weighted means printed with few digits."""
 _BELONGS = {
     "RShoulder": "right_shoulder", "RElbow": "right_elbow", "RWrist": "right_wrist",
     "LShoulder": "left_shoulder", "LElbow": "left_elbow", "LWrist": "left_wrist",
@@ -43,8 +41,6 @@ _BELONGS = {
     "LHip": "left_hip", "LKnee": "left_knee", "LAnkle": "left_ankle",
 }  # fmt: skip
 """SMPL joints near which keypoints must lie."""
-_FARTHEST = 0.15
-"""Maximum distance of a keypoint from its SMPL joint, as a share of the body's height."""
 _RISING = ("ankle", "knee", "hip", "shoulder")
 """Joints in ascending order of height in T-pose."""
 
@@ -253,7 +249,8 @@ def _implausible(template: Array, joint_regressor: Array, keypoint_regressor: Ar
         ("keypoint_regressor", keypoint_regressor),
     ):
         off = np.abs(regressor.sum(axis=1) - 1).max()
-        if off > _SUM_TOLERANCE:
+        # Tolerance for row sums of regressors, which are weighted means printed with few digits.
+        if off > 0.02:
             return (
                 f"{name} has rows that do not sum to 1 (off by {off:.2g}): use an unchanged file "
                 "of one model"
@@ -278,7 +275,8 @@ def _implausible(template: Array, joint_regressor: Array, keypoint_regressor: Ar
         distance = float(np.linalg.norm(keypoints[name] - joints[joint]))
         side, part = joint.split("_")
         mirrored = joints[f"{'right' if side == 'left' else 'left'}_{part}"]
-        if distance > _FARTHEST * height or distance > np.linalg.norm(keypoints[name] - mirrored):
+        # Maximum distance of a keypoint from its SMPL joint, as a share of the body's height.
+        if distance > 0.15 * height or distance > np.linalg.norm(keypoints[name] - mirrored):
             return (
                 f"keypoint_regressor puts {name} {distance:.2g} m from {joint}: rows are BODY_25 "
                 "in order"
