@@ -27,11 +27,6 @@ _SMPL_VERTEX_KEYPOINTS = {
     "LSmallToe": 3226, "LHeel": 3387, "RBigToe": 6617, "RSmallToe": 6624, "RHeel": 6787,
 }  # fmt: skip
 """Vertices of SMPL's own mesh for keypoints."""
-_SMPL_JOINT_KEYPOINTS = {
-    "RShoulder": 17, "RElbow": 19, "RWrist": 21, "LShoulder": 16, "LElbow": 18, "LWrist": 20,
-    "RHip": 2, "RKnee": 5, "RAnkle": 8, "LHip": 1, "LKnee": 4, "LAnkle": 7,
-}  # fmt: skip
-"""SMPL joints for keypoints."""
 _HEIGHT_M = (0.4, 3.0)
 """Range of body heights, m, from a newborn to above any adult; detects templates in other units."""
 _BELONGS = {
@@ -40,7 +35,7 @@ _BELONGS = {
     "RHip": "right_hip", "RKnee": "right_knee", "RAnkle": "right_ankle",
     "LHip": "left_hip", "LKnee": "left_knee", "LAnkle": "left_ankle",
 }  # fmt: skip
-"""SMPL joints near which keypoints must lie."""
+"""SMPL joints of keypoints: of SMPL's own mesh they are the keypoints, of others they are near."""
 _RISING = ("ankle", "knee", "hip", "shoulder")
 """Joints in ascending order of height in T-pose."""
 
@@ -226,8 +221,8 @@ def _smpl_keypoint_regressor(joint_regressor: Array) -> Array:
     regressor = np.zeros((_NUM_KEYPOINTS, _SMPL_NUM_VERTICES))
     for name, vertex in _SMPL_VERTEX_KEYPOINTS.items():
         regressor[BODY_25.index(name), vertex] = 1
-    for name, joint in _SMPL_JOINT_KEYPOINTS.items():
-        regressor[BODY_25.index(name)] = joint_regressor[joint]
+    for name, joint in _BELONGS.items():
+        regressor[BODY_25.index(name)] = joint_regressor[SMPL_24.index(joint)]
     for middle, sides in {"Neck": ("RShoulder", "LShoulder"), "MidHip": ("RHip", "LHip")}.items():
         regressor[BODY_25.index(middle)] = regressor[[BODY_25.index(side) for side in sides]].mean(
             0
