@@ -438,7 +438,7 @@ class Filmed:
                 break
             count = np.ceil((self.own_s[-1] - self.own_s[0]) / _KNOT_S) * (near_m == _NEAR_M[-1])
             knots_s = np.linspace(self.own_s[0], self.own_s[-1], 1 + int(count))
-            given = replace(start, centre=np.zeros(2), knots_s=knots_s)
+            given = replace(start, knots_s=knots_s)
             frame, rays = frame[used], self.rays[frame[used], person[used]]
             prior = np.array([*sigmas, lens.focal])
             start = _Fit(self, given, placed.rows(rows[used]), frame, rays, prior).solved()
@@ -473,31 +473,37 @@ class _Fit:
         return np.asarray(self.filmed._oTb[self.frame, :3, 3].mean(axis=0))
 
     @cached_property
-    def _level(self) -> "Start":
-        """The start, turned so that an axis of the log that is nearly vertical is vertical."""
+    def _upright(self) -> Rotation | None:
+        """The turn of the start that makes an axis of the log vertical, if it nearly is."""
         wRo = self.start.wTo[:3, :3]
         axis = int(np.argmax(np.abs(wRo[2])))
         up = [0.0, 0.0, np.sign(wRo[2, axis])]
         turn = Rotation.align_vectors([up], [wRo[:, axis]])[0]
-        if turn.magnitude() > _LEVEL_RAD:
-            return self.start
-        at = self.start.stretch * (wRo - turn.as_matrix() @ wRo) @ self._middle
-        return replace(self.start, wTo=rigid(turn.as_matrix() @ wRo, self.start.wTo[:3, 3] + at))
+        return turn if turn.magnitude() < _LEVEL_RAD else None
+
+    @cached_property
+    def _prior(self) -> "Start":
+        """The start with the given unit and lens, and upright."""
+        wRo = self.start.wTo[:3, :3]
+        level = wRo if self._upright is None else self._upright.as_matrix() @ wRo
+        at = self.start.wTo[:3, 3] + (self.start.stretch * wRo - level) @ self._middle
+        return replace(
+            self.start, wTo=rigid(level, at), stretch=1.0, focal=1.0, centre=np.zeros(2)
+        )
 
     def moved(self, x: Array) -> Start:
         """The start changed by the parameters."""
-        given, each = self._level, self.sigmas * x[: len(self.sigmas)]
+        given, each = self._prior, self.sigmas * x[: len(self.sigmas)]
         wRo = given.wTo[:3, :3]
-        turn = Rotation.from_rotvec(each[:3]).as_matrix()
-        stretch = given.stretch * float(np.exp(each[6]))
-        at = given.wTo[:3, 3] + given.stretch * wRo @ self._middle + each[3:6]
+        turn, stretch = Rotation.from_rotvec(each[:3]).as_matrix(), float(np.exp(each[6]))
+        at = given.wTo[:3, 3] + wRo @ self._middle + each[3:6]
         steps = self._steps * x[len(each) :][: self._steps.size].reshape(self._steps.shape)
         return replace(
             given,
             wTo=rigid(turn @ wRo, at - stretch * turn @ wRo @ self._middle),
-            centre=given.centre + each[7:9],
+            centre=each[7:9],
             offset_s=given.offset_s + each[9],
-            focal=given.focal * float(np.exp(each[10])),
+            focal=float(np.exp(each[10])),
             stretch=stretch,
             drift=np.vstack([np.zeros(6), np.cumsum(steps, axis=0)]),
         )
@@ -510,7 +516,7 @@ class _Fit:
         filmed, own_s, knots_s = self.filmed, self.filmed.own_s, self.start.knots_s
         grown = np.einsum("fii->if", filmed.trajectory.drifted(filmed._oTb, own_s)).cumsum(axis=1)
         variance = np.diff([np.interp(knots_s, own_s[1:], each) for each in grown]).T
-        variance[:, :2] *= self._level is self.start
+        variance[:, :2] *= self._upright is None
         return np.sqrt(variance)
 
     def _poses(self, x: Array) -> tuple[Array, Array]:
