@@ -1,6 +1,7 @@
 """Fit how much larger covariances are than those of the graph (`Doubt` and `Lasting` of
-`estimation/covariance_factors.py`) to the errors in simulated recordings, and average the noise
-laws learnt from them (`estimation/noise_law.py`).
+`estimation/covariance_factors.py`) to the errors in simulated recordings, and the tails of these
+errors (`error_tails` of `estimation/uncertainty.py`), and average the noise laws learnt from them
+(`estimation/noise_law.py`).
 
     python scripts/fit_covariances.py --mocap cmu_smpl24.npz --output covariances.json
 
@@ -9,7 +10,7 @@ half an hour on one core. The mean log score of the true joint under its Gaussia
 In single frames joints seen by two or more views and by one have fixed shares in it; over time the
 recordings and people whose detections have new errors in every frame count half each. Errors beyond
 `FAR` have little influence. Finally, covariances are scaled so that 95 % regions of the recordings
-hold 95 %: errors have heavier tails than a Gaussian.
+hold 95 %: errors have heavier tails than a Gaussian, those of Student's t.
 """
 
 import argparse
@@ -22,8 +23,8 @@ from typing import Any
 from unittest.mock import patch
 
 import numpy as np
-from scipy.optimize import minimize
-from scipy.stats import chi2
+from scipy.optimize import minimize, minimize_scalar
+from scipy.stats import chi2, f
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
@@ -90,12 +91,14 @@ def main() -> None:
     new = [part for seed in range(NEW) for part in new_errors(seed)]
     columns = [np.concatenate(column) for column in zip(*frames, strict=True)]
     doubt = fitted(*columns)
+    lasting = fitted_over_time(windows, new, doubt)
     content = {
         "about": f"scripts/fit_covariances.py: {len(columns[0])} joints of simulated people in "
         f"single frames, {sum(len(squared) for squared, *_ in windows)} over time",
         "noise": mean_law(laws),
         "doubt": asdict(doubt),
-        "lasting": asdict(fitted_over_time(windows, new, doubt)),
+        "lasting": asdict(lasting),
+        "tails": tails_of([part for part, _ in widened(windows, lasting, doubt)]),
     }
     arguments.output.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
@@ -213,23 +216,41 @@ def fitted_over_time(windows: list[Columns], new: list[Columns], doubt: Doubt) -
     each, scaled for 95 % of the joints in recordings.
     """
 
-    def off(numbers: np.ndarray, parts: list[Columns]) -> Iterator[tuple[np.ndarray, float]]:
-        """Squared distances by window, under the widened covariances, and the factor."""
-        for squared, rejected, share, alone in parts:
-            factor = Lasting(*np.exp(numbers)).factor(share, alone) * doubt.of_rejected(rejected)
-            yield squared / factor, float(factor)
-
     def loss(numbers: np.ndarray) -> float:
         total = 0.0
         for parts in (windows, new):
-            each = [(limited(part) + 3 * np.log(by)).sum() for part, by in off(numbers, parts)]
+            each = widened(parts, Lasting(*np.exp(numbers)), doubt)
+            each = [(limited(part) + 3 * np.log(by)).sum() for part, by in each]
             total += sum(each) / sum(len(squared) for squared, *_ in parts)
         return total
 
     numbers = minimize(loss, (0.0, 0.0), method="Nelder-Mead").x
-    every = np.concatenate([part for part, _ in off(numbers, windows)])
+    best = Lasting(*np.exp(numbers))
+    every = np.concatenate([part for part, _ in widened(windows, best, doubt)])
     scale = np.quantile(every, 0.95) / chi2.ppf(0.95, 3)
     return Lasting(*np.round(np.exp(numbers) * scale, 2).tolist())
+
+
+def widened(
+    parts: list[Columns], lasting: Lasting, doubt: Doubt
+) -> Iterator[tuple[np.ndarray, float]]:
+    """Squared distances by window, under the widened covariances, and the factor."""
+    for squared, rejected, share, alone in parts:
+        factor = lasting.factor(share, alone) * doubt.of_rejected(rejected)
+        yield squared / factor, float(factor)
+
+
+def tails_of(parts: list[np.ndarray]) -> float:
+    """The degrees of freedom of Student's t with the covariances' 95 % region that is most probable
+    for squared distances.
+    """
+    every = np.concatenate(parts)
+
+    def loss(tails: float) -> float:  # a squared distance over its 3 dimensions has F
+        scale = chi2.ppf(0.95, 3) / 3 / f.ppf(0.95, 3, tails)
+        return -float(f.logpdf(every / 3, 3, tails, scale=scale).mean())
+
+    return round(minimize_scalar(loss, bounds=(2.0, 100.0), method="bounded").x, 1)
 
 
 def limited(squared: np.ndarray) -> np.ndarray:

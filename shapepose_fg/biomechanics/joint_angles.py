@@ -80,8 +80,6 @@ information: all but the flexion of pelvis and trunk."""
 _SHARED = 2.0
 """Number of a person's joints whose errors count as one, since they are marginals of one graph with
 one body (coverage of `scripts/measure_angles.py`)."""
-_LEAST_INFORMATION = 1e-6
-"""Added to the diagonal of the information, so that a row with few joints has an inverse."""
 _STEP = 1e-4
 """Step of the central differences, rad."""
 _BLOCK = 256
@@ -309,7 +307,8 @@ def _rotations(
     blocks = blocks.reshape(count, NUM_ANGLES, NUM_ANGLES)
     information[:, 13:82, 13:82] += blocks.swapaxes(1, 2) @ prior @ blocks
     information[:, range(NUM_BETAS), range(NUM_BETAS)] += 1
-    information[:, range(columns), range(columns)] += _LEAST_INFORMATION
+    # So that a row with few joints has an inverse.
+    information[:, range(columns), range(columns)] += 1e-6
     covariance = np.linalg.inv(information)[:, 10:82, 10:82]
     residual = np.where(seen[..., None], people.joints - points, 0).reshape(count, -1, 1)
     pull = weighted.swapaxes(1, 2) @ residual

@@ -23,13 +23,9 @@ _NOISE_M = 0.015
 _OUTLIER, _OUTLIER_SIGMA = 0.1, 1.0
 """Share of outlier distances, and standard deviation of their logarithm: a detector places joints
 that it does not find anywhere on the person."""
-_NEAREST = 0.02
-"""Minimum distance, as a share of the mean distance; limits the effect of joints in one pixel."""
 LIKE_A_BODY = -1.0
 """Minimum fit in images of anything like a body, nats per pair; gowned people at a
 table have -1."""
-_LEAST_PAIRS = 20
-"""Minimum number of distances for a person to be informative: seven joints."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +89,8 @@ def fit_of_order(people: Array, points: Sequence[str]) -> Array:
     said = np.where(both, logs - mean, np.nan)
     count = np.isfinite(logs).sum(axis=1)
     off = logs - mean - _mean(said)[:, None]
-    return np.where(count >= _LEAST_PAIRS, _mean(_log_density(off, sigma)), np.nan)
+    # Minimum number of distances for a person to be informative: seven joints.
+    return np.where(count >= 20, _mean(_log_density(off, sigma)), np.nan)
 
 
 def exchanges(
@@ -151,7 +148,8 @@ def _logs(people: Array, first: Index, second: Index) -> Array:
     """(N, M) logarithms of the distances of M pairs of joints, NaN if either joint is not seen."""
     apart = np.linalg.norm(people[:, first] - people[:, second], axis=-1)
     least = np.exp(_mean(np.log(np.where(apart > 0, apart, np.nan))))
-    return np.log(np.maximum(apart, _NEAREST * np.nan_to_num(least, nan=1.0)[:, None]))
+    # Minimum distance, as a share of the mean distance; limits the effect of joints in one pixel.
+    return np.log(np.maximum(apart, 0.02 * np.nan_to_num(least, nan=1.0)[:, None]))
 
 
 def _mean(values: Array) -> Array:

@@ -123,7 +123,9 @@ def grouped(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def flowing(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Join the lines of each paragraph of the docstring: the help would break them twice."""
+    """Join the lines of each paragraph of the docstring; otherwise `--help` would break lines where
+    the source does, too.
+    """
     command.__doc__ = re.sub(r"(?<=\S)\n(?=[^\s-])", " ", inspect.getdoc(command) or "")
     return command
 

@@ -8,6 +8,7 @@ from shapepose_fg.cli.options import RESULT, argument, grouped, json_option, opt
 from shapepose_fg.cli.terminal import note, show, show_json, table
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.result_files import results_folder, set_aside
+from shapepose_fg.core.run_summary import has_identities
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -133,7 +134,7 @@ def _tracks_table(results: Path) -> "RenderableType":
         left=0,
     )
     lines = [f"{len(listed)} people, {rows} rows{rate_words(run)}"]
-    if not run.get("configuration", {}).get("temporal", True):
+    if not has_identities(run):
         lines.append("every frame was solved separately: numbers are not identities")
     edits = read_corrections(results_folder(results))
     if len(edits) > 0:
@@ -212,7 +213,7 @@ def _solver(folder: Path) -> "Solve | None":
             )
 
     def solve(rows: "Reconstruction") -> "Reconstruction":
-        from shapepose_fg.pipeline.solving import Solver, solve_rows
+        from shapepose_fg.pipeline.solve_again import Solver, solve_rows
 
         return solve_rows(rows, Solver.read(folder, rows))
 

@@ -93,7 +93,7 @@ class ObservationTable(Table):
             if len(set(getattr(self, name).tolist())) < len(getattr(self, name)):
                 raise ValueError(f"{name} must differ from each other")
         if not all(map(str.isprintable, self.view_names.tolist())):
-            raise ValueError("view_names must be one-line names")
+            raise ValueError("view_names must be printable, without line breaks")
         # A score may underflow in float32, and the index of the detection may be unknown.
         wrong = {
             "candidate": (self.candidate >= 0) & ~seen,

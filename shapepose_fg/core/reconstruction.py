@@ -11,7 +11,6 @@ from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, Field, FiniteFloat
 
 from shapepose_fg.core.arrays import Array, Mask, Whole
 from shapepose_fg.core.bounds import MOST_NUMBER
@@ -28,7 +27,7 @@ from shapepose_fg.core.result_files import (
     write_result,
 )
 from shapepose_fg.core.rig_file import CAMERAS, is_replaceable, write_rig
-from shapepose_fg.core.run_summary import check_frames, merged_run
+from shapepose_fg.core.run_summary import RunEntries, check_frames, merged_run
 from shapepose_fg.core.shapes import SubjectShapes
 from shapepose_fg.core.skeleton import BODY_25, check_joint_names
 from shapepose_fg.core.storage.files import BLOCK_FRAMES, ROWS_AT_ONCE, read_json
@@ -391,29 +390,12 @@ def check_files(people: Path, observations: Path | None) -> None:
 _UNREADABLE = "the result was not written, and the previous files are unchanged"
 
 
-class _Time(BaseModel, strict=True):
-    fps: FiniteFloat | None = None
-
-
-class _Run(BaseModel, strict=True):
-    """Entries of run.json that this program reads again; there may be others."""
-
-    configuration: dict[str, Any] = {}
-    versions: dict[str, Any] = {}
-    inputs: dict[str, Any] = {}
-    people: dict[str, Any] = {}
-    seconds: dict[str, FiniteFloat] = {}
-    time: _Time = _Time()
-    cuts: list[Annotated[int, Field(ge=0)]] = []
-    body: str | None = None
-
-
 def _read_run(file: Path, people_id: object) -> dict[str, Any]:
     """The content of run.json, empty if there is none. InputError if it is invalid, or belongs to
     another run.
     """
     run, cure = read_json(file) if file.is_file() else {}, "restore it or delete it"
-    validated(_Run, run, file, cure)
+    validated(RunEntries, run, file, cure)
     with naming(file, cure):
         check_frames(run)
         try:

@@ -4,15 +4,72 @@ import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import BaseModel, Field, FiniteFloat
 
 from shapepose_fg.core.frame_times import spans_of
 
 Run = dict[str, Any]
 MOST_FRAMES = 10_000_000
 """Maximum number of frames of a recording: over four days at 25 frames a second."""
+
+
+class _Time(BaseModel, strict=True):
+    fps: FiniteFloat | None = None
+    source: str = ""
+
+
+class _People(BaseModel, strict=True):
+    dropped: dict[str, int] = {}
+    problems: list[dict[str, Any]] = []
+
+
+class _Setup(BaseModel, strict=True):
+    warnings: list[str] = []
+
+
+class _Probability(BaseModel, strict=True):
+    person: int
+    probability: FiniteFloat
+
+
+class _Distances(BaseModel, strict=True):
+    median_px: FiniteFloat | None = None
+    median_mm: FiniteFloat | None = None
+
+
+class CameraEntry(BaseModel, strict=True):
+    """The entry of run.json about the detections of a camera, as `setup_check.report.CameraUse`
+    writes it.
+    """
+
+    camera: str = ""
+    offered: int | None = None
+    used: int = 0
+    left_out: _Distances = _Distances()
+
+
+_Span = Annotated[list[int], Field(min_length=2, max_length=2)]
+
+
+class RunEntries(BaseModel, strict=True):
+    """Entries of run.json that this program reads again; there may be others."""
+
+    configuration: dict[str, Any] = {}
+    versions: dict[str, Any] = {}
+    inputs: dict[str, Any] = {}
+    notes: list[str] = []
+    setup: _Setup = _Setup()
+    people: _People = _People()
+    cameras: list[CameraEntry] = []
+    probability: list[_Probability] | dict[str, int] = []
+    dropped_frames: dict[str, list[_Span]] = {}
+    seconds: dict[str, FiniteFloat] = {}
+    time: _Time = _Time()
+    cuts: list[Annotated[int, Field(ge=0)]] = []
+    body: str | None = None
 
 
 def merged_run(runs: Sequence[Run]) -> Run:
@@ -94,6 +151,11 @@ def covered_frames(run: Mapping[str, Any]) -> list[range] | None:
         raise ValueError(
             f'"frames" must be [start, stop] or a list of those, got {frames!r}'
         ) from None
+
+
+def has_identities(run: Mapping[str, Any]) -> bool:
+    """Whether people of a run were followed over time, so that their numbers are identities."""
+    return bool(run.get("configuration", {}).get("temporal", True))
 
 
 def check_frames(run: Mapping[str, Any]) -> None:

@@ -13,13 +13,6 @@ from scipy.ndimage import map_coordinates
 from shapepose_fg.core.arrays import Array, Index, Mask, Real
 from shapepose_fg.io.detections.association_text import TextSkeleton
 
-_MIN_SCORE = 0.1
-"""Minimum height of a peak; lower ones are noise."""
-_MIN_ALONG = 0.05
-"""Minimum component of the field along the limb at a point that supports it, as in OpenPose."""
-_MIN_SUPPORTED = 0.7
-"""Minimum share of supporting points of a limb with an affinity."""
-
 
 @dataclass(frozen=True)
 class Candidates:
@@ -77,7 +70,7 @@ def decode(output: NDArray[np.float32], skeleton: TextSkeleton) -> Candidates:
     return Candidates(joint, xy, score, pairs[there], limb[there], affinity[there])
 
 
-def peaks(heat: NDArray[np.float32], min_score: float = _MIN_SCORE) -> tuple[Index, Array, Array]:
+def peaks(heat: NDArray[np.float32], min_score: float = 0.1) -> tuple[Index, Array, Array]:
     """Joint (D,), position (D, 2) in cells, and height (D,) of the local maxima of heat maps (J, H,
     W).
 
@@ -139,5 +132,7 @@ def line_integrals(fields: NDArray[np.float32], start: Array, end: Array, limb: 
     for axis in range(2):
         places = np.stack([np.broadcast_to(2.0 * limb[:, None] + axis, x.shape), y, x])
         component += map_coordinates(fields, places, np.float64, order=1) * direction[:, axis, None]
-    supported = (component >= _MIN_ALONG).mean(axis=1) >= _MIN_SUPPORTED
+    # Minimum component of the field along the limb at a point that supports it, as in OpenPose.
+    # Minimum share of supporting points of a limb with an affinity.
+    supported = (component >= 0.05).mean(axis=1) >= 0.7
     return np.where(supported & (length > 0), np.clip(component.mean(axis=1), 0.0, 1.0), 0.0)

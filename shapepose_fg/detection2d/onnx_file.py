@@ -38,8 +38,6 @@ _MESSAGES: dict[str, dict[int, str]] = {
     "tensor": {},
 }
 """The messages of onnx.proto that lead to tensors, with the fields that hold messages."""
-_EXTERNAL_DATA, _DATA_LOCATION = 13, 14
-"""Fields of a tensor: the place of external data, and whether there is any."""
 
 
 class _Broken(Exception):
@@ -102,9 +100,8 @@ def _is_whole(content: memoryview) -> bool:
                 raise _Broken(f"byte {start} begins a group")
             if at > end:
                 raise _Broken(f"the field at byte {start} ends beyond its message")
-            if message == "tensor" and (
-                field == _EXTERNAL_DATA or (field == _DATA_LOCATION and value != 0)
-            ):
+            # Fields of a tensor: the place of external data, and whether there is any.
+            if message == "tensor" and (field == 13 or (field == 14 and value != 0)):
                 return False
     return True
 

@@ -81,14 +81,15 @@ class Doubt:
 def covariance_factors(marginals: Marginals, noise: float) -> Array:
     """Factors on variances: (1,) of a person's window, or (T,) of people in single frames.
 
-    `noise` is the standard deviation of the recording's detections over the usual one.
+    `noise` is the standard deviation of the recording's detections over the usual one. Detections
+    have it already; beyond it, such detectors have more large errors.
     """
     doubt, (sigma_m, told, used) = Doubt.measured(), signs_of_doubt(marginals)
     if not marginals.window.over_time:
         return doubt.in_frames(sigma_m, 1 - used / np.maximum(told, 1e-9))
     rejected = 1 - used.sum(keepdims=True) / max(told.sum(), 1e-9)
     lasting = Lasting.measured().factor(*signs_of_lasting(marginals))
-    return noise * lasting * doubt.of_rejected(rejected)
+    return np.sqrt(noise) * lasting * doubt.of_rejected(rejected)
 
 
 def signs_of_doubt(marginals: Marginals) -> tuple[Array, Array, Array]:

@@ -1,15 +1,17 @@
-"""Probabilistic queries on uncertain joints: joint distributions, and distances.
+"""Probabilistic queries on uncertain joints: joint distributions, regions, and distances.
 
 For any `Reconstruction`: saved, from `OnlineReconstructor.people`, or solved with user factors.
 """
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING
 
 import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.special import chdtri, fdtri, ndtr, roots_genlaguerre
 
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig, Views
@@ -17,8 +19,9 @@ from shapepose_fg.core.decompositions import principal_axes, symmetric_root
 from shapepose_fg.core.errors import NotDetermined
 from shapepose_fg.core.reconstruction import BODY, Reconstruction
 from shapepose_fg.estimation.camera_pose_uncertainty import POSES_LAST_S, reported_with_poses
+from shapepose_fg.estimation.gated_views import ObservationConfig
 from shapepose_fg.estimation.in_time import moments
-from shapepose_fg.estimation.linearisation import ObservationConfig
+from shapepose_fg.estimation.noise_law import shipped_covariances
 from shapepose_fg.estimation.window_solution import PersonGraph
 
 if TYPE_CHECKING:
@@ -46,6 +49,8 @@ _REACH_M = 0.15
 _NODES, _WIDE = 24, 6.0
 """Number of nodes of the quadrature per axis, and its range in standard deviations on
 either side."""
+_SCALES = 4
+"""Number of Gaussians whose mixture Student's t is."""
 _STEPS = 64
 """Number of limits at which a distance's distribution is tabulated for quantiles."""
 
@@ -73,29 +78,66 @@ class Marginal:
         return self.covariance[3 * one : 3 * one + 3, 3 * other : 3 * other + 3]
 
 
+def error_tails() -> float:
+    """Degrees of freedom of Student's t, by which joints' errors are distributed: most are smaller
+    than their covariance says and a few far larger. Measured by `scripts/fit_covariances.py`.
+    """
+    return float(shipped_covariances()["tails"])
+
+
+def squared_radius(share: float) -> float:
+    """Squared Mahalanobis distance e^T C^-1 e up to which a `share` of all true joints lies. It is
+    7.8 for 0.95, as for a Gaussian, since covariances are those of 95 % regions.
+    """
+    return 3 * _shape(error_tails()) * float(fdtri(3, error_tails(), share))
+
+
+@cache
+def _mixture(tails: float) -> tuple[Array, Array]:
+    """(K,) shares and (K,) scales of the covariances of the Gaussians whose mixture is Student's t
+    with the given degrees of freedom, and the same 95 % region as a Gaussian.
+    """
+    if np.isinf(tails):
+        return np.ones(1), np.ones(1)
+    nodes, shares = roots_genlaguerre(_SCALES, tails / 2 - 1)
+    return shares / shares.sum(), _shape(tails) * tails / 2 / nodes
+
+
+def _shape(tails: float) -> float:
+    """Student's t has the 95 % region of a Gaussian with its shape matrix over this number."""
+    return float(chdtri(3, 0.05) / (3 * fdtri(3, tails, 0.95)))
+
+
 @dataclass(frozen=True)
 class Distance:
-    """Distances (...,) between pairs of points, with a Gaussian displacement.
+    """Distances (...,) between pairs of points, whose displacement is Gaussian or has Student's t.
 
-    Near zero a distance is not Gaussian: its probabilities are integrals of the three-dimensional
-    Gaussian over balls, by quadrature, which is also accurate in the tails, unlike noncentral
+    Near zero a distance is not Gaussian: its probabilities are integrals of three-dimensional
+    Gaussians over balls, by quadrature, which is also accurate in the tails, unlike noncentral
     chi-square or moment fits.
     """
 
     apart: Array
     """(..., 3) mean displacement from the first to the second point, metres."""
     covariance: Array
-    """(..., 3, 3) covariance of `apart`, m²."""
+    """(..., 3, 3) covariance of the Gaussian with the same 95 % region as `apart`, m²."""
+    tails: float = np.inf
+    """Degrees of freedom of Student's t (`error_tails` for joints); infinite for a Gaussian."""
 
     def below(self, limit_m: ArrayLike) -> Array:
-        """Probability (...,) that the distance is below a limit (...,), metres.
+        """Probability (...,) that the distance is below a limit (...,), metres."""
+        parts = zip(*_mixture(self.tails), strict=True)
+        return np.asarray(sum(share * self._in_ball(limit_m, scale) for share, scale in parts))
+
+    def _in_ball(self, limit_m: ArrayLike, scale: float) -> Array:
+        """`below` of a Gaussian with `scale` times the covariance.
 
         Along the axis of smallest spread the integral is that of a normal distribution, over the
         two others by Gauss-Legendre quadrature.
         """
         limit = np.asarray(limit_m, dtype=np.float64)
         values, axes = principal_axes(self.covariance)
-        sigma = np.sqrt(np.maximum(values, 1e-12))
+        sigma = np.sqrt(np.maximum(scale * values, 1e-12))
         mean = np.einsum("...ij,...i->...j", axes, self.apart)
         shape = np.broadcast_shapes(limit.shape, mean.shape[:-1])
         r = np.broadcast_to(np.maximum(limit, 0.0), shape)
@@ -128,7 +170,10 @@ class Distance:
         )
         limits = self._span()
         shorter = np.stack(
-            [Distance(each[..., None] * way, self.covariance).below(away) for each in limits]
+            [
+                Distance(each[..., None] * way, self.covariance, self.tails).below(away)
+                for each in limits
+            ]
         )
         ends = ((1 + probability) / 2, (1 - probability) / 2)
         low, high = (_reached(end, shorter[::-1], limits[::-1]) for end in ends)
@@ -143,7 +188,11 @@ class Distance:
     @property
     def sigma_m(self) -> Array:
         """(...,) standard deviation, metres."""
-        square = (self.apart**2).sum(axis=-1) + np.trace(self.covariance, axis1=-2, axis2=-1)
+        ratio, tails = 1.0, self.tails
+        if np.isfinite(tails):
+            ratio = _shape(tails) * tails / (tails - 2)
+        variance = ratio * np.trace(self.covariance, axis1=-2, axis2=-1)
+        square = (self.apart**2).sum(axis=-1) + variance
         return np.sqrt(np.maximum(square - self.mean_m**2, 0.0))
 
     def _span(self) -> Array:
@@ -302,10 +351,11 @@ def distance(
         both = marginal(people, one, other, rig=rig, graphs=graphs)
         across = both.block(0, 1)
         covariance = both.block(0, 0) + both.block(1, 1) - across - across.T
-        return Distance(both.mean[1] - both.mean[0], covariance)
+        return Distance(both.mean[1] - both.mean[0], covariance, error_tails())
     alone, points = marginal(people, one), np.asarray(other, dtype=np.float64)
     apart = points - alone.mean[0]
-    return Distance(apart, np.broadcast_to(alone.covariance, (*apart.shape, 3)))
+    covariance = np.broadcast_to(alone.covariance, (*apart.shape, 3))
+    return Distance(apart, covariance, error_tails())
 
 
 def distances(people: Reconstruction, point: ArrayLike) -> Distance:
@@ -313,7 +363,7 @@ def distances(people: Reconstruction, point: ArrayLike) -> Distance:
     NaN if unknown.
     """
     points = np.broadcast_to(np.asarray(point, dtype=np.float64), (len(people), 3))
-    return Distance(points[:, None] - people.joints, people.covariance)
+    return Distance(points[:, None] - people.joints, people.covariance, error_tails())
 
 
 def surface_distance(
@@ -486,6 +536,4 @@ def _nodes(low: Array, high: Array, mean: Array, sigma: Array) -> tuple[Array, A
 
 def _normal(z: Array) -> Array:
     """The standard normal distribution function."""
-    from scipy.special import ndtr
-
     return np.asarray(ndtr(z))

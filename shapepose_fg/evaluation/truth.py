@@ -17,9 +17,9 @@ from shapepose_fg.core.frame_times import spans_of
 from shapepose_fg.core.joint_names import keypoint_names, layouts_called
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.result_files import PEOPLE
-from shapepose_fg.core.run_summary import covered_frames
+from shapepose_fg.core.run_summary import covered_frames, has_identities
 from shapepose_fg.core.skeleton import SMPL_24
-from shapepose_fg.core.storage.files import read_bytes, read_json
+from shapepose_fg.core.storage.files import MIDDLE, read_bytes, read_json
 from shapepose_fg.core.storage.npz import NpzFile, read_npz
 from shapepose_fg.evaluation.metrics import PlainPeople
 from shapepose_fg.evaluation.shelf import SHELF_JOINTS, read_shelf_ground_truth
@@ -35,10 +35,6 @@ _LARGEST = 1e6
 """Limit of positions, m, and angles, rad; beyond it a file is damaged."""
 _SIZE_M = (0.1, 5.0)
 """Diagonal of the box around the joints of a person, m; another median means another unit."""
-_SMPLX_VALUES = 165
-"""Values of a pose of SMPL-X, whose shape differs from SMPL's."""
-_MAT_BYTES = 2**26
-"""Maximum size of a MATLAB variable in memory, bytes; Shelf's annotation has 5 MB."""
 _CELL, _FLOATS, _MATRIX, _COMPRESSED = 1, (6, 7), 14, 15
 """Codes of MATLAB files: classes (cell; double and single), types (matrix; compressed matrix)."""
 
@@ -103,7 +99,7 @@ def people_of(result: Reconstruction) -> PlainPeople:
         tuple(result.joint_names.tolist()),
         result.covariance,
         covered_frames(result.run),
-        identified=bool(result.run.get("configuration", {}).get("temporal", True)),
+        identified=has_identities(result.run),
     )
 
 
@@ -166,7 +162,8 @@ def _panoptic(files: list[Path]) -> PlainPeople:
                 "confidence of each joint; download the file again"
             ) from None
     if len({row[2].shape for row in rows}) > 1:
-        raise InputError(f"{files[0].parent}: has joints19 and joints15; give a folder with one")
+        problem = "some bodies have joints19, others joints15"
+        raise InputError(f"{files[0].parent}: {problem}; give a folder with one of them")
     return _table(files[0].parent, rows, names, covered=spans_of(frames))
 
 
@@ -225,7 +222,8 @@ def _amass(files: list[Path], turn: Array, fps: float | None, body: Path | None)
                 f"{file}: must hold finite poses (F, 66 or more), trans (F, 3) and betas (10 or "
                 "more), and whole frames (F) and one mocap_framerate, if any; give AMASS motions"
             )
-        if poses.shape[1] == _SMPLX_VALUES:
+        # Values of a pose of SMPL-X, whose shape differs from SMPL's.
+        if poses.shape[1] == 165:
             raise InputError(
                 f"{file}: its shape belongs to SMPL-X; download the motion as SMPL+H instead"
             )
@@ -250,11 +248,11 @@ def _amass(files: list[Path], turn: Array, fps: float | None, body: Path | None)
 
 def _actors(file: Path) -> PlainPeople:
     """The annotation of Shelf or Campus: actor3D, cells of actors, of frames, of (14, 3) metres."""
-    content, tree = read_bytes(file, _MAT_BYTES), None
+    content, tree = read_bytes(file, MIDDLE), None
     try:
         for kind, part in _elements(content[128:] if content[126:128] == b"IM" else b""):
             if kind == _COMPRESSED:
-                kind, part = next(_elements(zlib.decompressobj().decompress(part, _MAT_BYTES)))
+                kind, part = next(_elements(zlib.decompressobj().decompress(part, MIDDLE)))
             if kind == _MATRIX and bytes(list(_elements(part))[2][1]) == b"actor3D":
                 tree = _value(part)
     except (ValueError, IndexError, KeyError, StopIteration, struct.error, zlib.error) as error:

@@ -24,8 +24,6 @@ _PHOTOS = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 _FORMATS = ("JPEG", "PNG", "TIFF")
 """Pillow's names of the supported formats: other readers of Pillow are disabled, because some start
 external programs."""
-_EXIF, _FOCAL_35MM = 0x8769, 0xA405
-"""EXIF tags: the Exif directory in a photo, and FocalLengthIn35mmFilm in it."""
 
 
 def lenses_of(detections: Path, fields: Sequence[str], size: tuple[int, int] | None) -> Rig:
@@ -124,7 +122,7 @@ def _focal_of_photo(file: Path) -> float:
     """A photo's focal length relative to its longer side, from EXIF's FocalLengthIn35mmFilm, which
     refers to 35 mm film with the same image diagonal (EXIF 2.3, 4.6.5).
     """
-    image = optional("PIL.Image", "photos")
+    image, tags = optional("PIL.Image", "photos"), optional("PIL.ExifTags", "photos")
     cure = "give an unedited photo of the camera, or degrees"
     with open_regular(file, cure, BIG) as stream, warnings.catch_warnings():
         warnings.simplefilter(
@@ -134,10 +132,8 @@ def _focal_of_photo(file: Path) -> float:
             with image.open(stream, formats=_FORMATS) as photo:
                 # Without EXIF in its header, a PNG would be decoded to look behind the image data.
                 known = photo.format != "PNG" or "exif" in photo.info
-                sides, found = (
-                    photo.size,
-                    photo.getexif().get_ifd(_EXIF).get(_FOCAL_35MM) if known else None,
-                )
+                exif = photo.getexif().get_ifd(tags.IFD.Exif) if known else {}
+                sides, found = photo.size, exif.get(tags.Base.FocalLengthIn35mmFilm)
         except (
             Exception
         ) as error:  # for damaged files Pillow raises many kinds of errors, such as SyntaxError

@@ -28,9 +28,6 @@ ON_TRIAL = -1
 _SURE = 0.3
 """Evidence per second above which a new person is reported at once: probability 0.97
 (`track_selection.probability`)."""
-_WAITS_S = 1.0
-"""Longest time for which a new track that may be a re-identification waits for its bone lengths,
-s."""
 
 
 @dataclass(frozen=True)
@@ -249,8 +246,10 @@ class Filter:
 
     def _may_be_back(self, now: FilterState, row: int) -> bool:
         """Whether too few bones are measured to distinguish the track from ended tracks nearby."""
+        # Longest time for which a new track that may be a re-identification waits for its bone
+        # lengths, s.
         if (
-            now.tracks.time_s - now.born_s[row] > _WAITS_S
+            now.tracks.time_s - now.born_s[row] > 1.0
             or (now.count[row] >= LEAST_ROWS).mean() >= 0.5
         ):
             return False

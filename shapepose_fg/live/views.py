@@ -15,8 +15,6 @@ SHORTEST_S = 1 / 250
 """Shortest time between a camera's pictures, s; closer ones are duplicates of one picture."""
 MOST_S = 1e12
 """Largest time, s: beyond it the resolution of doubles is too coarse."""
-_BEFORE_S = 0.4
-"""Time before a camera's first pose from which on this pose is used, s."""
 
 Frame = tuple[Detections, Array]
 """Detections of all cameras, and their times (V,)."""
@@ -109,7 +107,8 @@ def with_pose(
             f"pose must be (4, 4) and pose_covariance (6, 6), got {pose.shape} and "
             f"{covariance.shape}"
         )
-    times, poses, covariances = np.array([time_s - _BEFORE_S]), pose[None], covariance[None]
+    # Time before a camera's first pose from which on this pose is used, s.
+    times, poses, covariances = np.array([time_s - 0.4]), pose[None], covariance[None]
     if len(known) > 0:
         times, poses, covariances = (
             known[0].time_s,

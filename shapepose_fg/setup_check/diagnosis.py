@@ -30,12 +30,6 @@ from shapepose_fg.setup_check.offset_scan import Lag, lag_of, lags
 from shapepose_fg.setup_check.over_time import parted, parting_of
 from shapepose_fg.setup_check.small_errors import LEAST_DEG, Problem
 
-_SAME_PX = 0.6
-"""Maximum distance, px, between detections of one picture stored with pixel accuracy."""
-_SAME_SHARE = 0.8
-_SAME_PLACE, _SAME_ANGLE_DEG = 0.002, 0.05
-"""Maximum differences of two equal poses, as a share of the cameras' mean distance and in degrees;
-no two stands agree so well."""
 _BONES = (
     ("Shoulder", "Hip", 0.311, 0.52),
     ("Hip", "Knee", 0.227, 0.15),
@@ -55,7 +49,9 @@ def duplicates(rig: Rig, evidence: Evidence) -> list[Finding]:
     findings = []
     for first, second in combinations(range(len(rig)), 2):
         angle_deg, away = difference(rig.cTw[first], rig.cTw[second])
-        pose = away <= _SAME_PLACE * spread and angle_deg < _SAME_ANGLE_DEG and len(rig) > 2
+        # Maximum differences of two equal poses, as a share of the cameras' mean distance and in
+        # degrees; no two stands agree so well.
+        pose = away <= 0.002 * spread and angle_deg < 0.05 and len(rig) > 2
         seen = _same_detections(evidence, rig, first, second)
         if pose or seen:
             same = "" if pose and seen else "pose" if pose else "detections"
@@ -79,9 +75,10 @@ def _same_detections(evidence: Evidence, rig: Rig, first: int, second: int) -> b
         raw[0].reshape(one.xy.shape)[i] - raw[1].reshape(other.xy.shape)[j], axis=-1
     )
     there = ~np.isnan(distance)
-    alike = (there & (distance < _SAME_PX)).sum(axis=1) >= 0.9 * np.maximum(there.sum(axis=1), 1)
+    # Maximum distance, px, between detections of one picture stored with pixel accuracy.
+    alike = (there & (distance < 0.6)).sum(axis=1) >= 0.9 * np.maximum(there.sum(axis=1), 1)
     alike &= there.sum(axis=1) >= 3
-    return bool(len(np.unique(i[alike])) >= _SAME_SHARE * len(one))
+    return bool(len(np.unique(i[alike])) >= 0.8 * len(one))
 
 
 def other_sizes(given: Sequence[str], rig: Rig) -> tuple[Finding, ...]:
@@ -168,8 +165,6 @@ def build_of(points: Array, skeleton: Skeleton) -> Build:
     return Build(stature, up, int(enough.sum()))
 
 
-_FEW_FRAMES, _FEW_SIGHTINGS = 16, 300
-"""Frames, and sightings of people in them, that are enough if nothing in them is odd."""
 _FITTING, _STEADY, _UNLIKELY, _NEARLY = 0.5, 0.3, 0.1, 0.5
 """Signs of a mistake in them: a camera's score below the first, a difference of its scores between
 parts of the recording above the second, a probability of small mistakes above the third, or an
@@ -180,13 +175,8 @@ _UNFIT = 0.15
 """Score below which a camera without any explanation does not fit."""
 _CROWD = 8.0
 """Mean number of people per picture above which occlusions, not mistakes, explain low scores."""
-_LEAST_FOCAL = 0.04
-"""Minimum change of the focal length of one camera that is reported."""
-_NOBODY = 0.05
-"""Minimum people placed per sighting; with fewer, cameras see no people in common."""
 _STOPPED = 0.02
 """Share of repeated pictures above which a camera is reported; fewer replace dropped frames."""
-_LAG_ROUNDS, _LAG_NEAR = 6, 8
 _SHORTEST, _TALLEST = 0.45, 2.4
 """Range of plausible median statures, metres; outside, the calibration's unit is wrong. Newborns
 are 0.5 m tall, the tallest people 2.5 m, and stature from bones is accurate to a tenth."""
@@ -242,7 +232,8 @@ def diagnose(detections: DetectionSequence, rig: Rig, frames: range | None = Non
     evidence = gather(detections, frames, len(rig))
     look = Look.given(evidence, rig)
     often = len(look.sightings) / max(len(evidence.anchors), 1)
-    few = max(_FEW_FRAMES, round(_FEW_SIGHTINGS / max(often, 1.0)))
+    # Frames, and sightings of people in them, that are enough if nothing in them is odd.
+    few = max(16, round(300 / max(often, 1.0)))
     sound = _sound(replace(look, evidence=evidence.thinned(few)), detections, rig)
     return _all_mistakes(evidence, detections, rig, frames) if sound is None else sound
 
@@ -284,7 +275,8 @@ def _all_mistakes(
     if len(rig) < 2 or len(look.sightings) < MIN_SIGHTINGS:
         return Diagnosis(tuple(findings), given, look)
     if len(look.groups()) < MIN_SIGHTINGS // 2:
-        none = look.cameras_used > 1 and len(look.groups()) < _NOBODY * len(look.sightings)
+        # Minimum people placed per sighting; with fewer, cameras see no people in common.
+        none = look.cameras_used > 1 and len(look.groups()) < 0.05 * len(look.sightings)
         findings += (
             _nobody(look) if none else _unfit(look, {view for f in findings for view in f.cameras})
         )
@@ -366,11 +358,11 @@ def _settled(look: Look, view: int, frames: int) -> tuple[Look, Problem]:
     People who move mostly in one direction make a time offset look like a rotation, so that the two
     are estimated alternately.
     """
-    for _ in range(_LAG_ROUNDS):
+    for _ in range(6):
         look = look.later(view, frames)
         problem = Problem.of(look)
         refined = replace(look, views=problem.relaxed())
-        more = lag_of(without_biases(refined), view, _LAG_NEAR)
+        more = lag_of(without_biases(refined), view, 8)
         frames = more.frames
         if frames == 0 or more.gain < 0:
             break
@@ -407,10 +399,9 @@ def _small_findings(problem: Problem, known: set[int]) -> tuple[list[Finding], l
     if guilt <= max(SURE * (1 - nothing), nothing) or len(of_cameras) == 0:
         return [], biased
     found = one_of(of_cameras)
+    # Minimum change of the focal length of one camera that is reported.
     size, least = (
-        (found.amount, LEAST_DEG)
-        if found.kind != Kind.FOCAL
-        else (abs(np.log(found.amount)), _LEAST_FOCAL)
+        (found.amount, LEAST_DEG) if found.kind != Kind.FOCAL else (abs(np.log(found.amount)), 0.04)
     )
     return ([found] if size > least or found.kind == Kind.MOVED else []), biased
 

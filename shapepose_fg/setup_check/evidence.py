@@ -35,10 +35,6 @@ of 170."""
 
 ANCHORS = 100
 """Number of frames used, spread over the recording."""
-_WHOLE = 600
-"""Maximum number of frames of a recording that is used completely, for time offsets."""
-_LAG_ANCHORS = 16
-"""Number of frames of a longer recording with neighbours used."""
 MOST_LAG = 60
 """Maximum time offset searched for, frames; less in a short recording."""
 _MOST_PAIRS = 25_000
@@ -74,7 +70,8 @@ def gather(detections: DetectionSequence, frames: range, views: int) -> Evidence
     pictures.
     """
     count, every = len(frames), 1
-    if count <= _WHOLE:
+    # Maximum number of frames of a recording that is used completely, for time offsets.
+    if count <= 600:
         wanted = np.arange(frames.start, frames.stop)
         most = min(MOST_LAG, count // 4)
         spread = np.unique(
@@ -92,7 +89,8 @@ def gather(detections: DetectionSequence, frames: range, views: int) -> Evidence
                 [t for t in frames if len(detections[t]) > 0] or [frames.start], dtype=np.intp
             )
             spread = there[np.unique(np.linspace(0, len(there) - 1, ANCHORS).astype(np.intp))]
-        every = max(1, ANCHORS // _LAG_ANCHORS)
+        # Number of frames of a longer recording with neighbours used.
+        every = max(1, ANCHORS // 16)
         near = [np.arange(t - most, t + most + 1) for t in spread[::every]]
         wanted = np.unique(np.concatenate([spread, *near]))
         wanted = wanted[(wanted >= frames.start) & (wanted < frames.stop)]

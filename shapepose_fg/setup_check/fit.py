@@ -37,15 +37,10 @@ Q = len(PARAMETERS)
 TURN, MOVE, CENTRE, FOCAL, POSE = [0, 1, 2], [3, 4, 5], [6, 7], [8], [0, 1, 2, 3, 4, 5]
 _MOST_ZOOM = 5.0
 """Maximum step of the focal length's logarithm; larger ones are implausible and would overflow."""
-_TRIES = 40
-"""Number of pairs of a person and a sighting that are tried; with two people, half of them are
-correct."""
 _ROUNDS = 4
 """Number of rounds of matching and fitting."""
 _STEPS = 4
 """Number of steps between matchings."""
-_WEAK = 1e-6
-"""Relative information added to each joint's position, since two rays may be parallel."""
 CORNER = np.array([-0.5, -0.5])
 """Coordinates of a picture's corner, px; the origin is the centre of the first pixel."""
 
@@ -61,8 +56,8 @@ class Others(Rows):
 
 
 Fitted = Callable[[Array, Array, Pinhole], Pinhole | None]
-"""Function that fits a camera to joints in the world (N, 3) and in its picture (N, 2), or returns
-None."""
+"""Function that fits a camera to joints (N, 3), in the calibration's unit, and their detections
+(N, 2), pixels, starting from the given camera; None if no fit is possible."""
 
 
 @dataclass(frozen=True)
@@ -146,13 +141,15 @@ def tries(
     person, sighting = same_frame(others.frame, seen.frame)
     both = ~np.isnan(others.points[person][..., 0]) & ~np.isnan(seen.xy[sighting][..., 0])
     enough = np.flatnonzero(both.sum(axis=1) >= MIN_JOINTS + 3)
-    for row in rng.permutation(enough)[:_TRIES].tolist():
+    # Number of pairs of a person and a sighting that are tried; with two people, half of them are
+    # correct.
+    for row in rng.permutation(enough)[:40].tolist():
         yield others.points[person[row]][both[row]], seen.xy[sighting[row]][both[row]]
 
 
-def turned_to(points: Array, xy: Array, camera: Pinhole) -> Pinhole | None:
-    """The camera rotated about its centre for the best fit of directions to `points` (N, 3) and
-    pixels `xy` (N, 2).
+def turned_to(points: Array, xy: Array, camera: Pinhole) -> Pinhole:
+    """The camera rotated about its centre for the best fit of directions to `points` (N, 3), in the
+    calibration's unit, and pixels `xy` (N, 2).
     """
     centre = -camera.cTw[:, :3].T @ camera.cTw[:, 3]
     away = points - centre
@@ -312,7 +309,8 @@ def placing(A: Array) -> Array:
     their derivatives A (..., m, 3) by its position.
     """
     H = A.mT @ A
-    H += np.eye(3) * (_WEAK * np.trace(H, axis1=-2, axis2=-1)[..., None, None] + 1e-300)
+    # Relative information added to each joint's position, since two rays may be parallel.
+    H += np.eye(3) * (1e-6 * np.trace(H, axis1=-2, axis2=-1)[..., None, None] + 1e-300)
     return np.linalg.solve(H, A.mT)
 
 

@@ -48,8 +48,6 @@ _FITTED: tuple[tuple[Kind, fit.Fitted, list[int]], ...] = (
 )
 """Corrections of one camera: an exact fit to one person, then parameters (`fit.PARAMETERS`) fitted
 to all."""
-_FACTORS = (0.25, 1 / 3, 0.5, 2 / 3, 0.75, 4 / 3, 1.5, 2.0, 3.0, 4.0)
-"""Factors of picture sizes that are tested for all cameras."""
 
 GOOD = 0.45
 """Score for the others' people above which a camera's pose is correct, except for small errors."""
@@ -65,7 +63,6 @@ _EXPLAINED = 0.65
 """Total score above which no other explanation than detector errors is searched for."""
 _PRICE = 0.02
 """Minimum gain in score per fitted parameter: half a centimetre of a person's joints is 0.02."""
-_SLIGHT = 0.08
 
 
 @dataclass(frozen=True)
@@ -188,7 +185,7 @@ def _likeliest(look: Look, found: list[tuple[float, Change]]) -> Change | None:
 
 def _slight(finding: Finding) -> bool:
     """Whether a scale change is too small for a gross mistake: no pictures are resized by 4 %."""
-    return finding.kind in (Kind.FOCAL, Kind.RESIZED) and abs(np.log(finding.amount)) < _SLIGHT
+    return finding.kind in (Kind.FOCAL, Kind.RESIZED) and abs(np.log(finding.amount)) < 0.08
 
 
 def judged(look: Look, change: Change) -> float:
@@ -257,7 +254,8 @@ def _of_all(look: Look) -> Iterator[Change]:
     everybody = tuple(range(look.view_count))
     for kind in _MISREAD:
         yield _misread(look, kind, everybody)
-    for factor in _FACTORS:
+    # Factors of picture sizes that are tested for all cameras.
+    for factor in (0.25, 1 / 3, 0.5, 2 / 3, 0.75, 4 / 3, 1.5, 2.0, 3.0, 4.0):
         cameras = {view: fit.scaled(look.camera(view), factor, fit.CORNER) for view in everybody}
         yield Change(Finding(Kind.RESIZED, everybody, factor), look.with_cameras(cameras))
 

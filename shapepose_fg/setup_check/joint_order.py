@@ -18,8 +18,6 @@ from shapepose_fg.setup_check.findings import Finding, Kind
 from shapepose_fg.setup_check.matching import MIN_SIGHTINGS, people_of
 from shapepose_fg.setup_check.small_errors import MOST_PEOPLE
 
-_FEWEST_JOINTS = 7
-"""Minimum number of joints in trunk and limbs for any statement."""
 _GAIN, _SHARE = 0.02, 0.8
 """Minimum gain in 3D, nats per pair of joints, and minimum share of people who gain. In 198
 motion-capture clips an exchange gains up to 0.035 over the right order, in at most 0.7 of the
@@ -48,7 +46,8 @@ def order_of_joints(detections: DetectionSequence, look: Look) -> list[Finding]:
     names = [skeleton.joints[skeleton.core[place]] for place in own]
     flat = _some(look.sightings.xy[:, own])
     space = _some(look.structure()[1].points[:, own])
-    if len(flat) < MIN_SIGHTINGS or len(own) < _FEWEST_JOINTS:
+    # Minimum number of joints in trunk and limbs for any statement.
+    if len(flat) < MIN_SIGHTINGS or len(own) < 7:
         return []
     in_space = np.isfinite(fit_of_order(space, names)).sum() >= MIN_SIGHTINGS
     order = exchanges(space if in_space else flat, names, _sides(names))

@@ -21,9 +21,6 @@ MIN_JOINTS = 5
 """Minimum number of core joints in view for a person to be used."""
 MIN_SIGHTINGS = 20
 """Minimum number of people seen for any statement on a camera or on the order of joints."""
-_STATURE_PER_SPREAD = 3.4
-"""Stature of a standing person over the root of the joints' summed variances: 1 / 0.29 for a
-uniform spread."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +82,9 @@ def size_of(xy: Array) -> Array:
     variance = (np.where(seen, (here - mean[..., None, :]) ** 2, 0.0).sum(axis=-2) / count).sum(
         axis=-1
     )
-    return np.asarray(np.maximum(_STATURE_PER_SPREAD * np.sqrt(variance), 1.0))
+    # Stature of a standing person over the root of the joints' summed variances: 1 / 0.29 for a
+    # uniform spread.
+    return np.asarray(np.maximum(3.4 * np.sqrt(variance), 1.0))
 
 
 def people_of(
@@ -126,8 +125,6 @@ GATE = 0.15
 """Maximum distance between the joints of two sightings of a person, as a share of the person's
 size. A detector errs by 3 cm of 170; the smallest reported error of a calibration is three times
 that (docs/setup_checks.md)."""
-_MIN_ANGLE = np.deg2rad(4.0)
-"""Minimum angle between the two rays of a pair, rad; below it the depth is poorly observed."""
 
 
 @dataclass(frozen=True)
@@ -270,7 +267,8 @@ def _meeting(
         )
     error = np.where(np.isfinite(half_gap) & ((s <= 0) | (t <= 0)), np.inf, error)
     angle = median_of(np.arcsin(np.minimum(sine, 1.0)))
-    median = np.where(angle > _MIN_ANGLE, median_of(error, MIN_JOINTS), np.inf)
+    # Minimum angle between the two rays of a pair, rad; below it the depth is poorly observed.
+    median = np.where(angle > np.deg2rad(4.0), median_of(error, MIN_JOINTS), np.inf)
     points = centres[sightings.view[first]][:, None] + (on_a + on_b) / 2
     return median, points
 
@@ -361,11 +359,6 @@ def median_over(values: Array) -> Array:
     return np.where(count > 0, (middle[0] + middle[1]) / 2, 0.0)
 
 
-_REACH, _FORGOTTEN = 1.4, 40
-"""Maximum distance that a person moves between frames, relative to the spread of the joints (two
-thirds of a metre), and the number of frames after which a lost person is forgotten."""
-
-
 def follow(frame: Index, away: Callable[[Index, Index], Array], reach: float, gap: int) -> Index:
     """(N,) identities of rows over frames (N,): rows of a frame and of the `gap` frames before
     are the same if they are nearest to each other, and within `reach`.
@@ -397,8 +390,10 @@ def followed(frame: Index, points: Array) -> Index:
         far = np.linalg.norm(middle[one, None] - middle[other], axis=-1)
         return far if far.size > 1 else 0 * far  # one person is the same one after a cut
 
-    reach = _REACH * float(np.median(spread)) if len(frame) > 0 else 0.0
-    return follow(frame, away, reach, _FORGOTTEN)
+    # Maximum distance that a person moves between frames, relative to the spread of the joints (two
+    # thirds of a metre), and the number of frames after which a lost person is forgotten.
+    reach = 1.4 * float(np.median(spread)) if len(frame) > 0 else 0.0
+    return follow(frame, away, reach, 40)
 
 
 def _middle(points: Array) -> Array:

@@ -14,14 +14,6 @@ from shapepose_fg.core.compiled import kernel
 from shapepose_fg.setup_check.evidence import Look
 from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS, Sightings, centres_of, rays_of
 
-_ANCHORS = 150
-"""Number of frames of one camera that are compared with those of another, at every offset."""
-_LEAST_FRAMES = 40
-"""Minimum number of frames for time offsets. In fewer, people hardly move enough to separate a
-small time offset from chance."""
-_NEAR = GATE / 3
-"""Distance of people above which they count as missed by a camera, as a share of the size; other
-people come that near seldom."""
 _CLEAR = 0.25
 """Minimum gain of a time offset. Sound cameras have up to 0.2, late ones 0.3 to 1."""
 LEAST_MISS = 0.004
@@ -50,7 +42,9 @@ class Lag:
 
 def lags(look: Look) -> list[Lag]:
     """Time offset of each camera against the others; none in a short recording."""
-    if len(np.unique(look.evidence.sightings.frame)) < _LEAST_FRAMES:
+    # Minimum number of frames for time offsets. In fewer, people hardly move enough to separate a
+    # small time offset from chance.
+    if len(np.unique(look.evidence.sightings.frame)) < 40:
         return [Lag()] * look.view_count
     return [lag_of(look, view) for view in range(look.view_count)]
 
@@ -62,8 +56,10 @@ def lag_of(look: Look, view: int, most: int | None = None) -> Lag:
     most = look.evidence.most_lag if most is None else min(most, look.evidence.most_lag)
     offsets, seen, around = np.arange(-most, most + 1), look.shifted, look.evidence.around
     rows = seen.rows((seen.view == view) | np.isin(seen.frame, around))
+    # Distance of people above which they count as missed by a camera, as a share of the size; other
+    # people come that near seldom.
     of_pairs = [
-        scan(rows, look.views, other, view, offsets, np.ptp(around) / 4, _NEAR)
+        scan(rows, look.views, other, view, offsets, np.ptp(around) / 4, GATE / 3)
         for other in np.unique(rows.view).tolist()
         if other != view
     ]
@@ -93,7 +89,8 @@ def scan(
     if min(len(one), len(other)) == 0:
         return np.full(len(lags), np.nan)
     taken = np.unique(one.frame)
-    wanted = taken[np.unique(np.linspace(0, len(taken) - 1, _ANCHORS).astype(np.intp))]
+    # Number of frames of one camera that are compared with those of another, at every offset.
+    wanted = taken[np.unique(np.linspace(0, len(taken) - 1, 150).astype(np.intp))]
     one = one.rows(np.isin(one.frame, wanted))
     other = other.rows(np.argsort(other.frame, kind="stable"))
     begin, last = int(other.frame[0]), int(other.frame[-1])

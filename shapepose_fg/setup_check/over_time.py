@@ -18,8 +18,6 @@ from shapepose_fg.setup_check.findings import Finding, Kind
 from shapepose_fg.setup_check.fit import POSE, TURN, Others, independent, likelihood, match
 from shapepose_fg.setup_check.matching import GATE, Pinhole, Sightings
 
-_LEAST_PEOPLE, _LEAST_PART = 6, 0.1
-"""Minimum number of people in each part of a recording, and minimum share of all."""
 _RESTLESS = 0.1
 """Difference of a camera's score between parts above which it is examined: 3 cm on people."""
 _LEAST_DEG = 1.2
@@ -73,7 +71,8 @@ def parting(one: Index, other: Index, frame: Index, error: Array) -> Parting | N
         (fits[-1] - fits)[:-1],
     )
     before, after = fits / possible, left / rest
-    enough = np.minimum(possible, rest) >= max(_LEAST_PEOPLE, _LEAST_PART * (possible + rest)[0])
+    # Minimum number of people in each part of a recording, and minimum share of all.
+    enough = np.minimum(possible, rest) >= max(6, 0.1 * (possible + rest)[0])
     if not enough.any():
         return None
     n = int(np.argmax(np.where(enough, np.abs(before - after) * np.sqrt(possible * rest), 0.0)))

@@ -17,6 +17,7 @@ from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.reconstruction import Reconstruction, Status
+from shapepose_fg.core.run_summary import has_identities
 from shapepose_fg.core.trust import BELIEVED, Spell, Trust, trust_in
 from shapepose_fg.setup_check.diagnosis import Build, Diagnosis, diagnose
 from shapepose_fg.setup_check.evidence import Look, left_out
@@ -234,17 +235,9 @@ def rounded(value: Any) -> Any:
     return float(f"{value:.4g}") if isinstance(value, float) else value
 
 
-_FASTEST_M_S, _PAIRS = 10.0, 10
-"""Speed of sprinters, m/s, and minimum number of steps for a speed."""
-_MOST, _FEW = 0.5, 50
-"""Share of used detections below which a camera is reported, and minimum number of detections."""
-_LOST, _LOST_SHARE = 0.5, 0.1
-"""Minimum number of missing people per frame, and minimum share of them, for a warning."""
 _LOOKED_AT = 200
 """Number of frames in which unused detections are counted, and of rows whose distances from the
 other cameras are measured, spread over the recording."""
-_SHORT_S = 1.0
-"""Duration, s, below which people seen by two cameras may lack evidence."""
 _REASONS = {
     Gate.TOO_FAR: "are too far from the joint",
     Gate.CONTRADICTS_BODY: "contradict the body",
@@ -252,9 +245,6 @@ _REASONS = {
     Gate.NOT_PLACED: "are of joints without a position",
 }
 """Reasons why assigned detections were not used."""
-_LEAST_USED = 0.1
-"""Minimum share of detections that people explain; on Shelf, with false candidates included, it is
-most."""
 
 
 @dataclass(frozen=True)
@@ -405,7 +395,7 @@ def _left_out(table: ObservationTable, rig: Rig) -> tuple[Array, Array]:
 
 def _speeds(people: Reconstruction) -> Iterator[str]:
     """Warning on implausible speeds of people, if rows have identities."""
-    if not people.run.get("configuration", {}).get("temporal", True):
+    if not has_identities(people.run):
         return
     hips = [
         place
@@ -418,8 +408,9 @@ def _speeds(people: Reconstruction) -> Iterator[str]:
     with np.errstate(divide="ignore", invalid="ignore"):
         speed = np.linalg.norm(np.diff(x, axis=0), axis=1)[follows] / np.diff(t)[follows]
     speed = np.sort(speed[np.isfinite(speed)])
-    fast = float(np.median(speed[-max(len(speed) // 10, 1) :])) if len(speed) >= 2 * _PAIRS else 0.0
-    if fast >= _FASTEST_M_S:
+    # Minimum number of steps for a speed; and the speed of sprinters, m/s.
+    fast = float(np.median(speed[-max(len(speed) // 10, 1) :])) if len(speed) >= 20 else 0.0
+    if fast >= 10.0:
         rate = 1 / float(np.median(np.diff(t)[follows] / np.diff(people.frame[order])[follows]))
         yield (
             f"people move at {fast:.0f} m/s, which is implausible: --fps is probably wrong "
@@ -444,7 +435,9 @@ def _too_many(people: Reconstruction) -> Iterator[str]:
 def _clutter(uses: Sequence[CameraUse]) -> Iterator[str]:
     """Warning if people explain hardly any detections."""
     offered, used = (sum(getattr(use, name) for use in uses) for name in ("offered", "used"))
-    if 0 < used < _LEAST_USED * offered:
+    # Minimum share of detections that people explain; on Shelf, with false candidates included, it
+    # is most.
+    if 0 < used < 0.1 * offered:
         yield (
             f"people explain only {100 * used / offered:.1f} % of the detections: identities may "
             "be arbitrary; use a higher confidence threshold in the detector"
@@ -454,7 +447,9 @@ def _clutter(uses: Sequence[CameraUse]) -> Iterator[str]:
 def _unused(uses: Sequence[CameraUse]) -> Iterator[str]:
     """Warnings on cameras with mostly unused detections, with reasons."""
     for use in uses:
-        if use.offered < _FEW or use.used >= _MOST * use.offered:
+        # Share of used detections below which a camera is reported, and minimum number of
+        # detections.
+        if use.offered < 50 or use.used >= 0.5 * use.offered:
             continue
         why = [
             f"{count} {words}"
@@ -481,7 +476,7 @@ def _unseen(
     if len(people) == 0 or len(frames) == 0:
         return []
     fps = people.run.get("time", {}).get("fps")
-    alone = not people.run.get("configuration", {}).get("temporal", True)
+    alone = not has_identities(people.run)
     rows = np.searchsorted(frames, people.frame[np.isin(people.frame, frames)])
     per_frame = np.bincount(rows, minlength=len(frames))
     return unseen(
@@ -511,10 +506,12 @@ def unseen(
             joints = np.bincount(found.joint[found.view == view], minlength=max(core) + 1)
             seen[row, view] = np.median(joints[core])
     by_two, here = float(np.sort(seen, axis=1)[:, -2].mean()), float(per_frame[looked_at].mean())
-    if by_two - here < max(_LOST, _LOST_SHARE * by_two):
+    # Minimum number of missing people per frame, and minimum share of them, for a warning.
+    if by_two - here < max(0.5, 0.1 * by_two):
         return []
     why = "the others are seen too little, or the cameras do not agree on them"
-    if lasts_s is not None and lasts_s < _SHORT_S:
+    # Duration, s, below which people seen by two cameras may lack evidence.
+    if lasts_s is not None and lasts_s < 1.0:
         why = (
             f"{lasts_s:.2g} s are too short to confirm all people; give more frames, or "
             "--no-temporal"

@@ -40,15 +40,10 @@ _WRONG = 0.5
 unusual bias."""
 _KNOCKED = 3
 """Prior frequency of rotated or translated cameras, relative to other mistakes."""
-_PARTS = 8
-"""Maximum number of parts of a recording at whose borders a camera may be bumped; errors of a
-detector last for some frames, so a part has `_LEAST_OF_ONE` or more."""
 MOST_PEOPLE = 150
 """Maximum number of people used, spread over the recording."""
 _LEAST_OF_ONE = 6
 """Minimum number of frames of a person; people with fewer are pooled for the biases."""
-_TURN_DEG = 1.0
-"""Rotation, degrees, above which a translated and rotated camera is called rotated."""
 LEAST_DEG = 0.25
 """Minimum rotation, or shift of a principal point, that is reported, degrees."""
 
@@ -92,7 +87,9 @@ class Problem:
         frame = groups.frame
         often = np.bincount(who, minlength=1) >= _LEAST_OF_ONE
         person = np.unique(np.where(often[who], who, len(often)), return_inverse=True)[1]
-        parts = min(_PARTS, len(np.unique(frame)) // _LEAST_OF_ONE)
+        # Maximum number of parts of a recording at whose borders a camera may be bumped; errors of
+        # a detector last for some frames, so a part has `_LEAST_OF_ONE` or more.
+        parts = min(8, len(np.unique(frame)) // _LEAST_OF_ONE)
         ends = np.quantile(frame, np.arange(1, parts) / parts) if parts > 1 else np.zeros(0)
         part = np.unique(
             np.searchsorted(np.unique(np.ceil(ends)), frame, side="right"), return_inverse=True
@@ -302,4 +299,5 @@ def named(kind: Kind, view: int, given: Views, views: Views) -> Finding:
         degrees = float(np.rad2deg(np.hypot(x, y) / views.focal_px[view]))
         return Finding(kind, (view,), degrees, ((x, y),))
     turn, moved = difference(given.cTw[view], views.cTw[view])
-    return Finding(Kind.TURNED if turn > _TURN_DEG else kind, (view,), turn, moved=moved)
+    # Rotation, degrees, above which a translated and rotated camera is called rotated.
+    return Finding(Kind.TURNED if turn > 1.0 else kind, (view,), turn, moved=moved)

@@ -24,18 +24,17 @@ _STILL = (
     "arms held high",
 )
 """Actions of people who stay in place, as the recordings name them."""
-_STILL_M, _WALK_M = 0.75, 2.5
-"""Radius within which standing people stay, and distance that walking people exceed, m."""
 _HORIZON_S = np.linspace(0.2, 2.0, 10)
 """Times ahead at which a walker predicts the others, s."""
 
 
 def standing_clips(mocap: Mocap, *, without: frozenset[str]) -> list[int]:
     """Indices of clips of people who stand and gesture, by subjects other than `without`."""
+    # Radius within which standing people stay, and distance that walking people exceed, m.
     return [
         index
         for index, action, plan in _clips(mocap, 90, without)
-        if any(word in action for word in _STILL) and np.ptp(plan, axis=0).max() < _STILL_M
+        if any(word in action for word in _STILL) and np.ptp(plan, axis=0).max() < 0.75
     ]
 
 
@@ -47,7 +46,7 @@ def walking_clips(mocap: Mocap, *, without: frozenset[str]) -> list[int]:
             way = np.linalg.norm(plan[-1] - plan[0])
             speed = way / len(plan) * float(mocap.arrays["fps"][index])
             straight = way > 0.95 * np.linalg.norm(np.diff(plan, axis=0), axis=1).sum()
-            found += [index] if way > _WALK_M and straight and speed < 1.6 else []
+            found += [index] if way > 2.5 and straight and speed < 1.6 else []
     return found
 
 

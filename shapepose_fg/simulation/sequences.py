@@ -380,7 +380,7 @@ def _dances(
 def _together_in(
     mocap: Mocap, pair: tuple[int, int], config: SequenceConfig, fps: float
 ) -> list[tuple[Clip, Clip]]:
-    """The segments of a take in which both are close together."""
+    """The segments of a take of two dancers in which they are close together."""
     lead, follow = (mocap.clip(index).resampled(fps) for index in pair)
     gap = np.linalg.norm((lead.pelvis - follow.pelvis)[:, [0, 2]], axis=1)
     # Maximum distance of the dancers at the ends of the used part of a take, m.

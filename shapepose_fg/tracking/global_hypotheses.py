@@ -5,6 +5,7 @@ A world is a global hypothesis: a set of tracks that share no detection. People 
 several frames, tracked from there forwards and backwards, and the tracks that explain most are
 selected (`track_selection.py`). The selected people are then joined in one world in the frames that
 show them best, and tracked again from there, so that they no longer take each other's detections.
+Alternatives are sought in what people with evidence throughout leave.
 """
 
 from collections.abc import Iterable, Sequence
@@ -41,8 +42,8 @@ again, and the best different one: on ten simulated recordings, most before thre
 PLACED_M = 0.2
 """Standard deviation below which a track's joint has a known position, m."""
 _PLAIN, _PLAIN_S = 0.25, 0.3
-"""Minimum evidence per second, over any window of `_PLAIN_S` s, with which people are tracked only
-once; in simulated crowds, alternatives are found only for people with less."""
+"""Minimum evidence per second, over any window of `_PLAIN_S` s, of a person to whom no
+alternatives are sought; in simulated crowds, they are found only for people with less."""
 _SAME_M = 0.02
 """Maximum distance between joints of two worlds with the same detections for these to
 be merged, m."""
@@ -84,6 +85,12 @@ class Hypotheses:
 
     def __len__(self) -> int:
         return len(self.carried)
+
+    def rows(self, chosen: NDArray[np.bool_]) -> "Hypotheses":
+        """The `chosen` hypotheses (H,)."""
+        names = ("carried", "world", "there", "candidate", "places", "weight", "price")
+        columns = {name: getattr(self, name)[chosen] for name in names}
+        return replace(self, **columns, joints=self.joints.rows(np.flatnonzero(chosen)))
 
     @classmethod
     def concatenate(cls, parts: Sequence["Hypotheses"]) -> "Hypotheses":
@@ -129,12 +136,14 @@ def explained(
         times_of(frames),
         np.full((len(carried), len(tracker.skeleton), len(frames[0].rig)), -1),
     )
-    on = Seed(-1, carried, unseen, backwards=False)
-    found = follow_worlds(tracker, frames, [on], keep)
-    if len(frames) == 1 or _plain(found, times):
+    on, everything = Seed(-1, carried, unseen, backwards=False), Rest.of(frames)
+    found = follow_worlds(tracker, everything, [on], keep)
+    plain = _plain(found, times)
+    if plain.all():
         return found, found.account.choose(found.world)
+    rest = Rest.of(frames, found.rows(plain))
     found = Hypotheses.concatenate(
-        [found, follow_worlds(tracker, frames, _seeds(tracker, frames), keep)]
+        [found, follow_worlds(tracker, rest, _seeds(tracker, rest.frames), keep)]
     )
     before = 0.0
     for _ in range(_ROUNDS):
@@ -145,17 +154,48 @@ def explained(
         unlike = (way for way in others if found.account.agreement(best, way) < _ALIKE)
         ways = (best, *islice(unlike, 1))
         again = [seed for way in ways for seed in _restarts(tracker, frames, times, found, way)]
-        found = Hypotheses.concatenate([found, follow_worlds(tracker, frames, again, keep)])
+        found = Hypotheses.concatenate([found, follow_worlds(tracker, everything, again, keep)])
     return found, found.account.choose(found.world)
 
 
-def _plain(found: Hypotheses, times: Array) -> bool:
-    """Whether all tracks span all frames with high evidence throughout."""
-    if not found.there.all():
-        return False
+def _plain(found: Hypotheses, times: Array) -> NDArray[np.bool_]:
+    """(H,) hypotheses that span all frames with high evidence throughout; all, of one frame."""
+    if len(times) == 1:
+        return np.ones(len(found), dtype=bool)
     evidence = found.weight.sum(axis=(2, 3)) - found.price
     frames = min(len(times), max(1, round(_PLAIN_S / float(np.median(np.diff(times))))))
-    return bool((sliding_window_view(evidence, frames, axis=1).mean(axis=-1) >= _PLAIN).all())
+    high = sliding_window_view(evidence, frames, axis=1).mean(axis=-1) >= _PLAIN
+    return np.asarray(found.there.all(axis=1) & high.all(axis=1))
+
+
+@dataclass(frozen=True)
+class Rest:
+    """T frames without the detections of K people, who are tracked already."""
+
+    whole: Sequence[Input]
+    """The frames with all detections."""
+    frames: Sequence[Input]
+    """The frames without the people's detections."""
+    index: Sequence[NDArray[np.intp]]
+    """Indices, among all detections of each frame, of those that are left; -1 at the end."""
+    places: Array
+    """(K, T, J, 3) joints of the people, who occlude others, metres; NaN where uncertain."""
+
+    @classmethod
+    def of(cls, frames: Sequence[Input], people: Hypotheses | None = None) -> "Rest":
+        """What `people` leave; by default, nobody is tracked already."""
+        if people is None or len(people) == 0:
+            index = [np.append(np.arange(len(frame.detections)), -1) for frame in frames]
+            return cls(frames, frames, index, np.zeros((0, len(frames), 1, 3)))
+        left = [
+            np.setdiff1d(np.arange(len(frame.detections)), people.candidate[:, t])
+            for t, frame in enumerate(frames)
+        ]
+        rest = [
+            replace(frame, detections=frame.detections.rows(own))
+            for frame, own in zip(frames, left, strict=True)
+        ]
+        return cls(frames, rest, [np.append(own, -1) for own in left], people.places)
 
 
 def times_of(frames: Sequence[Input]) -> Array:
@@ -238,14 +278,12 @@ Followed = tuple[int, Seed, NDArray[np.intp]]
 """A world's number, its seed, and the numbers of the people in it."""
 
 
-def follow_worlds(
-    tracker: Tracker, frames: Sequence[Input], seeds: Sequence[Seed], keep: int
-) -> Hypotheses:
+def follow_worlds(tracker: Tracker, rest: Rest, seeds: Sequence[Seed], keep: int) -> Hypotheses:
     """Track all `seeds` forwards and backwards through T frames, in parallel.
 
     People found on the forward pass are also tracked backwards.
     """
-    log = _Log(tracker, frames, keep)
+    log, frames = _Log(tracker, rest, keep), rest.frames
     given, born = list[Followed](), list[Followed]()
     for world, seed in enumerate(seeds):
         carried = seed.tracks.ids if seed.frame < 0 else None
@@ -360,9 +398,9 @@ def _twins(
 class _Log:
     """Collects the states of all tracks on their way."""
 
-    def __init__(self, tracker: Tracker, frames: Sequence[Input], keep: int) -> None:
-        self.tracker, self.frames, self.keep = tracker, frames, keep
-        self.shape = (len(tracker.skeleton), len(frames[0].rig))
+    def __init__(self, tracker: Tracker, rest: Rest, keep: int) -> None:
+        self.tracker, self.rest, self.frames, self.keep = tracker, rest, rest.whole, keep
+        self.shape = (len(tracker.skeleton), len(rest.whole[0].rig))
         self.carried, self.world = list[int](), list[int]()
         self.parts = list[tuple[int, NDArray[np.intp], NDArray[np.intp], Array, Array, Array]]()
         self.kept = list[tuple[NDArray[np.intp], JointStates]]()
@@ -380,14 +418,24 @@ class _Log:
         return np.arange(first, first + count)
 
     def add(self, t: int, tracks: Tracks, candidate: NDArray[np.intp]) -> None:
-        """Record the tracks in frame `t`, with their detections (A, J, V)."""
+        """Record the tracks in frame `t`, with their detections (A, J, V) among the rest."""
         if len(tracks) == 0:
             return
-        frame, joints = self.frames[t], tracks.joints
+        frame, joints, A = self.frames[t], tracks.joints, len(tracks)
+        candidate = self.rest.index[t][candidate]
         places = np.where((joints.sigma_m < PLACED_M)[..., None], joints.position, np.nan)
         arrays = FrameArrays.of(frame.detections, frame.rig, self.tracker.skeleton)
-        weight, price = weighed(candidate, places, arrays, self.tracker.skeleton, tracks.world)
-        self.parts.append((t, tracks.ids, candidate, places, weight, price))
+        # The people who are tracked already occlude those of every world.
+        others = self.rest.places[:, t]
+        worlds = np.unique(tracks.world) if len(others) > 0 else tracks.world[:0]
+        weight, price = weighed(
+            np.concatenate([candidate, np.full((len(worlds) * len(others), *self.shape), -1)]),
+            np.concatenate([places, *[others] * len(worlds)]),
+            arrays,
+            self.tracker.skeleton,
+            np.concatenate([tracks.world, worlds.repeat(len(others))]),
+        )
+        self.parts.append((t, tracks.ids, candidate, places, weight[:A], price[:A]))
         if t == self.keep:
             self.kept.append((tracks.ids, joints))
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from scipy.special import chndtr
+from scipy.special import chdtri, chndtr, fdtri
 
 from shapepose_fg import reconstruct
 from shapepose_fg.body.model.body_model import BodyModel
@@ -21,10 +21,12 @@ from shapepose_fg.estimation.uncertainty import (
     correlation,
     distance,
     distances,
+    error_tails,
     marginal,
+    squared_radius,
     surface_distance,
 )
-from shapepose_fg.pipeline.solving import window_solutions
+from shapepose_fg.pipeline.solve_again import window_solutions
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.viz.bodies import surfaces
 
@@ -161,6 +163,27 @@ def test_any_ellipsoid_is_as_drawn():
     assert float(found.mean_m) == pytest.approx(drawn.mean(), rel=0.01)
     assert float(found.sigma_m) == pytest.approx(drawn.std(), rel=0.02)
     assert float(found.quantile(0.9)) == pytest.approx(np.quantile(drawn, 0.9), rel=0.02)
+
+
+def test_errors_with_heavier_tails_have_the_same_95_percent_region():
+    """Student's t: 50 % regions are smaller than a Gaussian's, 99 % regions larger."""
+    rng, tails = np.random.default_rng(0), error_tails()
+    shape = np.diag([0.01, 0.02, 0.03]) ** 2
+    quoted = 3 * fdtri(3, tails, 0.95) / chdtri(3, 0.05) * shape
+    error = rng.multivariate_normal(np.zeros(3), shape, 200_000, method="cholesky")
+    error *= np.sqrt(tails / rng.chisquare(tails, len(error)))[:, None]
+    squared = np.square(error / np.sqrt(np.diag(quoted))).sum(axis=1)
+    for share in (0.5, 0.95, 0.99):
+        inside = (squared < squared_radius(share)).mean()
+        assert inside == pytest.approx(share, abs=0.004)
+    assert squared_radius(0.5) < chdtri(3, 0.5) and squared_radius(0.99) > chdtri(3, 0.01)
+    apart = np.array([0.02, 0.03, 0.0])
+    found, drawn = Distance(apart, quoted, tails), np.linalg.norm(apart + error, axis=1)
+    for limit in (0.02, 0.05, 0.1):
+        assert float(found.below(limit)) == pytest.approx((drawn < limit).mean(), abs=0.01)
+    assert float(found.sigma_m) == pytest.approx(drawn.std(), rel=0.1)
+    low, high = found.interval(0.95)
+    assert low < np.linalg.norm(apart) < high
 
 
 @pytest.mark.slow

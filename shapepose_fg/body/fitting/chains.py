@@ -9,10 +9,6 @@ from shapepose_fg.body.model.body_model import BodyParameters
 from shapepose_fg.body.model.rotation import log_so3, right_jacobian_inverse
 from shapepose_fg.core.arrays import Array, Index
 
-_LEVER_M = 0.05
-"""A rotation that moves a keypoint by less per radian, metres, does not decide how fast that
-keypoint is."""
-
 
 class Links:
     """`MotionPrior` along a chain of T rows with N parameters, as a part of a least-squares
@@ -156,7 +152,9 @@ def nearest_keypoint(energy: BodyEnergy) -> Index:
     _, slopes = energy.model.keypoints_with_jacobian(still)
     turns = slopes[0, :, :, 10:82].reshape(slopes.shape[1], 3, 24, 3)
     lever = np.sqrt((turns**2).sum(axis=(1, 3)) / 2)
-    lever = np.where(lever > _LEVER_M, lever, np.inf)
+    # A rotation that moves a keypoint by less per radian, metres, does not decide how fast that
+    # keypoint is.
+    lever = np.where(lever > 0.05, lever, np.inf)
     nearest = np.where(np.isfinite(lever).any(axis=0), lever.argmin(axis=0), lever[:, 0].argmin())
     return np.concatenate(
         [nearest[:1].repeat(3), (nearest[1:].repeat(3))[energy.angles], nearest[:1].repeat(3)]

@@ -11,9 +11,6 @@ from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.core.compiled import kernel, part
 from shapepose_fg.core.rows import Rows
 
-_ROUNDING = 1e-4
-"""Relative tolerance for asymmetry and negative eigenvalues of information; inverses for rays lose
-precision."""
 LEAST_JOINTS = 4
 """Minimum number of joints with full information: three determine a pose, one more
 allows a check."""
@@ -89,7 +86,9 @@ def _weighed(information, v, found, variance, full, valid):
             L, M = information[n, k], found[n, k]
             a, d, f = L[0, 0], L[1, 1], L[2, 2]
             b, c, e = (L[0, 1] + L[1, 0]) / 2, (L[0, 2] + L[2, 0]) / 2, (L[1, 2] + L[2, 1]) / 2
-            t = _ROUNDING * max(math.sqrt(a * a + d * d + f * f + 2 * (b * b + c * c + e * e)), 1.0)
+            # Relative tolerance for asymmetry and negative eigenvalues of information; inverses for
+            # rays lose precision.
+            t = 1e-4 * max(math.sqrt(a * a + d * d + f * f + 2 * (b * b + c * c + e * e)), 1.0)
             askew = max(abs(L[0, 1] - L[1, 0]), abs(L[0, 2] - L[2, 0]), abs(L[1, 2] - L[2, 1]))
             if askew > t or not _positive(a + t, b, c, d + t, e, f + t):
                 valid[n] = False

@@ -24,8 +24,6 @@ from shapepose_fg.core.rows import Rows
 
 _CHUNK = 64
 """Number of rows per batch of fits; their Hessians fit into the cache, and memory is bounded."""
-_ARRIVE = 128
-"""Number of rows per batch of the network."""
 _CONVERGED = 9.0
 """Without a network: maximum decrease of the energy that a Newton step predicts for a converged row
 (3 sigma of the posterior). With a network, `BodyConfig.unfinished` is used after the plain
@@ -143,7 +141,8 @@ class SmplFitter(BodyFitter):
         Each row separately: the choice of optimiser does not depend on the targets of another one.
         """
         parts = list[JointPosterior]()
-        for some in _parts(len(evidence.xyz), _ARRIVE):
+        # Number of rows per batch of the network.
+        for some in _parts(len(evidence.xyz), 128):
             targets, variance = _relative(evidence.rows(some))
             free, held = self.optimiser.arrive(
                 targets, variance, None if start is None else start[some]

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS
 from shapepose_fg.core.bounds import Settings
 from shapepose_fg.core.compiled import kernel
+from shapepose_fg.core.skeleton import SMPL_24
 
-NUM_ROTATIONS = 22
+NUM_ROTATIONS = SMPL_24.index("left_hand")
 """Root and the 21 joints of SMPL that are not hands: the rotations that the network updates."""
 NUM_PARAMETERS = 10 + 6 * NUM_ROTATIONS + 3
 """Number of parameters: betas, 6D rotations, translation."""

@@ -35,9 +35,6 @@ MAX_ITERATIONS = 40
 """Maximum number of Levenberg-Marquardt steps, rejected ones included."""
 TOLERANCE = 1e-2
 """Convergence: decrease of a row's energy in a step, in squared standard deviations."""
-_NOBODY = 50.0
-"""Size of a beta above which the network has diverged; such rows are fitted by the
-plain optimiser."""
 _DAMPING_START, _DAMPING_MIN, _DAMPING_MAX = 1e-3, 1e-7, 1e7
 
 
@@ -91,7 +88,9 @@ class NetworkDescent:
         pelvis = self._energy.model.rest_pelvis(arrived.betas)
         transl = (rotation @ (pelvis + arrived.transl)[..., None])[..., 0] + origin - pelvis
         free = np.concatenate((arrived.betas, orient, angles, transl), 1)
-        free[~(np.abs(arrived.betas).max(axis=1) < _NOBODY)] = np.nan
+        # Size of a beta above which the network has diverged; such rows are fitted by the plain
+        # optimiser.
+        free[~(np.abs(arrived.betas).max(axis=1) < 50.0)] = np.nan
         return free, Held(arrived.betas, np.ones(count), angles)
 
     def evaluated(self, free: Array, targets: EnergyTargets, held: Held) -> Evaluated:

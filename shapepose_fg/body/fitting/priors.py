@@ -24,9 +24,6 @@ _SAMPLES = 2000
 _MARGIN, _NOISE_M = 1.25, 0.05
 """Margin for people outside the body model, and for the errors of two joints (3 cm each, 1.5
 sigma)."""
-_UNKNOWN_M = 0.75
-"""Maximum length of a bone unknown to the body, m: the trunk of a tall adult, hip to neck, is about
-0.65 m."""
 
 
 @dataclass(frozen=True)
@@ -177,5 +174,7 @@ def longest_bones(skeleton: Skeleton) -> Array:
     xyz[:, known] = model.keypoints(BodyParameters(betas, still, pose, still))
     parents = np.array(skeleton.parents)
     length = np.quantile(np.linalg.norm(xyz - xyz[:, parents], axis=-1), 0.999, axis=0)
-    longest = np.where(np.isfinite(length), _MARGIN * length + _NOISE_M, _UNKNOWN_M)
+    # Maximum length of a bone unknown to the body, m: the trunk of a tall adult, hip to neck, is
+    # about 0.65 m.
+    longest = np.where(np.isfinite(length), _MARGIN * length + _NOISE_M, 0.75)
     return np.where(parents < 0, np.inf, longest)

@@ -27,24 +27,15 @@ _SMPL_VERTEX_KEYPOINTS = {
     "LSmallToe": 3226, "LHeel": 3387, "RBigToe": 6617, "RSmallToe": 6624, "RHeel": 6787,
 }  # fmt: skip
 """Vertices of SMPL's own mesh for keypoints."""
-_SMPL_JOINT_KEYPOINTS = {
-    "RShoulder": 17, "RElbow": 19, "RWrist": 21, "LShoulder": 16, "LElbow": 18, "LWrist": 20,
-    "RHip": 2, "RKnee": 5, "RAnkle": 8, "LHip": 1, "LKnee": 4, "LAnkle": 7,
-}  # fmt: skip
-"""SMPL joints for keypoints."""
 _HEIGHT_M = (0.4, 3.0)
 """Range of body heights, m, from a newborn to above any adult; detects templates in other units."""
-_SUM_TOLERANCE = 0.02
-"""Tolerance for row sums of regressors, which are weighted means printed with few digits."""
 _BELONGS = {
     "RShoulder": "right_shoulder", "RElbow": "right_elbow", "RWrist": "right_wrist",
     "LShoulder": "left_shoulder", "LElbow": "left_elbow", "LWrist": "left_wrist",
     "RHip": "right_hip", "RKnee": "right_knee", "RAnkle": "right_ankle",
     "LHip": "left_hip", "LKnee": "left_knee", "LAnkle": "left_ankle",
 }  # fmt: skip
-"""SMPL joints near which keypoints must lie."""
-_FARTHEST = 0.15
-"""Maximum distance of a keypoint from its SMPL joint, as a share of the body's height."""
+"""SMPL joints of keypoints: of SMPL's own mesh they are the keypoints, of others they are near."""
 _RISING = ("ankle", "knee", "hip", "shoulder")
 """Joints in ascending order of height in T-pose."""
 
@@ -230,8 +221,8 @@ def _smpl_keypoint_regressor(joint_regressor: Array) -> Array:
     regressor = np.zeros((_NUM_KEYPOINTS, _SMPL_NUM_VERTICES))
     for name, vertex in _SMPL_VERTEX_KEYPOINTS.items():
         regressor[BODY_25.index(name), vertex] = 1
-    for name, joint in _SMPL_JOINT_KEYPOINTS.items():
-        regressor[BODY_25.index(name)] = joint_regressor[joint]
+    for name, joint in _BELONGS.items():
+        regressor[BODY_25.index(name)] = joint_regressor[SMPL_24.index(joint)]
     for middle, sides in {"Neck": ("RShoulder", "LShoulder"), "MidHip": ("RHip", "LHip")}.items():
         regressor[BODY_25.index(middle)] = regressor[[BODY_25.index(side) for side in sides]].mean(
             0
@@ -253,7 +244,8 @@ def _implausible(template: Array, joint_regressor: Array, keypoint_regressor: Ar
         ("keypoint_regressor", keypoint_regressor),
     ):
         off = np.abs(regressor.sum(axis=1) - 1).max()
-        if off > _SUM_TOLERANCE:
+        # Tolerance for row sums of regressors, which are weighted means printed with few digits.
+        if off > 0.02:
             return (
                 f"{name} has rows that do not sum to 1 (off by {off:.2g}): use an unchanged file "
                 "of one model"
@@ -278,7 +270,8 @@ def _implausible(template: Array, joint_regressor: Array, keypoint_regressor: Ar
         distance = float(np.linalg.norm(keypoints[name] - joints[joint]))
         side, part = joint.split("_")
         mirrored = joints[f"{'right' if side == 'left' else 'left'}_{part}"]
-        if distance > _FARTHEST * height or distance > np.linalg.norm(keypoints[name] - mirrored):
+        # Maximum distance of a keypoint from its SMPL joint, as a share of the body's height.
+        if distance > 0.15 * height or distance > np.linalg.norm(keypoints[name] - mirrored):
             return (
                 f"keypoint_regressor puts {name} {distance:.2g} m from {joint}: rows are BODY_25 "
                 "in order"

@@ -24,10 +24,6 @@ from shapepose_fg.core.storage.files import read_bytes
 
 _MOST_STEPS = 200_000
 """Maximum number of steps; SMPL's files take a few thousand."""
-_MOST_BYTES = 2**30
-"""Maximum size of a file, bytes; SMPL's own have 40 to 250 MB."""
-_MOST_DENSE = 2**23
-"""Maximum number of entries of a dense matrix: 24 joints from 350,000 vertices."""
 
 
 class RefusedPickle(Exception):
@@ -177,7 +173,8 @@ def read_smpl_pickle(path: Path) -> dict[str, Any]:
 
     Raises RefusedPickle if the file needs anything but data; a damaged pickle can raise any error.
     """
-    content = _Reader(read_bytes(path, _MOST_BYTES)).load()
+    # Maximum size of a file, bytes; SMPL's own have 40 to 250 MB.
+    content = _Reader(read_bytes(path, 2**30)).load()
     if not isinstance(content, dict):
         raise RefusedPickle(f"it holds a {type(content).__name__}, but SMPL's files hold a dict")
     return {str(name): value for name, value in content.items()}
@@ -246,7 +243,8 @@ def _sparse_array(value: Record) -> Array:
     state = value.state
     shape = as_array(state["_shape"] if "_shape" in state else state["shape"]).astype(np.int64)
     parts = [as_array(state[name]) for name in ("data", "indices", "indptr")]
-    if shape.shape != (2,) or not 0 < shape.prod() <= _MOST_DENSE or not (shape > 0).all():
+    # Maximum number of entries of a dense matrix: 24 joints from 350,000 vertices.
+    if shape.shape != (2,) or not 0 < shape.prod() <= 2**23 or not (shape > 0).all():
         raise ValueError(f"a sparse matrix of {shape.tolist()} entries")
     kind = sparse.csc_array if value.name in _COLUMNS else sparse.csr_array
     matrix = kind((parts[0], *(each.astype(np.intp) for each in parts[1:])), tuple(shape.tolist()))

@@ -17,11 +17,6 @@ _ANKLES, _KNEES = (
 )
 SINK_M = 0.01
 """Depth below the floor that is tolerated, m: flesh and soles are soft."""
-_BEND_RAD = 0.6
-"""Maximum rotation of an ankle to lift a foot, rad."""
-_OF_FEET, _BEYOND = 3, 10
-"""Every third vertex of the feet and every tenth of the other skin are tested; they are 1 to 3 cm
-apart."""
 _ROWS = 8
 """Number of bodies per batch of vertices."""
 
@@ -33,7 +28,9 @@ Bodies = tuple[Array, Array, Array, Array]
 def feet_vertices(model: BodyModel) -> list[Index]:
     """Sampled vertices of the right foot, and of the left."""
     bone = model.arrays.weights.argmax(axis=1)
-    return [np.flatnonzero(np.isin(bone, bones))[::_OF_FEET] for bones in _BONES]
+    # Every third vertex of the feet and every tenth of the other skin are tested; they are 1 to 3
+    # cm apart.
+    return [np.flatnonzero(np.isin(bone, bones))[::3] for bones in _BONES]
 
 
 def lowest_of_feet(model: BodyModel, bodies: Bodies, up: Array) -> Array:
@@ -77,16 +74,13 @@ def _bends(model: BodyModel, bodies: Bodies, normal: Array, height_m: float) -> 
     flat = arm - (arm @ normal)[..., None] * normal
     length = np.maximum(np.linalg.norm(flat, axis=-1), 0.05)
     axis = np.cross(flat / length[..., None], normal)
-    return np.einsum(
-        "bfji,bfj->bfi", shanks, axis * np.minimum(sunk / length, _BEND_RAD)[..., None]
-    )
+    # Maximum rotation of an ankle to lift a foot, rad.
+    return np.einsum("bfji,bfj->bfi", shanks, axis * np.minimum(sunk / length, 0.6)[..., None])
 
 
 def _lowest(model: BodyModel, bodies: Bodies, normal: Array) -> Array:
     """(B,) smallest height of each body along a `normal` (3,), metres, accurate to 1 cm."""
-    chosen = np.union1d(
-        np.concatenate(feet_vertices(model)), np.arange(0, model.num_vertices, _BEYOND)
-    )
+    chosen = np.union1d(np.concatenate(feet_vertices(model)), np.arange(0, model.num_vertices, 10))
     return np.asarray((_vertices(model, bodies, chosen) @ normal).min(axis=1))
 
 

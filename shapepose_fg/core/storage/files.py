@@ -222,18 +222,11 @@ def parse_toml(path: Path, text: str) -> dict[str, Any]:
             )
     try:
         return bounded(tomllib.loads(text), path)
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(
-            f"{path}: cannot be read as TOML ({error}); correct it or write the file again"
-        ) from None
     except InputError:
         raise
-    except (
-        ValueError,
-        RecursionError,
-    ) as error:  # such as an invalid date, or an integer of 5,000 digits
+    except (ValueError, RecursionError) as error:  # an integer of 5,000 digits is no syntax error
         raise InputError(
-            f"{path}: cannot be read as TOML ({error}); write the file again"
+            f"{path}: cannot be read as TOML ({error}); correct it or write the file again"
         ) from None
 
 

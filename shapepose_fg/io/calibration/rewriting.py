@@ -44,8 +44,6 @@ from shapepose_fg.io.calibration.xml_files import (
 )
 
 Files = dict[Path, str]
-_KEY = re.compile(r"(?P<indent>\s*)(- )?[\"']?(?P<key>[^\"':#]+?)[\"']?\s*:\s*(?P<rest>.*)$")
-_DATA = re.compile(r"(?P<head>\s*data\s*:\s*)\[(?P<numbers>[^\]]*)\]", re.DOTALL)
 
 
 def _numbers(values: ArrayLike) -> str:
@@ -99,48 +97,33 @@ def _vicon(content: Content, rig: Rig, metres: float) -> Files:
     return {content.path: ET.tostring(content.value, encoding="unicode")}
 
 
-def _matrices(text: str, value: Callable[[tuple[str, ...], int], ArrayLike | None]) -> str:
-    """FileStorage's text with new matrices: `value(keys, count)` returns a new matrix or None; keys
-    are the outermost first.
+def _storage(path: Path, value: Callable[[tuple[str, ...], int], ArrayLike | None]) -> str:
+    """The text of a FileStorage with new matrices: `value(keys, count)` returns a new matrix or
+    None; keys are the outermost first, after the name of the file.
     """
-    if text.lstrip().startswith("<"):
-        return _matrices_of_xml(text, value)
-    pieces, above, place = list[str](), list[tuple[int, str]](), 0
-    for line in re.finditer(r"[^\n]*\n?", text):
-        found = _KEY.match(line.group().rstrip("\n"))
-        if line.start() < place or found is None:
-            continue
-        indent = len(found["indent"])
-        above = [(depth, key) for depth, key in above if depth < indent] + [(indent, found["key"])]
-        data = _DATA.search(text, line.end()) if found["rest"].startswith("!!opencv-") else None
-        if data is not None:
-            count = len(data["numbers"].split(","))
-            new = value(tuple(key for _, key in above), count)
-            if new is not None and np.size(new) == count:
-                head = text[place : data.start()].replace("dt: f", "dt: d")
-                pieces.append(f"{head}{data['head']}[ {', '.join(_numbers(new).split())} ]")
-                place = data.end()
-    return "".join(pieces) + text[place:]
+    ending = ".xml" if path.suffix.lower() == ".xml" else ".yml"
+    storage = cv2.FileStorage(ending, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
 
+    def write(keys: tuple[str, ...], node: Any) -> None:
+        if isinstance(node, dict):
+            storage.startWriteStruct(keys[-1], cv2.FILE_NODE_MAP)
+            for key, each in node.items():
+                write((*keys, key), each)
+            storage.endWriteStruct()
+        elif isinstance(node, list):
+            storage.startWriteStruct(keys[-1], cv2.FILE_NODE_SEQ)
+            for each in node:
+                write((*keys, ""), each)
+            storage.endWriteStruct()
+        else:
+            new = value(keys, node.size) if isinstance(node, np.ndarray) else None
+            if new is not None and np.size(new) == node.size:
+                node = np.reshape(new, node.shape)
+            storage.write(keys[-1], node)
 
-def _matrices_of_xml(text: str, value: Callable[[tuple[str, ...], int], ArrayLike | None]) -> str:
-    root = ET.fromstring(text)
-
-    def fill(element: ET.Element, keys: tuple[str, ...]) -> None:
-        for child in element:
-            data = (
-                child.find("data") if str(child.get("type_id", "")).startswith("opencv-") else None
-            )
-            if data is None:
-                fill(child, (*keys, child.tag))
-                continue
-            count = len((data.text or "").split())
-            new = value((*keys, child.tag), count)
-            if new is not None and np.size(new) == count:
-                data.text = _numbers(new)
-
-    fill(root, ())
-    return ET.tostring(root, encoding="unicode")
+    for key, node in load(path).value.items():
+        write((path.stem, key), node)
+    return storage.releaseAndGetString()
 
 
 def numbers_of(name: str, camera: Camera, metres: float, count: int) -> ArrayLike | None:
@@ -192,12 +175,10 @@ def _opencv(content: Content, rig: Rig, metres: float) -> Files:
     files = {path for path in beside if re.fullmatch(r"(intri|extri)\.ya?ml", path.name)}
     files = files if whole or content.path in files else {content.path}
     files |= {path for path in beside if path.stem in cameras} if whole else set()
-    return {
-        path: _matrices(
-            read_text(path), lambda keys, count, stem=path.stem: value((stem, *keys), count)
-        )
-        for path in sorted(files)
-    }
+    try:
+        return {path: _storage(path, value) for path in sorted(files)}
+    except cv2.error:  # a value that OpenCV itself would not write
+        return {}
 
 
 def _ros(content: Content, rig: Rig, metres: float) -> Files:

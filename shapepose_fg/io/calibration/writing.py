@@ -37,7 +37,7 @@ def write_like(source: Path, rig: Rig, target: Path, unit: Unit | None = None) -
     """Write `rig`, which was read from `source` and then changed, to `target`; returns the format's
     name and the written path.
 
-    Poses, intrinsics and distortions are replaced; the rest of the file is unchanged. For formats
+    Poses, intrinsics and distortions are replaced; all other values are unchanged. For formats
     of several files, `target` is a folder, without file extension. `unit` is the argument given to
     `read_rig`. The file is read back; if the result is not equal to `rig` (the format lacks a
     field, the file is unusual, or `rig` has only some of its cameras), this project's rig file is

@@ -55,9 +55,6 @@ _RERUN = {
     _YOLO: "write each frame's result.to_json() again, or run yolo pose with save_txt=True",
     _SEPARATE: "run AlphaPose again, without --format",
 }
-_LONGEST_GAP = 1000
-"""Maximum ratio of missing to existing frames; a larger ratio means that the numbers are not frame
-numbers."""
 FRAME_FILE = r"(_keypoints|(\.\w{1,5})?\.predictions)?\.json"
 """Pattern of what follows the frame number in file names."""
 _ALL_FRAMES, _SEP_JSON = "alphapose-results.json", "sep-json"
@@ -213,7 +210,8 @@ def read_frame_files(folder: Path) -> CameraPeople:
         program, joints = _program_of_frames([file for _, file in found])
     in_order(found)
     first, last = found[0][0], found[-1][0]
-    if last - first + 1 > 2 * len(found) + _LONGEST_GAP:
+    # If more frames are missing than this, the numbers are not frame numbers.
+    if last - first + 1 > 2 * len(found) + 1000:
         problem = f"{len(found)} files are numbered from {first} to {last}"
         raise InputError(
             f"{folder}: {problem}; number them by the frames of the recording, or {_RERUN[program]}"
@@ -281,7 +279,7 @@ def _lists(folder: Path) -> list[Path]:
 
 
 def _known(item: Any) -> bool:
-    """Whether this is an item of a list in one of the programs' formats."""
+    """Whether `item` of a JSON list is a person, or a picture's people, in a supported format."""
     return isinstance(item, dict) and ("image_id" in item or "instances" in item)
 
 

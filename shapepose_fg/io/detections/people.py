@@ -17,9 +17,6 @@ from shapepose_fg.io.detections.view_streams import ViewCandidates, ViewStream
 
 OVERSHOOT = 1.1
 """Largest score that is clipped to 1 without a note: upsampled heat maps overshoot slightly."""
-_RARE = 0.01
-"""Share of scores above the quantile by which all scores are divided; the maximum would depend on a
-single outlier."""
 
 
 @dataclass(frozen=True)
@@ -195,7 +192,8 @@ def score_rule(people: Sequence[KeptPeople]) -> tuple[Scores, str | None]:
     # their scale.
     step = -(-sum(each.score_count for each in people) // 4_000_000)
     looked_at = np.concatenate([block.scores[::step] for each in people for block in each.blocks()])
-    scale = max(1.0, float(np.quantile(looked_at, 1 - _RARE)))
+    # The maximum would depend on a single outlier.
+    scale = max(1.0, float(np.quantile(looked_at, 0.99)))
     divided = f"divided by {scale:.3g}, their 99 % quantile, and " if scale > 1 else ""
     note = f"scores reach {top:.3g}, so they are not probabilities: they were {divided}clipped to 1"
     return lambda score: np.minimum(score / scale, 1.0), note

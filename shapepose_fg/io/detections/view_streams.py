@@ -18,12 +18,6 @@ from shapepose_fg.io.detection_table import BLOCK_FRAMES, DetectionTable, keep_b
 
 MARGIN = 0.25
 """Maximum distance of a joint outside the picture, as a share of the picture's size."""
-_STRAY = 0.05
-"""Maximum share of a camera's joints far outside its picture; these are left out, with a note. A
-larger share means that the detections belong to other pictures."""
-_BENT = 0.5
-"""Maximum share of a camera's joints at which its distortion cannot be inverted, as in the corners
-of wide lenses. A larger share means that the coefficients are wrong."""
 
 
 @dataclass(frozen=True)
@@ -249,9 +243,13 @@ class _Undistorted:
 
     def __init__(self, source: Path | str, camera: Camera) -> None:
         self.source, self.camera = source, camera
+        # Maximum share of a camera's joints far outside its picture; these are left out, with a
+        # note. A larger share means that the detections belong to other pictures.
+        # Maximum share of a camera's joints at which its distortion cannot be inverted, as in the
+        # corners of wide lenses. A larger share means that the coefficients are wrong.
         self.reasons = (
-            _LeftOut("give detections from pictures of the calibrated size", _STRAY),
-            _LeftOut("check the distortion coefficients in the calibration", _BENT),
+            _LeftOut("give detections from pictures of the calibrated size", 0.05),
+            _LeftOut("check the distortion coefficients in the calibration", 0.5),
         )
 
     def undistorted(self, view: ViewCandidates) -> ViewCandidates:

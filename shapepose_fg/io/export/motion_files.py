@@ -19,7 +19,7 @@ from shapepose_fg.io.export.registry import Job, Written
 from shapepose_fg.io.export.skinned import BONES, Motion, RestBody, all_segments
 from shapepose_fg.io.export.take import y_up, z_up
 
-_SHARED = 22
+_SHARED = SMPL_24.index("left_hand")
 """Number of joints, from the pelvis on, that SMPL and SMPL-H have in common."""
 OPEN_BODY = "shapepose-fg open body"
 """Name of the built-in body model in files."""

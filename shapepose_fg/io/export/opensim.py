@@ -152,8 +152,8 @@ def _scale_tool(name: str, markers: Markers, span: str, marker_file: str) -> str
 
 
 def _ik_tool(name: str, markers: Markers, span: str) -> str:
-    """Inverse kinematics; the weight of a marker is its inverse variance, relative to the median
-    marker.
+    """The settings of OpenSim's inverse kinematics; the weight of a marker is its inverse
+    variance, relative to the median marker.
     """
     sigma = np.where(markers.there & np.isfinite(markers.sigma_m), markers.sigma_m, np.inf)
     spread = np.median(sigma[markers.frames], axis=0)

@@ -26,8 +26,6 @@ from shapepose_fg.io.export.rerun_log import camera_path, log_take, person_path
 from shapepose_fg.io.export.take import Take, y_up
 
 APPLICATION = "shapepose-fg"
-_CONNECT_S, _PATIENCE_S = 10.0, 30
-"""Maximum time to connect to a running viewer, and to a newly started one, s."""
 
 
 def new_stream() -> Any:
@@ -48,7 +46,8 @@ def shown(first: Any, url: str | None) -> Iterator[Any]:
     try:
         if url is not None:
             stream.connect_grpc(url, default_blueprint=first)
-            stream.flush(timeout_sec=_CONNECT_S)
+            # Maximum time to connect to a running viewer, and to a newly started one, s.
+            stream.flush(timeout_sec=10.0)
         else:
             rr.spawn(
                 recording=stream,
@@ -195,9 +194,7 @@ def switch_off(viewer: str) -> bool:
 
     def says(command: str) -> str:
         words = [viewer, "analytics", command]
-        done = subprocess.run(
-            words, capture_output=True, text=True, timeout=_PATIENCE_S, check=True
-        )
+        done = subprocess.run(words, capture_output=True, text=True, timeout=30, check=True)
         return done.stdout
 
     def on() -> bool:

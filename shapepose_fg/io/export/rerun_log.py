@@ -31,7 +31,6 @@ from shapepose_fg.io.footage.placement import CameraFootage, Placement
 
 _CAMERAS = "world/cameras"
 """Path of the cameras in the recording."""
-_JOINT_M, _GUESSED_M, _BONE_M = 0.016, 0.010, 0.007
 Drawn = dict[int, dict[int, Array]]
 """By person whose body is shown, and bone: rotations (M, 3, 3) of the bones nearby, relative to
 this one, for which its part was shaped."""
@@ -42,8 +41,6 @@ _GATES = {
     Gate.NOT_PLACED: (150, 150, 150),
 }
 """Colours of unused detections, by reason; used ones have the colour of their person."""
-_USED_DOT, _UNUSED_DOT = -2.0, -3.0
-"""Radii of dots in screen units, independent of the zoom; rerun marks these by negative values."""
 
 
 def person_path(who: int) -> str:
@@ -201,16 +198,14 @@ def _log_person(rr: ModuleType, stream: Any, take: Take, person: int) -> None:
         points = rr.Points3D(
             joints[placed],
             colors=_rgb8(shades),
-            radii=np.where(seen, _JOINT_M, _GUESSED_M),
+            radii=np.where(seen, 0.016, 0.010),
             labels=people.joint_names[placed].tolist(),
             show_labels=False,
         )
         stream.log(f"{path}/joints", points)
         lines = joints[bones]
         lines = lines[np.isfinite(lines).all(axis=(1, 2))]
-        stream.log(
-            f"{path}/bones", rr.LineStrips3D(lines, colors=_rgb8(colour[None]), radii=_BONE_M)
-        )
+        stream.log(f"{path}/bones", rr.LineStrips3D(lines, colors=_rgb8(colour[None]), radii=0.007))
         stream.log(
             f"{path}/uncertainty",
             _ellipsoids(rr, joints[placed], people.covariance[row][placed], colour),
@@ -332,17 +327,19 @@ def _log_observations(rr: ModuleType, stream: Any, take: Take, rig: Rig) -> None
         rows = np.flatnonzero(row_frame == index)
         for view, path in enumerate(map(camera_path, rig.names)):
             row, joint = np.nonzero(used[rows, :, view])
+            # Radii of dots in screen units, independent of the zoom; rerun marks these by negative
+            # values.
             points = rr.Points2D(
                 table.xy[rows[row], joint, view],
                 colors=colours[rows[row]],
-                radii=_USED_DOT,
+                radii=-2.0,
                 labels=take.people.joint_names[joint].tolist(),
                 show_labels=False,
             )
             stream.log(f"{path}/seen/used", points)
             row, joint = np.nonzero(seen[rows, :, view] & ~used[rows, :, view])
             xy, gate = table.xy[rows[row], joint, view], table.gate[rows[row], joint, view]
-            stream.log(f"{path}/seen/not_used", rr.Points2D(xy, class_ids=gate, radii=_UNUSED_DOT))
+            stream.log(f"{path}/seen/not_used", rr.Points2D(xy, class_ids=gate, radii=-3.0))
             errors = residual[rows, :, view]
             if np.isfinite(errors).any():
                 plot = path.replace(_CAMERAS, "plots/residual", 1)

@@ -14,7 +14,7 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import LEAST_FPS, MOST_FPS, rate_of, typed_rate
 from shapepose_fg.core.reconstruction import BODY, Known, Reconstruction
 from shapepose_fg.core.result_files import check_memory
-from shapepose_fg.core.run_summary import covered_frames
+from shapepose_fg.core.run_summary import covered_frames, has_identities
 
 _BODY_BYTES = 2_000
 """Approximate memory for one person's body per frame during export, bytes."""
@@ -64,7 +64,7 @@ class Take:
         """
         if len(people) == 0:
             raise ValueError("the result has no people, so there is nothing to export")
-        if identities and not people.run.get("configuration", {}).get("temporal", True):
+        if identities and not has_identities(people.run):
             raise ValueError(
                 "this result is frame by frame and has no identities; reconstruct with "
                 "--temporal, or export csv or rrd"

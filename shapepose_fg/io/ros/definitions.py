@@ -118,7 +118,8 @@ def check_definition(name: str, text: str) -> None:
             (int(n) for kind in fields.values() for n in re.findall(r"\[(?:<=)?(\d+)\]", kind)),
             default=0,
         )
-        if len(fields) == 0 or size > _MOST_ITEMS:
+        # Maximum number of items of an array of fixed size.
+        if len(fields) == 0 or size > 2**16:
             raise ValueError(f"{each} has {f'an array of {size}' if size else 'no field'}")
     waiting = [(name, name)]
     while len(waiting) > 0:
@@ -169,8 +170,6 @@ _FAMILY |= {
 }
 _FAMILY |= {"float32": "real", "float64": "real"}
 """Kind of value for each primitive ROS type; any other type is a message."""
-_MOST_ITEMS = 2**16
-"""Maximum number of items of an array of fixed size."""
 _TIME = {
     each: {"sec": "int32", "nanosec": "uint32"}
     for each in ("builtin_interfaces/Time", "builtin_interfaces/Duration")

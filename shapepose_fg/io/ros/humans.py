@@ -37,9 +37,6 @@ _SKELETON_2D = (
     "LEye REye LEar REar"
 ).split()
 """Points of hri_msgs/Skeleton2D in their order."""
-_LEAST_LIFT, _MIDDLE_YAW = 0.4, 0.4
-"""Limits of the shoulder in the reference model, radians: largest lift to the back, and the middle
-of its turns about the vertical."""
 
 
 _Axes = tuple[tuple[float, float, float], ...]
@@ -281,7 +278,9 @@ def _shoulder_angles(R: Array) -> tuple[Array, Array, Array]:
     """
     lift = np.arctan2(np.hypot(R[:, 0, 2], R[:, 1, 2]), R[:, 2, 2])
     yaw = np.arctan2(-R[:, 0, 2], -R[:, 1, 2])
-    backwards = (lift <= _LEAST_LIFT) & (np.cos(yaw - _MIDDLE_YAW) < 0)
+    # Limits of the shoulder in the reference model, radians: largest lift to the back, and the
+    # middle of its turns about the vertical.
+    backwards = (lift <= 0.4) & (np.cos(yaw - 0.4) < 0)
     yaw, lift = np.where(backwards, yaw + math.pi, yaw), np.where(backwards, -lift, lift)
     x = np.cos(yaw) * R[:, 0, 0] - np.sin(yaw) * R[:, 1, 0]
     y = np.sin(yaw) * R[:, 0, 0] + np.cos(yaw) * R[:, 1, 0]

@@ -35,9 +35,6 @@ _WINDOW, _MOST_RECORDS = 2**27, 2**19
 of records of a chunk, which are all in memory."""
 _CURE = f"give MCAP with ROS 2 messages {type_name(_DETECTIONS)}"
 _CURE_POSES = "give MCAP with ROS 2 messages of /tf, odometry or poses"
-_LOOK_S = 0.1
-"""Interval between searches for the poses of waiting pictures, s of log time; each search reads all
-poses."""
 View = tuple[str, Detections, float, Array | None, Array | None]
 """The arguments of `OnlineReconstructor.push_view`."""
 
@@ -153,7 +150,9 @@ def read_views(
                     waiting.append(
                         (view, frame_of(goes) if goes else message.header.frame_id.lstrip("/"))
                     )
-            if abs(logged_s - looked_s) >= _LOOK_S or len(waiting) > 2 * left + 64:
+            # Interval between searches for the poses of waiting pictures, s of log time; each
+            # search reads all poses.
+            if abs(logged_s - looked_s) >= 0.1 or len(waiting) > 2 * left + 64:
                 yield from placed(logged_s)
                 looked_s, left = logged_s, len(waiting)
             if logged_s > tidied_s + 1.0:
@@ -197,7 +196,7 @@ def _whole(file: Path, cure: str) -> Iterator[None]:
         yield
     except (AttributeError, TypeError) as error:
         raise InputError(
-            f"{file}: cannot be read (field {error} of a message is missing); {cure}"
+            f"{file}: a message does not fit its definition ({error}); {cure}"
         ) from None
 
 

@@ -27,8 +27,6 @@ NS = 1_000_000_000
 """Nanoseconds per second."""
 _LAST_S = 2**31
 """Upper limit of the seconds in a time stamp, which have 32 bits."""
-_SPHERES, _LINES = 7, 5
-"""`SPHERE_LIST` and `LINE_LIST` of visualization_msgs/Marker."""
 _JOINT_M, _BONE_M = 0.05, 0.03
 COVARIANCES: dict[str, tuple[str, ...]] = {
     "none": (),
@@ -82,8 +80,8 @@ def people_message(
 
 
 def body_transforms(people: Sequence[Human], time_s: float) -> list[Message]:
-    """geometry_msgs/TransformStamped: `body_p<identity>` in the world, and the links of people in
-    their bodies.
+    """geometry_msgs/TransformStamped: from the world to each `body_p<identity>`, and from there to
+    each link of the body.
     """
     made = [
         (parent, f"{name}_{each.body_id}", pose)
@@ -183,9 +181,10 @@ def _markers(rows: Reconstruction, time_s: float, lasts_s: float) -> Iterator[Me
         placed = np.isfinite(joints).all(axis=1)
         ends = bones[placed[bones].all(axis=1)].ravel()
         color = dict(zip("rgba", (*colour_of(int(rows.person[n])), 1.0), strict=True))
+        # `SPHERE_LIST` and `LINE_LIST` of visualization_msgs/Marker.
         for ns, kind, points, size in (
-            ("joints", _SPHERES, joints[placed], (_JOINT_M,) * 3),
-            ("bones", _LINES, joints[ends], (_BONE_M, 0.0, 0.0)),
+            ("joints", 7, joints[placed], (_JOINT_M,) * 3),
+            ("bones", 5, joints[ends], (_BONE_M, 0.0, 0.0)),
         ):
             yield {
                 "header": header(WORLD, time_s), "ns": ns, "id": int(rows.person[n]) % _LAST_S,

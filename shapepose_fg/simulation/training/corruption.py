@@ -9,6 +9,7 @@ and halves are removed, joints become outliers, and sides are swapped.
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -217,29 +218,16 @@ def _reports(
     """Detections of one view for joints in `state` (B, K): missed or not, true sigma and stated
     sigma, metres.
     """
-    B, K = state.shape
-    group = _GROUP.expand(B, K)
-    missed = draw.uniform(B, K) < _table(statistics.miss)[group, state]
-    rank = draw.uniform(B, K)
-    levels = _table(statistics.levels)
-    at = (torch.searchsorted(levels, rank, right=True) - 1).clamp(0, len(levels) - 2)
-    part = (rank - levels[at]) / (levels[at + 1] - levels[at])
-    quantiles = _table(statistics.confidence)
-    low, high = quantiles[group, state, at], quantiles[group, state, at + 1]
-    confidence = (low + part * (high - low)).clamp(0.05, 1.0)
-    knots = _table(statistics.knots)
-    knot = (torch.searchsorted(knots, confidence) - 1).clamp(0, len(knots) - 2)
-    part = ((confidence - knots[knot]) / (knots[knot + 1] - knots[knot])).clamp(0, 1)
-    sigmas, tails = _table(statistics.sigma_m), _table(statistics.tail)
-    sigma = torch.lerp(sigmas[state, knot], sigmas[state, knot + 1], part)
-    tail = torch.lerp(tails[state, knot], tails[state, knot + 1], part)
-    sigma = (
-        sigma * _table(statistics.joint_scale).mean(-1)[group] * torch.exp(tail * draw.normal(B, K))
+    (B, K), which, group = state.shape, state.numpy(), _GROUP.expand_as(state).numpy()
+    missed = draw.uniform(B, K).numpy() < statistics.miss[group, which]
+    table, rank = statistics.confidence[group, which], draw.uniform(B, K).numpy()
+    confidence = statistics.quantile(table, rank).clip(0.05, 1.0)
+    sigma, tail = (
+        np.choose(which, [np.interp(confidence, statistics.knots, row) for row in rows])
+        for rows in (statistics.sigma_m, statistics.tail)
     )
+    sigma *= statistics.joint_scale.mean(axis=-1)[group] * np.exp(tail * draw.normal(B, K).numpy())
     # Standard deviation stated by the pipeline for a joint of confidence 1, m (see
     # `observations`).
-    return missed, sigma.clamp_max(0.25), 0.013 / confidence
-
-
-def _table(values: object) -> Tensor:
-    return torch.as_tensor(values, dtype=torch.float32)
+    claimed = torch.from_numpy(0.013 / confidence).float()
+    return torch.from_numpy(missed), torch.from_numpy(sigma).float().clamp_max(0.25), claimed

@@ -49,9 +49,8 @@ a further 0.6 and 0.1."""
 _WRISTS, _HANDS, _TOES = (
     smpl_joints(f"left_{name} right_{name}") for name in ("wrist", "hand", "foot")
 )
-_BODY_COLUMNS = 66
-"""Number of columns of root and 21 body joints, which SMPL, SMPL+H and SMPL-X files have in
-common."""
+_SHARED = SMPL_24.index("left_hand")
+"""Number of joints, from the root on, that SMPL, SMPL+H and SMPL-X files have in common."""
 _NOT_MOTIONS = ("shape.npz", "_stagei.npz")
 """Suffixes of other files than motions in AMASS."""
 
@@ -187,7 +186,7 @@ def _read_amass(path: Path) -> _Recording:
     # without interpolation.
     step = max(1, round(fps / 30.0))
     kept = np.zeros((len(poses[::step]), 24, 3))
-    kept[:, :22] = poses[::step, :_BODY_COLUMNS].reshape(-1, 22, 3)
+    kept[:, :_SHARED] = poses[::step, : 3 * _SHARED].reshape(-1, _SHARED, 3)
     # Rotation from AMASS, z up, to SMPL's own frame, y up.
     kept[:, 0] = (
         Rotation.from_rotvec([-np.pi / 2, 0.0, 0.0]) * Rotation.from_rotvec(kept[:, 0])
@@ -208,7 +207,7 @@ def _amass_arrays(path: Path) -> tuple[Array, float]:
             f"{path}: poses and {rate} must be numbers; give motions in AMASS's format"
         )
     poses, fps = arrays["poses"].astype(np.float64), arrays[rate].astype(np.float64)
-    if poses.ndim != 2 or len(poses) == 0 or poses.shape[1] < _BODY_COLUMNS or poses.shape[1] % 3:
+    if poses.ndim != 2 or len(poses) == 0 or poses.shape[1] < 3 * _SHARED or poses.shape[1] % 3:
         raise InputError(
             f"{path}: poses must be (T, 66 or more), got {poses.shape}; give motions in AMASS's "
             "format"

@@ -21,6 +21,7 @@ from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.rotation import exp_so3
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, MIRROR, TARGET_SKELETONS, slots
 from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.skeleton import SMPL_24
 from shapepose_fg.simulation.training.corruption import CorruptionConfig, corrupt
 from shapepose_fg.simulation.training.differentiable import (
     DescentTargets,
@@ -131,9 +132,13 @@ def _tensor(values: Array) -> Tensor:
     return torch.from_numpy(values).float()
 
 
-_CHAINS = torch.zeros(4, 24, dtype=torch.bool)
-for _row, _joints in enumerate(((13, 16, 18, 20), (14, 17, 19, 21), (1, 4, 7, 10), (2, 5, 8, 11))):
-    _CHAINS[_row, list(_joints)] = True
+_CHAINS = torch.tensor(
+    [
+        [name.startswith(side) and name.endswith(chain) for name in SMPL_24]
+        for chain in (("collar", "shoulder", "elbow", "wrist"), ("hip", "knee", "ankle", "foot"))
+        for side in ("left", "right")
+    ]
+)
 """(4, 24) arms and legs."""
 
 

@@ -15,8 +15,8 @@ from shapepose_fg.core.arrays import Array, Index, Mask, Real, Whole
 from shapepose_fg.core.camera import Axis
 from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.reconstruction import Known, Reconstruction, sigma_m
-from shapepose_fg.core.run_summary import covered_frames
-from shapepose_fg.viz.report.facts import lists, number, objects
+from shapepose_fg.core.run_summary import CameraEntry, covered_frames
+from shapepose_fg.viz.report.facts import entries_of
 
 KINDS = (Known.SEEN, Known.WEAK, Known.BODY, Known.MOTION, Known.UNKNOWN)
 """How joints are known, from the most to the least certain."""
@@ -91,7 +91,7 @@ class CameraFigures:
     trend_px: list[float | None]
     """Time series: median residual of all assigned detections, in equal segments of the
     recording."""
-    offered: float | None = None
+    offered: int | None = None
     """Number of all detections, assigned or not; None if run.json does not have it."""
     left_out_px: float | None = None
     """Median distance to the joint as estimated without this camera, pixels; None if run.json does
@@ -107,13 +107,11 @@ def camera_figures(people: Reconstruction) -> list[CameraFigures]:
     if table is None:
         return []
     px, segment = np.linalg.norm(table.residual_px, axis=-1), _segments(table)
-    entries = [objects(each) for each in lists(people.run.get("cameras"))]
-    told = {str(each.get("camera")): each for each in entries}
+    told = {each.camera: each for each in entries_of(people.run).cameras}
     made = []
     for view, name in enumerate(table.view_names.tolist()):  # only a few cameras
         gate, error = table.gate[..., view], px[..., view]
-        more = told.get(name, {})
-        left_out = objects(more.get("left_out"))
+        more = told.get(name, CameraEntry())
         made.append(
             CameraFigures(
                 name,
@@ -125,9 +123,9 @@ def camera_figures(people: Reconstruction) -> list[CameraFigures]:
                     Residual.of(error[segment == index]).median_px
                     for index in range(segment.max(initial=-1) + 1)
                 ],
-                number(more.get("offered")),
-                number(left_out.get("median_px")),
-                number(left_out.get("median_mm")),
+                more.offered,
+                more.left_out.median_px,
+                more.left_out.median_mm,
             )
         )
     return made
@@ -142,11 +140,10 @@ def overall(people: Reconstruction) -> dict[str, Any]:
     sigma = sigma[np.isfinite(sigma)]
     spans = [np.arange(span.start, span.stop) for span in covered_frames(people.run) or []]
     gate = np.zeros(0) if table is None else table.gate[table.gate != Gate.NOT_SEEN]
-    told = [number(objects(each).get("offered")) for each in lists(people.run.get("cameras"))]
-    offered = sum(each or 0.0 for each in told) if len(told) > 0 and None not in told else None
-    count = sum(
-        number(objects(each).get("used")) or 0.0 for each in lists(people.run.get("cameras"))
-    )
+    cameras = entries_of(people.run).cameras
+    told = [each.offered for each in cameras if each.offered is not None]
+    offered = sum(told) if 0 < len(told) == len(cameras) else None
+    count = sum(each.used for each in cameras)
     return {
         "placed": bool(np.isfinite(people.joints).all(axis=-1).any()),
         "seen": _share(known == Known.SEEN),
@@ -171,19 +168,18 @@ CURVES = (
     "elbow_flexion",
 )  # fmt: skip
 """Angles that the report draws, of both sides."""
-_DRAWN_PEOPLE, _DRAWN_FRAMES = 8, 80
-"""Maximum numbers of people with curves, and of frames of each, so that the page stays small and
-quick to make: 2 ms per row."""
 
 
 def angle_curves(people: Reconstruction, up: Axis, model: BodyModel) -> dict[int, list[Curve]]:
     """The curves of the people with the most rows, by number of the person."""
     numbers, counts = np.unique(people.person, return_counts=True)
     drawn = dict[int, list[Curve]]()
-    for who in np.sort(numbers[np.argsort(-counts, kind="stable")[:_DRAWN_PEOPLE]]).tolist():
+    # Maximum numbers of people with curves, and of frames of each, so that the page stays small and
+    # quick to make: 2 ms per row.
+    for who in np.sort(numbers[np.argsort(-counts, kind="stable")[:8]]).tolist():
         rows = np.flatnonzero(people.person == who)
         rows = rows[np.argsort(people.frame[rows], kind="stable")]
-        rows = rows[:: -(-len(rows) // _DRAWN_FRAMES)]
+        rows = rows[:: -(-len(rows) // 80)]
         angles = joint_angles(people.rows(rows), up, model)
         drawn[who] = [
             Curve.of(name, angles, people.frame[rows])

@@ -21,9 +21,6 @@ _MISSING = -32768
 """Code of an unknown coordinate."""
 _FINEST_MM = 1.0
 """Resolution of positions, mm; coarser if the scene is more than 65 m wide."""
-_OCTAVE, _LEVELS = 8, 63
-"""Quantisation of standard deviations: 63 levels in six bits, eight per doubling (steps of 9 %),
-from 1 mm on."""
 CELL_M = 0.05
 """Size of the grid cells in which one vertex of a body is kept, m. The open body then has 860 of
 its 12,488 vertices, which a page can draw in every frame."""
@@ -31,7 +28,7 @@ its 12,488 vertices, which a page can draw in every frame."""
 
 @dataclass(frozen=True)
 class Scene:
-    """Data of a page, and the frames of the recording in it."""
+    """What the 3D scene of a report page draws, and in which frames of the recording."""
 
     data: dict[str, Any]
     """The data for the page's script: plain values for JSON."""
@@ -131,8 +128,10 @@ def _known_and_sigma(known: NDArray[np.uint8], sigma: Array) -> NDArray[np.uint8
     """
     known = np.where(known == Known.WEAK, Known.BODY, known)
     with np.errstate(invalid="ignore", divide="ignore"):
-        level = 1 + np.rint(_OCTAVE * np.log2(1e3 * sigma))
-    level = np.where(np.isfinite(level), np.clip(level, 1, _LEVELS), 0)
+        # Quantisation of standard deviations: 63 levels in six bits, eight per doubling (steps of 9
+        # %), from 1 mm on.
+        level = 1 + np.rint(8 * np.log2(1e3 * sigma))
+    level = np.where(np.isfinite(level), np.clip(level, 1, 63), 0)
     return (known + 4 * level).astype(np.uint8)
 
 

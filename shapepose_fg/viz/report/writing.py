@@ -10,12 +10,12 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import ASSUMED_FPS
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.result_files import results_folder
+from shapepose_fg.core.run_summary import has_identities
 from shapepose_fg.core.storage.files import write_atomically
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.export.take import Take
 from shapepose_fg.io.solved_setup import CAMERAS, body_of, model_of
 from shapepose_fg.tracking.listing import list_tracks
-from shapepose_fg.viz.report.facts import objects
 from shapepose_fg.viz.report.figures import Curve, angle_curves
 from shapepose_fg.viz.report.page import page_text
 from shapepose_fg.viz.report.scene import Scene, scene_of
@@ -70,7 +70,7 @@ def write_report(
             remarks.append(f"the scene is not drawn: {error}")
     title = str(people.run.get("project") or folder.resolve().name or folder)
     curves = dict[int, list[Curve]]()
-    if arrays is not None and objects(people.run.get("configuration")).get("temporal", True):
+    if arrays is not None and has_identities(people.run):
         try:
             curves = angle_curves(people, up, model_of(people.run, body))
         except InputError as error:

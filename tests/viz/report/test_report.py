@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from shapepose_fg.cli.main import main
+from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.observation_table import Gate
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25
@@ -197,21 +198,22 @@ def test_the_page_says_who_was_there_and_what_happened(result, scene, tmp_path):
         assert part in text, part
 
 
-@pytest.mark.parametrize("value", [None, 7, "text", ["a", 3], {"a": {"b": None}}, [[1, "x"]]])
-def test_entries_of_run_json_that_make_no_sense_say_nothing(result, scene, tmp_path, value):
-    """Those that a loaded result may hold: others are refused when it is loaded (check_run)."""
-    names = (
-        "notes",
-        "setup",
-        "cameras",
-        "dropped_frames",
-        "keypoint_offsets",
-        "noise_law",
-        "probability",
-    )
-    run = {key: value for key in names}
-    run["people"] = {"dropped": value, "problems": value}
-    assert_closed(Page(write_report(tmp_path, result.with_run(**run), scene.rig)))
+@pytest.mark.parametrize(
+    ("name", "value", "problem"),
+    [
+        ("notes", ["a", 3], "notes[1] must be text, got 3"),
+        ("setup", 7, "setup must be an object, got 7"),
+        ("cameras", [{"offered": "x"}], "cameras[0].offered must be a whole number, got text 'x'"),
+        ("dropped_frames", {"far": [[1]]}, "dropped_frames.far[0] must hold 2 values, got 1"),
+        ("people", {"dropped": {"far": None}}, "people.dropped.far must be a whole number, got"),
+        ("noise_law", "text", "noise_law is damaged"),
+    ],
+)
+def test_entries_of_run_json_that_make_no_sense_are_refused(
+    result, scene, tmp_path, name, value, problem
+):
+    with pytest.raises(InputError, match=re.escape(f"run.json: {problem}")):
+        write_report(tmp_path, result.with_run(**{name: value}), scene.rig)
 
 
 def test_a_long_recording_is_thinned_and_says_so(result, scene, tmp_path, monkeypatch):
