@@ -194,7 +194,8 @@ def posed_projection_factors(
         or not len(sensors) == np.size(sigmas_px) == count
     ):
         raise ValueError(
-            f"view, pose_keys and keys must be (D,), xy (D, 2), got {shapes} and {points.shape}"
+            "view, pose_keys, keys and sigmas_px must be (D,), xy (D, 2), and sensors D, got "
+            f"{shapes}, {np.shape(sigmas_px)}, {points.shape} and {len(sensors)}"
         )
     if not np.isfinite(points).all():
         raise ValueError("xy holds a value that is not finite: drop unseen joints first")

@@ -12,7 +12,7 @@ from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.estimation.linearisation import ObservationConfig
+from shapepose_fg.estimation.gated_views import ObservationConfig
 from shapepose_fg.estimation.trajectory_graph import WEAKEST_M
 from shapepose_fg.setup_check.evidence import left_out, observed, triangulate
 from shapepose_fg.setup_check.matching import GATE, Pairs, Sightings, size_of

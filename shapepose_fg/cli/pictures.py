@@ -48,7 +48,7 @@ class PictureOptions:
         return list(names_of_footage(self.videos or []))
 
     def opened(self, names: Sequence[str]) -> "dict[str, Footage]":
-        """The footage of each camera; videos are decoded once."""
+        """The footage of each camera; each video is decoded once, to count its frames."""
         from shapepose_fg.io.footage.places import find_footage
 
         given = self.videos or []
@@ -89,7 +89,9 @@ class PictureOptions:
 
 
 def opened(name: str, path: Path) -> "Footage":
-    """A camera's footage; a video is decoded once, with a progress bar. Notes are printed."""
+    """A camera's footage; a video is decoded once, to count its frames, with a progress bar.
+    Notes are printed.
+    """
     from shapepose_fg.io.footage.footage import open_footage
 
     with progress(f"reading {name}") as done:

@@ -213,7 +213,7 @@ def _solver(folder: Path) -> "Solve | None":
             )
 
     def solve(rows: "Reconstruction") -> "Reconstruction":
-        from shapepose_fg.pipeline.solving import Solver, solve_rows
+        from shapepose_fg.pipeline.solve_again import Solver, solve_rows
 
         return solve_rows(rows, Solver.read(folder, rows))
 

@@ -15,19 +15,19 @@ from shapepose_fg.core.camera import Views
 from shapepose_fg.core.notes import Problem
 from shapepose_fg.core.observations import Observations, window_rows
 from shapepose_fg.core.reconstruction import Known
+from shapepose_fg.estimation.alternation_covariances import state_covariances
 from shapepose_fg.estimation.camera_pose_uncertainty import carried_covariance
 from shapepose_fg.estimation.draft import MODEL_SIGMA_M, first_places
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
-from shapepose_fg.estimation.linearisation import (
+from shapepose_fg.estimation.frame_graph import WindowGraph
+from shapepose_fg.estimation.gated_views import (
     ViewEvidence,
     linearise,
     mean_confidence,
     observation_sigmas,
 )
 from shapepose_fg.estimation.mirrored_sides import mirrored_spread
-from shapepose_fg.estimation.state_covariances import state_covariances
 from shapepose_fg.estimation.user_factors import FactorFunction, add_factors, factors_of
-from shapepose_fg.estimation.window_graph import WindowGraph
 from shapepose_fg.estimation.window_solution import (
     RUNAWAY_M,
     PersonGraph,

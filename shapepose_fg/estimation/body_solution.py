@@ -18,7 +18,6 @@ from shapepose_fg.core.observations import Observations, window_rows
 from shapepose_fg.core.reconstruction import Known
 from shapepose_fg.estimation.body_frames import BodyFrames
 from shapepose_fg.estimation.body_window import BodyWindow, Marginals
-from shapepose_fg.estimation.body_window_graph import BodyGraph
 from shapepose_fg.estimation.camera_pose_uncertainty import carried_covariance
 from shapepose_fg.estimation.condensed_graph import gtsam_step
 from shapepose_fg.estimation.contact import feet_of
@@ -26,21 +25,22 @@ from shapepose_fg.estimation.covariance_factors import covariance_factors
 from shapepose_fg.estimation.draft import first_places, joint_targets
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.factor_solution import solve_with_factors
-from shapepose_fg.estimation.in_time import near_in_time, velocities, waited_s
-from shapepose_fg.estimation.linearisation import (
+from shapepose_fg.estimation.gated_views import (
     ViewEvidence,
     inverses,
     linearise,
     mean_confidence,
     observation_sigmas,
 )
+from shapepose_fg.estimation.in_time import near_in_time, velocities, waited_s
 from shapepose_fg.estimation.mirrored_sides import mirrored_spread
 from shapepose_fg.estimation.missed_detections import (
     SPEED_M_S,
     elsewhere_variance,
     limbs_that_hide,
 )
-from shapepose_fg.estimation.motion_model import MotionModel
+from shapepose_fg.estimation.motion_densities import MotionModel
+from shapepose_fg.estimation.person_graph import BodyGraph
 from shapepose_fg.estimation.user_factors import FactorFunction, add_factors, factors_of
 from shapepose_fg.estimation.window_solution import (
     PersonGraph,
@@ -65,7 +65,14 @@ def solve_bodies(
     motion: MotionModel,
     functions: Sequence[FactorFunction] = (),
 ) -> WindowSolution:
-    """Joints, covariances and bodies of N rows: each track over its rows, or a row by itself."""
+    """Joints, covariances and bodies of N rows: each track over its rows, or a row by itself.
+
+    A joint's covariance is, in this order: what its views say, if its row has no body
+    (`_Found.of_views`); the marginal of its person's graph, with deviations wider for unseen joints
+    (`BodyWindow.of_joints`, `widen_unseen`), times the person's factor (`covariance_factors`), or
+    that of the graph with user factors (`solve_with_factors`); plus errors of moving cameras
+    (`carried_covariance`), and exchanged sides (`mirrored_spread`).
+    """
     assert fitter.model is not None
     # Gating of the initial estimate; what it rejects stays out, since bodies can be drawn to the
     # other leg's detections.
@@ -128,7 +135,7 @@ def solve_bodies(
         seen = np.asarray(strong[person.rows].any(axis=-1))
         moved = np.square(SPEED_M_S * waited_s(seen, person.times_s))
         moved = np.minimum(elsewhere[person.rows], moved)
-        person.window.widen_unseen(of_bodies, moved)
+        person.window.widen_unseen(of_bodies, moved / person.widen)  # a length, whatever the graph
         found.covariance[person.rows] = person.widen * person.window.of_joints(of_bodies)
 
     # User factors: people who have some are solved once more.

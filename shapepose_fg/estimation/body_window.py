@@ -32,14 +32,14 @@ from shapepose_fg.estimation.contact import (
     held_in_place,
     standing_density,
 )
-from shapepose_fg.estimation.in_time import moments, velocities
-from shapepose_fg.estimation.linearisation import (
+from shapepose_fg.estimation.gated_views import (
     ObservationConfig,
     ViewEvidence,
     inverses,
     linearise,
 )
-from shapepose_fg.estimation.motion_model import MotionModel
+from shapepose_fg.estimation.in_time import moments, velocities
+from shapepose_fg.estimation.motion_densities import MotionModel
 
 DEVIATION_M = 0.007
 """Standard deviation of a detector's joint from the body's, metres per axis."""

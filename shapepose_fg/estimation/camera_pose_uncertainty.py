@@ -9,7 +9,7 @@ from shapepose_fg.body.model.rotation import hat
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
-from shapepose_fg.estimation.linearisation import (
+from shapepose_fg.estimation.gated_views import (
     ObservationConfig,
     ViewEvidence,
     information_by_view,

@@ -11,7 +11,7 @@ from shapepose_fg.core.bounds import Settings
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.estimation.linearisation import (
+from shapepose_fg.estimation.gated_views import (
     ObservationConfig,
     linearise,
     observation_sigmas,

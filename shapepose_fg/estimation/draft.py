@@ -10,7 +10,7 @@ from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
-from shapepose_fg.estimation.linearisation import (
+from shapepose_fg.estimation.gated_views import (
     ViewEvidence,
     inverses,
     linearise,
@@ -44,7 +44,7 @@ class Draft:
     body: BodyFit
     """Bodies of the rows."""
     fitted: JointTargets
-    """Targets to which they were fitted."""
+    """Targets to which the bodies were fitted."""
     places: Array
     """(N, J, 3) positions, metres; NaN if neither views nor body determine them."""
     covariance: Array

@@ -8,8 +8,8 @@ from annotated_types import Interval
 from factors import CONSTANT_VELOCITY, Motion
 from shapepose_fg.core.bounds import Factor, Metres, MetresOrNone, Repeats, Settings, Share
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.estimation.linearisation import ObservationConfig
-from shapepose_fg.estimation.motion_model import MotionConfig
+from shapepose_fg.estimation.gated_views import ObservationConfig
+from shapepose_fg.estimation.motion_densities import MotionConfig
 from shapepose_fg.estimation.noise_law import NoiseLaw
 
 

@@ -24,8 +24,8 @@ from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.decompositions import raise_eigenvalues
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.estimation.camera_pose_uncertainty import reported_with_poses
-from shapepose_fg.estimation.linearisation import ObservationConfig, observation_sigmas
-from shapepose_fg.estimation.motion_model import MotionModel
+from shapepose_fg.estimation.gated_views import ObservationConfig, observation_sigmas
+from shapepose_fg.estimation.motion_densities import MotionModel
 from shapepose_fg.estimation.trajectory_graph import Mounted, dilution
 
 _MAP_S = 15.0

@@ -21,7 +21,7 @@ from shapepose_fg.core.camera import Views
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.storage.files import read_json
-from shapepose_fg.estimation.linearisation import (
+from shapepose_fg.estimation.gated_views import (
     ObservationConfig,
     inverses,
     linearise,

@@ -8,7 +8,7 @@ from factors import Motion
 from shapepose_fg.core.arrays import Array, Whole
 from shapepose_fg.estimation.in_time import motion_of
 from shapepose_fg.estimation.kernels import solve_chains
-from shapepose_fg.estimation.motion_model import MotionModel
+from shapepose_fg.estimation.motion_densities import MotionModel
 
 SPEED_M_S = 1.5
 """Minimum speed of a joint for the density of its accelerations: that of a walker, m/s."""

@@ -32,7 +32,7 @@ from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.camera_pose_uncertainty import POSES_LAST_S
-from shapepose_fg.estimation.linearisation import (
+from shapepose_fg.estimation.gated_views import (
     ObservationConfig,
     linearise,
     observation_sigmas,

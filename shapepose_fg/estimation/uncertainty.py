@@ -19,8 +19,8 @@ from shapepose_fg.core.decompositions import principal_axes, symmetric_root
 from shapepose_fg.core.errors import NotDetermined
 from shapepose_fg.core.reconstruction import BODY, Reconstruction
 from shapepose_fg.estimation.camera_pose_uncertainty import POSES_LAST_S, reported_with_poses
+from shapepose_fg.estimation.gated_views import ObservationConfig
 from shapepose_fg.estimation.in_time import moments
-from shapepose_fg.estimation.linearisation import ObservationConfig
 from shapepose_fg.estimation.noise_law import shipped_covariances
 from shapepose_fg.estimation.window_solution import PersonGraph
 

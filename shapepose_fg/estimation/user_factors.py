@@ -44,7 +44,7 @@ class CoupledGraph:
     """Factors with all variables in the last problem; the others were inactive."""
 
     def tie(self, nodes: Iterable[tuple[int, int]]) -> None:
-        """Record that a factor couples these variables."""
+        """Record that a factor couples these variables (`parts`)."""
         joined = frozenset(nodes)
         apart = [each for each in self.parts if not each & joined]
         self.parts = [*apart, joined.union(*(each for each in self.parts if each & joined))]

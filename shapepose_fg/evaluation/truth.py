@@ -162,7 +162,8 @@ def _panoptic(files: list[Path]) -> PlainPeople:
                 "confidence of each joint; download the file again"
             ) from None
     if len({row[2].shape for row in rows}) > 1:
-        raise InputError(f"{files[0].parent}: has joints19 and joints15; give a folder with one")
+        problem = "some bodies have joints19, others joints15"
+        raise InputError(f"{files[0].parent}: {problem}; give a folder with one of them")
     return _table(files[0].parent, rows, names, covered=spans_of(frames))
 
 

@@ -17,8 +17,8 @@ from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.camera_pose_uncertainty import carried_covariance
 from shapepose_fg.estimation.draft import MODEL_SIGMA_M
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
-from shapepose_fg.estimation.linearisation import linearise, observation_sigmas
-from shapepose_fg.estimation.motion_model import MotionModel
+from shapepose_fg.estimation.gated_views import linearise, observation_sigmas
+from shapepose_fg.estimation.motion_densities import MotionModel
 from shapepose_fg.live.filtering import FilterState
 from shapepose_fg.tracking.global_hypotheses import PLACED_M
 from shapepose_fg.tracking.motion_filter import JointStates

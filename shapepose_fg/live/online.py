@@ -25,7 +25,7 @@ from shapepose_fg.core.notes import Notebook
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25, Skeleton
 from shapepose_fg.estimation.mirrored_sides import mirrored_spread
-from shapepose_fg.estimation.motion_model import MotionModel
+from shapepose_fg.estimation.motion_densities import MotionModel
 from shapepose_fg.estimation.noise_law import NoiseLaw
 from shapepose_fg.live.cameras import CameraState, CameraWatch
 from shapepose_fg.live.clock import JUMP_S, CommonClock

@@ -68,7 +68,7 @@ class LiveState:
     settled: deque[Reconstruction] = field(default_factory=deque)
     """Settled rows that were not collected yet."""
     frames: int = 0
-    """Number of processed frames; the next ones are counts of `LiveReport`."""
+    """Number of processed frames; this field and the following are those of `LiveReport`."""
     late: int = 0
     dropped: int = 0
     unrefined: int = 0

@@ -35,7 +35,7 @@ from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.tracking.motion_filter import JointStates
 from shapepose_fg.tracking.tracker import Tracks
 
-_CURE = "start without it"
+_CURE = "start without this saved state"
 _CLASSES: dict[str, Any] = {
     each.__name__: each
     for each in (

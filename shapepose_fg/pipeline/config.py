@@ -25,8 +25,8 @@ from shapepose_fg.estimation.estimator_config import (
     RefineConfig,
     WindowGraphConfig,
 )
-from shapepose_fg.estimation.linearisation import ObservationConfig
-from shapepose_fg.estimation.motion_model import MotionConfig
+from shapepose_fg.estimation.gated_views import ObservationConfig
+from shapepose_fg.estimation.motion_densities import MotionConfig
 from shapepose_fg.proposal.candidates import CandidateConfig
 from shapepose_fg.proposal.proposals import ProposalConfig
 from shapepose_fg.tracking.identities import FollowingConfig

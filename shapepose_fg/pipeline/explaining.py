@@ -18,7 +18,7 @@ from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.reconstruction import Known, Reconstruction, sigma_m
 from shapepose_fg.core.validation import validated
 from shapepose_fg.estimation.factor_shares import FactorEvidence, factor_evidence
-from shapepose_fg.estimation.linearisation import inverses, observation_sigmas
+from shapepose_fg.estimation.gated_views import inverses, observation_sigmas
 from shapepose_fg.estimation.user_factors import ExtraFactors, functions_of, name_of
 from shapepose_fg.estimation.window_solution import PersonGraph
 from shapepose_fg.pipeline.config import PipelineConfig
@@ -30,7 +30,7 @@ from shapepose_fg.pipeline.explanation import (
     Finding,
     ViewReason,
 )
-from shapepose_fg.pipeline.solving import Solver, solved_around
+from shapepose_fg.pipeline.solve_again import Solver, solved_around
 
 OFF_SIGMA = 3.0
 """Distance of a detection from the prediction by all else, in standard deviations, above which it

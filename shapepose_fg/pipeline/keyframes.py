@@ -15,7 +15,7 @@ from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.core.frame_times import segments
 from shapepose_fg.core.observation_table import Gate
 from shapepose_fg.core.reconstruction import BODY, Known, Reconstruction, Status
-from shapepose_fg.estimation.motion_model import MotionModel
+from shapepose_fg.estimation.motion_densities import MotionModel
 
 STRAY_M = 0.03
 """Deviation of a joint from the cubic between keyframes, m, above which a frame between becomes a

@@ -116,8 +116,8 @@ def refine_trajectories(
     `reconstruct` does this first where cameras move; given the rig that this returns, it uses the
     poses as they are. People constrain a pose where two cameras see them that do not move together;
     elsewhere the odometry is used. Where no camera stands still the world is that in which the
-    first carrier starts. `camera_factors` are your own on poses. Poses of separate frames
-    (`config.temporal` false) are used as they are.
+    first carrier starts. `camera_factors` add your own factors on the carriers' poses. Poses of
+    separate frames (`config.temporal` false) are used as they are.
     """
     config = PipelineConfig() if config is None else config
     task = Task(detections, rig, config, frames, times, cuts, camera_factors=camera_factors)

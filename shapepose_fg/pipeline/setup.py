@@ -17,7 +17,7 @@ from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Reconstruction, Status
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
-from shapepose_fg.estimation.motion_model import MotionModel
+from shapepose_fg.estimation.motion_densities import MotionModel
 from shapepose_fg.estimation.noise_law import NoiseLaw
 from shapepose_fg.estimation.user_factors import ExtraFactors
 from shapepose_fg.estimation.window_solution import WindowSolution
@@ -122,6 +122,7 @@ class Setup:
             np.array([each.time_s.mean() for each in every]),
         )
         key = np.array([each.key for each in every])
+        # The cubic between keyframes is that of white noise on acceleration, for any `law`.
         motion = MotionModel.load(self.skeleton.joints, self.config.motion)
         carried = with_rows_between(self._result(whole, given, rig), frame, time_s, key, motion)
         for part in map(self.solve, halved(span, whole, carried, self.config)):

@@ -16,7 +16,7 @@ from shapepose_fg.estimation.asynchronous_views import widened
 from shapepose_fg.estimation.body_solution import solve_bodies
 from shapepose_fg.estimation.draft import Draft, draft
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
-from shapepose_fg.estimation.motion_model import MotionModel
+from shapepose_fg.estimation.motion_densities import MotionModel
 from shapepose_fg.estimation.smoothing import smoothed
 from shapepose_fg.estimation.user_factors import ExtraFactors, functions_of
 from shapepose_fg.estimation.window_solution import WindowSolution

@@ -56,8 +56,8 @@ class Others(Rows):
 
 
 Fitted = Callable[[Array, Array, Pinhole], Pinhole | None]
-"""Function that fits a camera to joints in the world (N, 3) and in its picture (N, 2), or returns
-None."""
+"""Function that fits a camera to joints (N, 3), in the calibration's unit, and their detections
+(N, 2), pixels, starting from the given camera; None if no fit is possible."""
 
 
 @dataclass(frozen=True)
@@ -147,9 +147,9 @@ def tries(
         yield others.points[person[row]][both[row]], seen.xy[sighting[row]][both[row]]
 
 
-def turned_to(points: Array, xy: Array, camera: Pinhole) -> Pinhole | None:
-    """The camera rotated about its centre for the best fit of directions to `points` (N, 3) and
-    pixels `xy` (N, 2).
+def turned_to(points: Array, xy: Array, camera: Pinhole) -> Pinhole:
+    """The camera rotated about its centre for the best fit of directions to `points` (N, 3), in the
+    calibration's unit, and pixels `xy` (N, 2).
     """
     centre = -camera.cTw[:, :3].T @ camera.cTw[:, 3]
     away = points - centre

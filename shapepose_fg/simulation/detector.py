@@ -160,7 +160,7 @@ class Detector:
         self._frame = 0
 
     def skip_to(self, frame: int) -> None:
-        """Advance the errors until `frame` is next; raises ValueError if it has passed."""
+        """Simulate the errors until `frame` is next; raises ValueError if it has passed."""
         if frame < self._frame:
             raise ValueError(
                 f"frames must be requested in order: frame {frame} was requested, but "

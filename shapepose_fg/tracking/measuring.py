@@ -10,8 +10,8 @@ from factors import DEFAULT_WIDTH_SIGMA
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.compiled import kernel, part
 from shapepose_fg.core.kernel_geometry import ROBUST, project, triangulated
+from shapepose_fg.estimation.gated_views import MIN_DEPTH_M, ObservationConfig
 from shapepose_fg.estimation.kernels import add_detection
-from shapepose_fg.estimation.linearisation import MIN_DEPTH_M, ObservationConfig
 from shapepose_fg.proposal.nearby import FrameArrays
 from shapepose_fg.tracking.motion_filter import TRUSTED_M, Bones, JointStates, sigma
 from shapepose_fg.tracking.plausibility import tear

@@ -40,7 +40,8 @@ missed detections in plain view. People rarely appear or disappear in the middle
 _WORLDS = 8
 """Maximum number of worlds given priority in turn, the most promising ones."""
 LEAST_S = 0.1
-"""Minimum evidence of a person, s; less in short recordings (`_EVEN`)."""
+"""Minimum evidence of a person, in seconds during which all views see the whole person; less in
+short recordings (`_EVEN`)."""
 _ON_TRIAL = 0.25
 """Factor of `APPEARS_S` and `LEAST_S` for people who are tracked again: in a world with the others
 they may gain evidence."""

@@ -21,7 +21,7 @@ from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.estimation.linearisation import ObservationConfig
+from shapepose_fg.estimation.gated_views import ObservationConfig
 from shapepose_fg.proposal.nearby import FrameArrays
 from shapepose_fg.tracking.measuring import Trust, measured
 from shapepose_fg.tracking.motion_filter import LOST_M, Bones, JointStates, predicted

@@ -21,11 +21,11 @@ from shapepose_fg.estimation.estimator_config import (
     RefineConfig,
     WindowGraphConfig,
 )
-from shapepose_fg.estimation.linearisation import (
+from shapepose_fg.estimation.frame_graph import WindowGraph
+from shapepose_fg.estimation.gated_views import (
     ObservationConfig,
     triangulate,
 )
-from shapepose_fg.estimation.window_graph import WindowGraph
 from shapepose_fg.estimation.window_solution import WindowSolution
 from shapepose_fg.pipeline.solve_window import solve_window
 

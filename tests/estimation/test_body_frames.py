@@ -9,10 +9,10 @@ from shapepose_fg.core.reconstruction import Status
 from shapepose_fg.estimation import body_solution
 from shapepose_fg.estimation.body_frames import BodyFrames
 from shapepose_fg.estimation.body_window import BodyState, BodyWindow
-from shapepose_fg.estimation.body_window_graph import BodyGraph
 from shapepose_fg.estimation.condensed_graph import gtsam_step
 from shapepose_fg.estimation.covariance_factors import Doubt, covariance_factors, signs_of_doubt
-from shapepose_fg.estimation.motion_model import MotionModel
+from shapepose_fg.estimation.motion_densities import MotionModel
+from shapepose_fg.estimation.person_graph import BodyGraph
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.pipeline import reconstruct
 from shapepose_fg.simulation import built_in_scene, simulate

@@ -13,12 +13,12 @@ from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.body_window import BodyWindow
-from shapepose_fg.estimation.body_window_graph import BodyGraph, ordering
 from shapepose_fg.estimation.condensed_graph import gtsam_step
 from shapepose_fg.estimation.covariance_factors import Lasting, covariance_factors, signs_of_lasting
+from shapepose_fg.estimation.gated_views import ObservationConfig, observation_sigmas
 from shapepose_fg.estimation.graph_covariances import graph_covariances
-from shapepose_fg.estimation.linearisation import ObservationConfig, observation_sigmas
-from shapepose_fg.estimation.motion_model import MotionModel
+from shapepose_fg.estimation.motion_densities import MotionModel
+from shapepose_fg.estimation.person_graph import BodyGraph, ordering
 
 T, CAMERAS = 12, 4
 

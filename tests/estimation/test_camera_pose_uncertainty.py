@@ -11,7 +11,7 @@ from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.trajectory import Trajectory
 from shapepose_fg.estimation.camera_pose_uncertainty import carried_covariance
-from shapepose_fg.estimation.linearisation import ObservationConfig, linearise
+from shapepose_fg.estimation.gated_views import ObservationConfig, linearise
 
 CONFIG = ObservationConfig(kernel="none")
 POSE = gtsam.Pose3(gtsam.Rot3.Ypr(0.7, 0.2, -0.1), np.array([1.0, -0.5, 0.3]))

@@ -16,7 +16,7 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.detector_offsets import OffsetConfig, confident_targets, spread_frames
-from shapepose_fg.estimation.linearisation import ObservationConfig
+from shapepose_fg.estimation.gated_views import ObservationConfig
 from shapepose_fg.pipeline.config import PeopleConfig
 from shapepose_fg.pipeline.pipeline import PipelineConfig, estimate_offsets, reconstruct
 from shapepose_fg.proposal.thinning import ThinnedFrames

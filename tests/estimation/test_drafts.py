@@ -14,7 +14,7 @@ from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation import draft
 from shapepose_fg.estimation.draft import drafted
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
-from shapepose_fg.estimation.linearisation import ViewEvidence
+from shapepose_fg.estimation.gated_views import ViewEvidence
 from shapepose_fg.simulation import Scene, built_in_scene
 
 LEG = [BODY_25.joints.index(name) for name in ("RKnee", "RAnkle", "RHeel", "RBigToe", "RSmallToe")]

@@ -12,7 +12,7 @@ from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.notes import Notebook
 from shapepose_fg.core.reconstruction import Status
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.estimation.motion_model import MotionModel
+from shapepose_fg.estimation.motion_densities import MotionModel
 from shapepose_fg.pipeline.config import SolvingConfig
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.pipeline.setup import Setup

@@ -17,7 +17,7 @@ from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.core.storage.kept_arrays import InMemory
 from shapepose_fg.estimation.detector_offsets import OffsetConfig
-from shapepose_fg.estimation.linearisation import ObservationConfig
+from shapepose_fg.estimation.gated_views import ObservationConfig
 from shapepose_fg.estimation.noise_law import (
     GROSS_M,
     NoiseLaw,

@@ -11,7 +11,7 @@ from factors import joint_information, make_camera, projection_factors, robust_k
 from shapepose_fg.core.camera import Camera, Rig, Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.estimation.linearisation import (
+from shapepose_fg.estimation.gated_views import (
     ObservationConfig,
     linearise,
     mean_confidence,

@@ -9,7 +9,7 @@ import pytest
 
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation import smoothing
-from shapepose_fg.estimation.motion_model import MotionModel
+from shapepose_fg.estimation.motion_densities import MotionModel
 
 MOTION = MotionModel.load(BODY_25.joints)
 WRIST = BODY_25.index("RWrist")

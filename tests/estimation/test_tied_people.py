@@ -11,11 +11,11 @@ from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.estimation.alternation_covariances import state_covariances
 from shapepose_fg.estimation.estimator_config import EstimatorConfig, WindowGraphConfig
-from shapepose_fg.estimation.linearisation import ObservationConfig
-from shapepose_fg.estimation.state_covariances import state_covariances
+from shapepose_fg.estimation.frame_graph import WindowGraph
+from shapepose_fg.estimation.gated_views import ObservationConfig
 from shapepose_fg.estimation.user_factors import add_factors
-from shapepose_fg.estimation.window_graph import WindowGraph
 
 R, L = BODY_25.index("RWrist"), BODY_25.index("LWrist")
 EXACT = WindowGraphConfig(max_iterations=100, tolerance=1e-12)

@@ -26,7 +26,7 @@ from shapepose_fg.estimation.uncertainty import (
     squared_radius,
     surface_distance,
 )
-from shapepose_fg.pipeline.solving import window_solutions
+from shapepose_fg.pipeline.solve_again import window_solutions
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.viz.bodies import surfaces
 

@@ -19,7 +19,7 @@ from shapepose_fg.core.reconstruction import Status
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.estimator_config import EstimatorConfig, RefineConfig
 from shapepose_fg.estimation.in_time import near_in_time
-from shapepose_fg.estimation.motion_model import MotionConfig, MotionModel
+from shapepose_fg.estimation.motion_densities import MotionConfig, MotionModel
 from shapepose_fg.estimation.window_solution import WindowSolution
 from shapepose_fg.pipeline.solve_window import solve_window
 

@@ -7,7 +7,7 @@ import pytest
 
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
-from shapepose_fg.estimation.linearisation import triangulate
+from shapepose_fg.estimation.gated_views import triangulate
 from shapepose_fg.evaluation.metrics import PlainPeople, match_people
 from shapepose_fg.pipeline.pipeline import PipelineConfig, find_people, reconstruct
 from shapepose_fg.simulation import DetectorConfig, built_in_scene, simulate

@@ -23,7 +23,7 @@ from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.rig_file import POSE
 from shapepose_fg.core.skeleton import BODY_25, COCO_17
 from shapepose_fg.detection2d.opening import read_form
-from shapepose_fg.estimation.motion_model import MotionConfig, MotionModel
+from shapepose_fg.estimation.motion_densities import MotionConfig, MotionModel
 from shapepose_fg.evaluation.shelf import read_shelf_ground_truth
 from shapepose_fg.evaluation.truth import read_people
 from shapepose_fg.io.calibration import read_rig, write_rig
@@ -40,7 +40,7 @@ from shapepose_fg.io.timestamps import read_timestamps
 from shapepose_fg.io.trajectories import read_trajectory
 from shapepose_fg.pipeline.explaining import explain
 from shapepose_fg.pipeline.pipeline import PipelineConfig
-from shapepose_fg.pipeline.solving import Solver
+from shapepose_fg.pipeline.solve_again import Solver
 from shapepose_fg.tracking.edits import Action, Edit
 from shapepose_fg.tracking.listing import list_saved_tracks
 from shapepose_fg.viz.report.writing import report_of

@@ -63,8 +63,8 @@ def test_a_video_that_was_cut_is_told_of(tmp_path):
     read = Video.open(cut)
     assert 15 < len(read.time_s) < 45
     assert read.notes == (
-        f"{cut}: only {len(read.time_s)} of the 60 frames in its header can be read;"
-        " the file is truncated or damaged",
+        f"{cut}: only {len(read.time_s)} of the 60 frames in its header can be read and are used;"
+        " the file is truncated or damaged: copy the video again",
     )
 
 

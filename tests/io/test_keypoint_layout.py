@@ -351,7 +351,7 @@ def test_cameras_of_two_models_are_refused(tmp_path, rig):
     one, other = (looks(keypoint_names(SKELETONS[name]), 60, 1) for name in ("BODY_25", "BODY_25B"))
     with pytest.raises(
         InputError,
-        match=r"people look like BODY_25, those of .* like BODY_25B; give the detections",
+        match=r"arranged as BODY_25, those of .* as BODY_25B; give the detections",
     ):
         read_detections(results(tmp_path, a=one, b=other), rig)
 

@@ -177,7 +177,9 @@ def test_a_state_of_something_else_is_refused_in_a_sentence(start, dance, tmp_pa
     whole = file.read_bytes()
     for place in (0, 40, len(whole) // 2, len(whole) - 1):
         file.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
-        with pytest.raises(InputError, match=r"state: cannot be read .*start without it"):
+        with pytest.raises(
+            InputError, match=r"state: cannot be read .*start without this saved state"
+        ):
             OnlineReconstructor.load(file, dance.scene.rig, workers=1)
     file.write_bytes(b"no zip")
     with pytest.raises(InputError, match="cannot be read"):

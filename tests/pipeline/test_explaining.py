@@ -17,7 +17,7 @@ from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.io.solved_setup import CAMERAS
 from shapepose_fg.pipeline.explanation import Cause, Explanation
-from shapepose_fg.pipeline.solving import Solver, solve_rows
+from shapepose_fg.pipeline.solve_again import Solver, solve_rows
 from shapepose_fg.setup_check.report import check_setup
 from shapepose_fg.simulation import built_in_scene, simulate
 

@@ -11,7 +11,7 @@ from factors import CONSTANT_VELOCITY
 from shapepose_fg.body.model.rotation import exp_so3, log_so3
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.reconstruction import Known, Reconstruction, Status
-from shapepose_fg.estimation.motion_model import MotionModel
+from shapepose_fg.estimation.motion_densities import MotionModel
 from shapepose_fg.evaluation.metrics import covariance_calibration, joint_metrics, match_people
 from shapepose_fg.pipeline.keyframes import (
     keyframes,
@@ -21,7 +21,7 @@ from shapepose_fg.pipeline.keyframes import (
     with_rows_between,
 )
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
-from shapepose_fg.pipeline.solving import Solver, solve_rows
+from shapepose_fg.pipeline.solve_again import Solver, solve_rows
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.simulation.files import truth_of
 

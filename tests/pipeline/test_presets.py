@@ -15,7 +15,7 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.alternation import JOINT_SIGMA_M
-from shapepose_fg.estimation.linearisation import linearise, observation_sigmas
+from shapepose_fg.estimation.gated_views import linearise, observation_sigmas
 from shapepose_fg.io.config import read_config
 from shapepose_fg.pipeline.pipeline import PipelineConfig, find_people
 from shapepose_fg.pipeline.solve_window import solve_window

@@ -20,7 +20,7 @@ from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.solved_setup import CAMERAS
 from shapepose_fg.pipeline import setup, solving
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
-from shapepose_fg.pipeline.solving import Solver, solve_rows
+from shapepose_fg.pipeline.solve_again import Solver, solve_rows
 from shapepose_fg.pipeline.windows import WindowConfig
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.simulation.scene import Scene

@@ -50,7 +50,7 @@ LEVELS = (
     "io",
     "io.export.take",
     "biomechanics",
-    "pipeline.solving",
+    "pipeline.solve_again",
     "pipeline.explanation",
     "pipeline.explaining",
     "live",

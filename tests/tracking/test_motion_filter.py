@@ -10,7 +10,7 @@ from shapepose_fg.core.camera import Views
 from shapepose_fg.core.kernel_geometry import ROBUST, robust_weight
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.estimation.linearisation import ObservationConfig, linearise, observation_sigmas
+from shapepose_fg.estimation.gated_views import ObservationConfig, linearise, observation_sigmas
 from shapepose_fg.proposal.nearby import FrameArrays
 from shapepose_fg.tracking.measuring import Trust, measured
 from shapepose_fg.tracking.motion_filter import Bones, JointStates, predicted

@@ -12,7 +12,7 @@ from shapepose_fg.body.fitting.priors import longest_bones
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.core.detections import Detections, Input
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.estimation.linearisation import ObservationConfig
+from shapepose_fg.estimation.gated_views import ObservationConfig
 from shapepose_fg.tracking.sides import correct_swaps_now
 from shapepose_fg.tracking.tracker import BodyScale, Tracker, TrackingConfig
 

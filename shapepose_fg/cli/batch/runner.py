@@ -54,7 +54,7 @@ class Assignment:
     request: Request
     """Options of the recording."""
     folder: Path
-    """Folder of its results."""
+    """Folder of the recording's results."""
     cluster: str
     """Address of the scheduler."""
     sharing: int = 1

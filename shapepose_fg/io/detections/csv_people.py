@@ -228,6 +228,8 @@ def _numbers(path: Path, line: int, row: list[str], width: int) -> list[float]:
     for n, word in enumerate(row):
         text = word.strip()
         if n > 0 and text and not is_number(text) and text.lower() != "nan":
-            raise InputError(f"{path}: line {line} must hold numbers, got {text[:20]!r}; {_RERUN}")
+            raise InputError(
+                f"{path}: line {line} must hold numbers, got {text[:20]!r}; correct it, or {_RERUN}"
+            )
         found.append(float(text) if is_number(text) else np.nan)
     return found

@@ -101,7 +101,8 @@ def _best_fit(people: Sequence[KeptPeople], layouts: Sequence[Skeleton]) -> tupl
     if len(chosen) > 1:
         (one, first), (other, second) = list(chosen.items())[:2]
         raise InputError(
-            f"{first.source}: people look like {one}, those of {second.source} like {other}; "
+            f"{first.source}: the keypoints are arranged as {one}, those of {second.source} as "
+            f"{other}; "
             f"give the detections of one model for all cameras, or {_CURE}"
         )
     fits_of_all = np.concatenate(fits, axis=1)

@@ -103,7 +103,7 @@ class Video:
         if announced - len(stamps) > 2:
             notes.append(
                 f"{path}: only {len(stamps)} of the {announced} frames in its header can be "
-                "read; the file is truncated or damaged"
+                "read and are used; the file is truncated or damaged: copy the video again"
             )
         return cls(path, size, time_s, tuple(notes))
 

@@ -196,7 +196,7 @@ def _whole(file: Path, cure: str) -> Iterator[None]:
         yield
     except (AttributeError, TypeError) as error:
         raise InputError(
-            f"{file}: cannot be read (field {error} of a message is missing); {cure}"
+            f"{file}: a message does not fit its definition ({error}); {cure}"
         ) from None
 
 

@@ -80,8 +80,8 @@ def people_message(
 
 
 def body_transforms(people: Sequence[Human], time_s: float) -> list[Message]:
-    """geometry_msgs/TransformStamped: `body_p<identity>` in the world, and the links of people in
-    their bodies.
+    """geometry_msgs/TransformStamped: from the world to each `body_p<identity>`, and from there to
+    each link of the body.
     """
     made = [
         (parent, f"{name}_{each.body_id}", pose)

@@ -12,10 +12,10 @@ from factors import DEFAULT_WIDTH_SIGMA, split_key
 from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.observations import Observations
+from shapepose_fg.estimation.alternation_covariances import state_covariances
 from shapepose_fg.estimation.estimator_config import EstimatorConfig, WindowGraphConfig
-from shapepose_fg.estimation.linearisation import ObservationConfig
-from shapepose_fg.estimation.state_covariances import state_covariances
-from shapepose_fg.estimation.window_graph import WindowGraph
+from shapepose_fg.estimation.frame_graph import WindowGraph
+from shapepose_fg.estimation.gated_views import ObservationConfig
 
 EXACT = WindowGraphConfig(max_iterations=100, tolerance=1e-12)
 """Solved to the end, so that the comparison is with the minimum and not with the stopping rule."""

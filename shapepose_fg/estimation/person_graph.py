@@ -26,10 +26,10 @@ from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.decompositions import symmetric_root
 from shapepose_fg.estimation.body_window import BodyState, BodyWindow, Marginals
 from shapepose_fg.estimation.condensed_graph import frame_systems
+from shapepose_fg.estimation.frame_graph import cameras_of
 from shapepose_fg.estimation.graph_covariances import graph_covariances
 from shapepose_fg.estimation.in_time import moments
 from shapepose_fg.estimation.user_factors import PersonWindow
-from shapepose_fg.estimation.window_graph import cameras_of
 
 _DEFINED_M_S = 1e-3
 """Standard deviation with which a velocity is that of its joint's positions, m/s: it is a

@@ -20,7 +20,7 @@ from shapepose_fg.core.frame_times import LEAST_STEP_S, segments
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.run_summary import covered_frames
 from shapepose_fg.estimation.floor import Floor
-from shapepose_fg.estimation.motion_model import MotionModel
+from shapepose_fg.estimation.motion_densities import MotionModel
 from shapepose_fg.estimation.noise_law import NoiseLaw
 from shapepose_fg.estimation.user_factors import ExtraFactors
 from shapepose_fg.estimation.window_solution import PersonGraph, WindowSolution

@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 
 from shapepose_fg.core.arrays import Array
-from shapepose_fg.estimation.window_graph import WindowGraph
+from shapepose_fg.estimation.frame_graph import WindowGraph
 
 UNDETERMINED_M = 10.0
 """Standard deviation, metres, above which a joint is undetermined, in its worst direction."""
