@@ -26,7 +26,7 @@ from shapepose_fg.core.decompositions import nearest_rotation, rigid
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.trajectory import Trajectory
-from shapepose_fg.estimation.trajectory_graph import ANYWHERE_M
+from shapepose_fg.estimation.trajectory_graph import ANYWHERE_M, correlated
 from shapepose_fg.setup_check.fit import POSE, Q, by_parameters, seen_by
 from shapepose_fg.setup_check.matching import Sightings, follow, median_of
 
@@ -50,9 +50,6 @@ _LEAST_SHARE, _LEAST_LEAD, _LEAST_PEOPLE = 0.7, 1.25, 25
 that of any other start, and minimum number."""
 _KNOT_S = 3.0
 """Time between the knots between which an odometry drifts linearly, s."""
-_VIEWS_CHANGE = 0.7
-"""Ratio of the correlated errors of a detector that count as one in a camera that moves to those in
-a fixed one; it sees people from changing directions (scripts/check_phones.py)."""
 _DRIFTS = np.log(3.0)
 """Standard deviation of the log of the ratio of an odometry's drift to the stated one."""
 _LEVEL_RAD, _TILT_RAD = np.radians(6.0), np.radians(0.5)
@@ -182,6 +179,8 @@ class Start:
     """Ratio of the focal length to the given one."""
     centre: Array = field(default_factory=lambda: np.zeros(2))
     """(2,) shift of the principal point, focal lengths."""
+    k1: float = 0.0
+    """Radial distortion that the given one lacks (OpenCV's k1)."""
     stretch: float = 1.0
     """Ratio of the world's unit to that of the odometry."""
     knots_s: Array = field(default_factory=lambda: np.zeros(1))
@@ -220,9 +219,10 @@ class Start:
         K = camera.K.copy()
         K[:2, 2] += K[:2, :2] @ self.centre
         K[[0, 1], [0, 1]] *= self.focal
+        distortion = camera.distortion + self.k1 * (np.arange(len(camera.distortion)) == 0)
         wTb = self.carrier(odometry.wTb, odometry.time_s)
         moved = replace(odometry, time_s=odometry.time_s + self.offset_s, wTb=wTb)
-        return replace(camera, K=K, bTc=self.bTc), moved
+        return replace(camera, K=K, bTc=self.bTc, distortion=distortion), moved
 
     def words(self, name: str) -> str:
         """How well the start of a camera is known."""
@@ -299,7 +299,7 @@ class Filmed:
     ) -> Start:
         """The start on which most people agree, up to `most_s` from the fixed cameras' clock.
 
-        `lens` has the prior standard deviations of the focal length and of the principal point;
+        `lens` has the prior standard deviations of focal length, principal point and distortion;
         `sigma_scale` is that of the world's scale, as a share.
 
         Raises Undetermined, with a sentence, if it is ambiguous.
@@ -438,9 +438,9 @@ class Filmed:
                 break
             count = np.ceil((self.own_s[-1] - self.own_s[0]) / _KNOT_S) * (near_m == _NEAR_M[-1])
             knots_s = np.linspace(self.own_s[0], self.own_s[-1], 1 + int(count))
-            given = replace(start, centre=np.zeros(2), knots_s=knots_s)
+            given = replace(start, knots_s=knots_s)
             frame, rays = frame[used], self.rays[frame[used], person[used]]
-            prior = np.array([*sigmas, lens.focal])
+            prior = np.array([*sigmas, lens.focal, lens.lens])
             start = _Fit(self, given, placed.rows(rows[used]), frame, rays, prior).solved()
         return self._judged(start, placed, _NEAR_M[-1])
 
@@ -451,8 +451,8 @@ class _Fit:
 
     Parameters are in prior standard deviations: rotation and translation in the world about the
     middle of the path, log of the odometry's unit, principal point, offset, log of the focal
-    length, steps of the drift from knot to knot, and errors of the fixed cameras
-    (`Placed.spread`).
+    length, radial distortion, steps of the drift from knot to knot, and errors of the fixed
+    cameras (`Placed.spread`).
     """
 
     filmed: Filmed
@@ -465,7 +465,7 @@ class _Fit:
     rays: Array
     """(N, J, 3) their joints in the camera, at depth 1."""
     sigmas: Array
-    """(11,) prior standard deviations of the parameters before the drift; 0: fixed."""
+    """(12,) prior standard deviations of the parameters before the drift; 0: fixed."""
 
     @cached_property
     def _middle(self) -> Array:
@@ -473,31 +473,38 @@ class _Fit:
         return np.asarray(self.filmed._oTb[self.frame, :3, 3].mean(axis=0))
 
     @cached_property
-    def _level(self) -> "Start":
-        """The start, turned so that an axis of the log that is nearly vertical is vertical."""
+    def _upright(self) -> Rotation | None:
+        """The turn of the start that makes an axis of the log vertical, if it nearly is."""
         wRo = self.start.wTo[:3, :3]
         axis = int(np.argmax(np.abs(wRo[2])))
         up = [0.0, 0.0, np.sign(wRo[2, axis])]
         turn = Rotation.align_vectors([up], [wRo[:, axis]])[0]
-        if turn.magnitude() > _LEVEL_RAD:
-            return self.start
-        at = self.start.stretch * (wRo - turn.as_matrix() @ wRo) @ self._middle
-        return replace(self.start, wTo=rigid(turn.as_matrix() @ wRo, self.start.wTo[:3, 3] + at))
+        return turn if turn.magnitude() < _LEVEL_RAD else None
+
+    @cached_property
+    def _prior(self) -> "Start":
+        """The start with the given unit and lens, and upright."""
+        wRo = self.start.wTo[:3, :3]
+        level = wRo if self._upright is None else self._upright.as_matrix() @ wRo
+        at = self.start.wTo[:3, 3] + (self.start.stretch * wRo - level) @ self._middle
+        return replace(
+            self.start, wTo=rigid(level, at), stretch=1.0, focal=1.0, centre=np.zeros(2), k1=0.0
+        )
 
     def moved(self, x: Array) -> Start:
         """The start changed by the parameters."""
-        given, each = self._level, self.sigmas * x[: len(self.sigmas)]
+        given, each = self._prior, self.sigmas * x[: len(self.sigmas)]
         wRo = given.wTo[:3, :3]
-        turn = Rotation.from_rotvec(each[:3]).as_matrix()
-        stretch = given.stretch * float(np.exp(each[6]))
-        at = given.wTo[:3, 3] + given.stretch * wRo @ self._middle + each[3:6]
+        turn, stretch = Rotation.from_rotvec(each[:3]).as_matrix(), float(np.exp(each[6]))
+        at = given.wTo[:3, 3] + wRo @ self._middle + each[3:6]
         steps = self._steps * x[len(each) :][: self._steps.size].reshape(self._steps.shape)
         return replace(
             given,
             wTo=rigid(turn @ wRo, at - stretch * turn @ wRo @ self._middle),
-            centre=given.centre + each[7:9],
+            centre=each[7:9],
             offset_s=given.offset_s + each[9],
-            focal=given.focal * float(np.exp(each[10])),
+            focal=float(np.exp(each[10])),
+            k1=each[11],
             stretch=stretch,
             drift=np.vstack([np.zeros(6), np.cumsum(steps, axis=0)]),
         )
@@ -510,7 +517,7 @@ class _Fit:
         filmed, own_s, knots_s = self.filmed, self.filmed.own_s, self.start.knots_s
         grown = np.einsum("fii->if", filmed.trajectory.drifted(filmed._oTb, own_s)).cumsum(axis=1)
         variance = np.diff([np.interp(knots_s, own_s[1:], each) for each in grown]).T
-        variance[:, :2] *= self._level is self.start
+        variance[:, :2] *= self._upright is None
         return np.sqrt(variance)
 
     def _poses(self, x: Array) -> tuple[Array, Array]:
@@ -537,12 +544,15 @@ class _Fit:
         cRw = poses[:, None, :3, :3].mT
         at = (placed.points + moved - poses[:, None, :3, 3]) @ poses[:, :3, :3]
         rays, depth = (self.rays[..., :2] - now.centre) / now.focal, at[..., 2:]
+        bent = rays * (rays**2).sum(axis=-1, keepdims=True)
+        rays = rays - now.k1 * bent
         across = np.concatenate([np.broadcast_to(-np.eye(2), (*rays.shape, 2)), rays[..., None]], 3)
         by_pose = np.concatenate([hat(at), np.broadcast_to(-cRw, (*at.shape, 3))], axis=3)
         J = across @ by_pose @ slopes[:, None]
         J[..., 7:9] -= self.sigmas[7:9] * depth[..., None] / now.focal * np.eye(2)
         J[..., 9] += self.sigmas[9] * (across @ cRw @ placed.velocity[..., None])[..., 0]
         J[..., 10] -= self.sigmas[10] * rays * depth
+        J[..., 11] -= self.sigmas[11] * bent * depth
         J[..., modes:] = across @ cRw @ placed.spread
         return rays * depth - at[..., :2], J
 
@@ -551,7 +561,7 @@ class _Fit:
         drift, modes = np.tile([0, 0, 0, 1, 1, 1], len(self._steps)), self.placed.spread.shape[-1]
         kinds = np.concatenate([np.full(len(self.sigmas), -1), drift, np.full(modes, -1)])
         x = np.zeros(len(kinds))
-        count = _VIEWS_CHANGE * dilution(np.unique(self.placed.time_s))
+        count = dilution(np.unique(self.placed.time_s))
         for _ in range(_STEPS):
             away, J = self._away(x)
             every = np.abs(away).swapaxes(0, 1).reshape(away.shape[1], -1)
@@ -567,6 +577,9 @@ class _Fit:
                 break
         ratio, covariance = _with_drift(information, x, kinds)
         x = covariance @ (information @ x + x)
+        root = 1 / np.hypot(1, away / _WIDTH)
+        varied = self._varied(root**2 * away, root[..., None] * J) / count**2
+        covariance = covariance + covariance @ (varied - information) @ covariance
         slopes = self._poses(x)[1]
         # A random walk deviates from the line between two knots.
         between = (self._steps * np.repeat(ratio, 3)).T ** 2 / 6 / max(len(self._steps), 1)
@@ -583,6 +596,22 @@ class _Fit:
             within_m=move_most,
         )
 
+    def _varied(self, away: Array, J: Array) -> Array:
+        """(P, P) covariance of the sum of `J` (N, J, 2, P) times errors of unit variance, which are
+        correlated over time, and between the joints of a person as those of `away` (N, J, 2) are.
+        """
+        alike = np.einsum("njc,nkc->jk", away, away)
+        size = np.sqrt(np.diag(alike)) + _TINY
+        values, vectors = np.linalg.eigh(alike / size / size[:, None])
+        J = np.einsum("njcp,jk->nkcp", J, vectors * np.sqrt(np.maximum(values, 0.0)))
+        total = np.zeros((J.shape[-1],) * 2)
+        for track in np.unique(self.placed.track).tolist():
+            rows = self.placed.track == track
+            time_s, each = self.placed.time_s[rows], J[rows].reshape(rows.sum(), -1)
+            later = correlated(time_s[:, None] - time_s) / correlated(0.0) @ each
+            total += each.reshape(-1, len(total)).T @ later.reshape(-1, len(total))
+        return total
+
 
 def _root_mean_square(slopes: Array, covariance: Array, more: float) -> tuple[float, float]:
     """Root mean square of the errors `slopes` (F, 3, P) x, for x of a `covariance`, with `more`
@@ -596,8 +625,8 @@ def _root_mean_square(slopes: Array, covariance: Array, more: float) -> tuple[fl
 
 
 def _with_drift(information: Array, x: Array, kinds: Index) -> tuple[Array, Array]:
-    """Most probable ratios (2,) of the drift's rotations and translations to their standard
-    deviations, and the covariance of the parameters `x` for these.
+    """Ratios (2,) of the drift's rotations and translations to their standard deviations, root mean
+    square over their probability, and the covariance of the parameters `x` for these.
 
     Parameters have a unit prior that `information` does not include; they are rotations (0 in
     `kinds`) or translations (1) of the drift, or others (-1). The ratios' prior is log-normal;
@@ -605,15 +634,19 @@ def _with_drift(information: Array, x: Array, kinds: Index) -> tuple[Array, Arra
     """
     both = information @ x + x
 
-    def judged(ratio: Array) -> tuple[float, Array, Array]:
+    def inverse(ratio: Array) -> Array:
         sigma = np.where(kinds < 0, 1.0, ratio[kinds])
-        inverse = np.asarray(np.linalg.inv(information + np.diag(1 / sigma**2)), np.float64)
-        prior = 0.5 * float((np.log(ratio) ** 2).sum()) / _DRIFTS**2
-        spread = float(0.5 * np.linalg.slogdet(inverse)[1] - np.log(sigma).sum())
-        return spread + 0.5 * float(both @ inverse @ both) - prior, ratio, inverse
+        return np.asarray(np.linalg.inv(information + np.diag(1 / sigma**2)), np.float64)
 
-    ratios = product(np.exp(_DRIFTS * np.linspace(-2, 1, 13)), repeat=2)
-    return max(map(judged, map(np.array, ratios)), key=lambda each: each[0])[1:]
+    def log_probability(ratio: Array) -> float:
+        found, logs = inverse(ratio), np.log(ratio)
+        spread = 0.5 * np.linalg.slogdet(found)[1] - np.where(kinds < 0, 0.0, logs[kinds]).sum()
+        return float(spread + 0.5 * both @ found @ both - 0.5 * (logs**2).sum() / _DRIFTS**2)
+
+    ratios = np.exp(_DRIFTS * np.array(list(product(np.linspace(-2, 1, 13), repeat=2))))
+    fit = np.array([log_probability(each) for each in ratios])
+    ratio = np.sqrt(np.average(ratios**2, axis=0, weights=np.exp(fit - fit.max())))
+    return ratio, inverse(ratio)
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ _LEAST_S = 3.0
 _AROUND_S = 0.6
 """Distance below which two offsets are the same, s."""
 _LEAST_SEEN = 50
-"""Minimum number of people, one per frame, that a camera must see."""
+"""Minimum number of people, one per frame, that a camera must see in tracks."""
 _SURE = 1.5
 """Minimum prominence of the best offset over all others, in their standard deviations: wrong ones
 were below 0.5, correct ones on Shelf above 1.9."""
@@ -140,15 +140,17 @@ def offsets(
     """Offsets (V,) within `most_s` of `around_s`, their standard deviations and prominence, from
     sightings in `frames`.
     """
-    views = Views.of(rig)
-    for view, name in enumerate(rig.names):
-        if (sightings.view == view).sum() < _LEAST_SEEN:
-            raise InputError(
-                f"camera {name}: too few people are seen to estimate the times of its frames"
-            )
+    views, tracks = Views.of(rig), list[Tracks]()
     start = -np.rint(around_s * fps).astype(np.intp)
     # Frames are counted on the clock of the first camera: with `shift` zero all clocks agree.
     sightings = replace(sightings, frame=sightings.frame - start[sightings.view])
+    for view, name in enumerate(rig.names):
+        tracks.append(Tracks.of(sightings, views, view, fps))
+        if len(tracks[view].frame) < _LEAST_SEEN:
+            raise InputError(
+                f"camera {name}: too few people are seen, or in single frames only, to estimate "
+                "the times of its frames; film people for a minute who walk about"
+            )
     pairs = list(combinations(range(len(rig)), 2))
     step = max(1, round(_STEP_S * fps))
     common = min(_LEAST_S * fps, len(frames) / 3)
@@ -159,7 +161,6 @@ def offsets(
         curves[a, b] = scan(sightings, views, a, b, lags, common)
         progress(number + 1, len(pairs))
     coarse, sure = chosen(curves, lags, len(rig), round(_AROUND_S * fps))
-    tracks = [Tracks.of(sightings, views, view, fps) for view in range(len(rig))]
     fine = Pairwise(tracks, views, coarse.astype(float), fps)
     shift, covariance = fine.solved()
     if len(rig) > 2:

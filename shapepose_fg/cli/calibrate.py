@@ -43,9 +43,10 @@ if TYPE_CHECKING:
     from shapepose_fg.io.detection_table import DetectionTable
 
 _CAMERAS = "Prior knowledge"
-_FILE_OFF, _GUESS_OFF, _CENTRE_OFF = 0.02, 0.2, 0.006
+_FILE_OFF, _GUESS_OFF, _CENTRE_OFF, _BENT = 0.02, 0.2, 0.006, 0.03
 """Relative prior standard deviations of focal lengths from a calibration, and from a field of view;
-and of the principal point of a lens without calibration, as a share of the longer side."""
+of the principal point of a lens without calibration, as a share of the longer side; and of the
+distortion k1 of a phone's main lens, whose log does not have it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -292,7 +293,7 @@ def _with_moving(
     cameras = dict(zip(rig.names, rig.cameras, strict=True))
     columns = dict(zip(rig.names, time_s.T, strict=True))
     trajectories = {each.name: each for each in whole.trajectories}
-    placed, starts = None, dict[str, "Start"]()
+    placed, starts, bent = None, dict[str, "Start"](), _BENT * (seen.calibration is None)
     for name in trajectories:
         given = whole.only([name])
         if placed is None:
@@ -303,9 +304,8 @@ def _with_moving(
             own_s = own_times(own, known, 1)[:, 0]
             odometry = trajectories[name].from_start(own_s)
             filmed = Filmed.of(own, given.cameras[0], odometry, own_s)
-            starts[name] = start = filmed.started(
-                placed, most, lenses[name], found.world.sigma_scale
-            )
+            lens = replace(lenses[name], lens=bent)
+            starts[name] = start = filmed.started(placed, most, lens, found.world.sigma_scale)
         cameras[name], trajectories[name] = start.of(given.cameras[0], odometry)
         columns[name] = own_s + start.offset_s
         note(start.words(name))

@@ -135,7 +135,7 @@ def solve_bodies(
         seen = np.asarray(strong[person.rows].any(axis=-1))
         moved = np.square(SPEED_M_S * waited_s(seen, person.times_s))
         moved = np.minimum(elsewhere[person.rows], moved)
-        person.window.widen_unseen(of_bodies, moved)
+        person.window.widen_unseen(of_bodies, moved / person.widen)  # a length, whatever the graph
         found.covariance[person.rows] = person.widen * person.window.of_joints(of_bodies)
 
     # User factors: people who have some are solved once more.

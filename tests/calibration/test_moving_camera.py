@@ -128,6 +128,26 @@ def test_an_unknown_principal_point_is_found_and_does_not_turn_the_camera(walk, 
     np.testing.assert_allclose(camera.K[:2, 2] - K[:2, 2], [20, -20], atol=6)
 
 
+def test_an_unknown_distortion_is_found_and_does_not_move_the_camera(walk, filmed):
+    """People look 1 to 3 % larger through such a lens."""
+    square = (filmed.rays[..., :2] ** 2).sum(axis=-1, keepdims=True)
+    bent = replace(filmed, rays=filmed.rays * [1, 1, 0] * (1 + 0.15 * square) + [0, 0, 1])
+    start = bent.started(walk, MOST_S, Freedom(lens=0.1))
+    camera, odometry = start.of(bent.camera, bent.trajectory)
+    away = np.linalg.norm((odometry.wTb @ camera.bTc)[:, :3, 3] - path(OWN_S)[:, :3, 3], axis=1)
+    assert camera.distortion[0] == start.k1 == pytest.approx(0.15, abs=0.05)
+    assert np.sqrt((away**2).mean()) < start.within_m
+
+
+def test_the_prior_on_the_unit_stays_where_it_was_given(walk, filmed):
+    """People look 4 % larger than the log says: refined again, the start stays."""
+    larger = replace(filmed, rays=filmed.rays * [1.04, 1.04, 1.0])
+    once = larger.started(walk, MOST_S, Freedom())
+    again = larger._refined(once, walk, MOST_S, Freedom(), 0.0)
+    assert abs(np.log(once.stretch)) > 0.003
+    assert again.stretch == pytest.approx(once.stretch, abs=1e-3)
+
+
 def test_a_log_of_another_walk_and_people_who_stand_are_refused(walk, filmed):
     still = path(np.zeros(len(OWN_S)))
     rng = np.random.default_rng(2)

@@ -33,7 +33,6 @@ from shapepose_fg.simulation.training.train import (
 )
 
 TRAINED, PLAIN = "trained", "plain optimiser"
-_CALIBRATION_PEOPLE = 4096
 _SEEN = tuple(range(len(BODY_25)))
 
 
@@ -66,7 +65,7 @@ def adapted(
     network = trainer.averaged.finished()
     source = PeopleSource(unseen, body, frame, replace(config, shake_rad=0.0, exchange=0.0))
     weights = FitterWeights(network, frame, fingerprint(body), shipped.spread)
-    weights = calibrated(weights, source, _CALIBRATION_PEOPLE)
+    weights = calibrated(weights, source)
     scores = compared({TRAINED: SmplFitter(body, weights=weights), PLAIN: SmplFitter(body)}, source)
     about = {
         "training": (

@@ -39,8 +39,6 @@ is calibrated."""
 _SKELETONS = ("SMPL_24", "HALPE_26", "BODY_25")
 """Skeletons for calibration; for a shared point the last one counts."""
 
-_APART = 5
-"""Number of joints of which one is left out of a person, in turn."""
 _ALL = tuple(range(len(BODY_POINTS)))
 
 
@@ -303,7 +301,7 @@ def left_out_squared(
     fitter = SmplFitter(model, weights=weights)
     truth, targets = _corrupted(source, places, count, generator)
     rows, found = np.arange(count), dict[int, list[Array]]()
-    for first in range(0, len(places), _APART):  # each person lacks one joint, which is predicted
+    for first in range(0, len(places), 5):  # each person lacks one joint, which is predicted
         joint, information = (rows + first) % len(places), targets.information.copy()
         information[rows, joint] = 0.0
         fit = fitter.fit(JointTargets(targets.xyz, information))

@@ -3,7 +3,7 @@ and found.
 """
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +29,12 @@ pytest.importorskip("torch", reason='needs pip install "shapepose-fg[train]"')
 import torch
 
 from shapepose_fg.simulation.training import adaptation
-from shapepose_fg.simulation.training.train import PeopleSource, TrainingConfig, compared
+from shapepose_fg.simulation.training.train import (
+    PeopleSource,
+    TrainingConfig,
+    calibrated,
+    compared,
+)
 
 LIMBS = (
     (0,),
@@ -119,7 +124,7 @@ def short(tmp_path, monkeypatch) -> Path:
     """
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(adaptation, "_CALIBRATION_PEOPLE", 64)
+    monkeypatch.setattr(adaptation, "calibrated", partial(calibrated, count=64))
     write_body(second_body(), tmp_path / "second.npz")
     return tmp_path
 
