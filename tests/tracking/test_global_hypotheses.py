@@ -68,3 +68,34 @@ def test_who_is_always_seen_well_is_followed_once(
     gap = [nobody if 20 <= t < 30 else frame for t, frame in enumerate(frames)]
     _, chosen = explained(tracker, inputs(five_cameras, gap), Tracks.none(tracker.skeleton), 44)
     assert len(chosen) == 2 and len(people_followed) > 2 * len(frames)
+
+
+def test_alternatives_are_sought_in_what_people_seen_well_leave(
+    tracker, five_cameras, walking, nobody, people_followed
+):
+    frames, _ = walking
+
+    def followed(given):
+        people_followed.clear()
+        nobody_yet = Tracks.none(tracker.skeleton)
+        found, chosen = explained(tracker, inputs(five_cameras, given), nobody_yet, 44)
+        return found, chosen, sum(people_followed)
+
+    whole, _, _ = followed(frames)
+    # A third of a second without the second person's detections, and without anybody's.
+    gap = [
+        frame.only(~np.isin(np.arange(len(frame)), whole.candidate[1, t]))
+        if 20 <= t < 30
+        else frame
+        for t, frame in enumerate(frames)
+    ]
+    found, chosen, count = followed(gap)
+    empty = [nobody if 20 <= t < 30 else frame for t, frame in enumerate(frames)]
+    assert count < 0.8 * followed(empty)[-1]
+    assert len(chosen) == 2
+    # All hypotheses name detections among those of the whole frame.
+    for t, frame in enumerate(gap):
+        who, joint, view = np.nonzero(found.candidate[:, t] >= 0)
+        own = found.candidate[who, t, joint, view]
+        np.testing.assert_array_equal(frame.joint[own], joint)
+        np.testing.assert_array_equal(frame.view[own], view)
