@@ -19,7 +19,14 @@ from shapepose_fg.pipeline.execution import Execution
 from shapepose_fg.pipeline.pipeline import PipelineConfig, Task, reconstruct, reconstruct_parts
 from shapepose_fg.pipeline.runs import chunks
 from shapepose_fg.pipeline.runs.assembly import Assembly
-from shapepose_fg.pipeline.runs.chunks import Border, Chunk, cut_in_chunks, same_people, windows_of
+from shapepose_fg.pipeline.runs.chunks import (
+    Border,
+    Chunk,
+    Identities,
+    cut_in_chunks,
+    same_people,
+    windows_of,
+)
 from shapepose_fg.pipeline.setup import Setup
 from shapepose_fg.pipeline.solved_windows import solve_chunk
 from shapepose_fg.pipeline.windows import Engine, WindowConfig
@@ -344,6 +351,18 @@ def test_strangers_on_both_sides_of_a_border_stay_strangers():
     # One of two goes on; the other's place is taken by nobody.
     two, one = border([0, 1], [7, 8], [[0, 0, 0], [9, 0, 0.0]]), border([10], [8], [[9, 0, 0.0]])
     assert same_people(two, one) == {10: 1} and same_people(one, two) == {1: 10}
+
+
+def test_identities_go_on_from_chunk_to_chunk():
+    places = [[0, 0, 0], [9, 0, 0.0]]
+    identities = Identities(5, border([3, 4], [7, 8], places))
+    names = identities.names(border([0, 1], [8, 6], places[::-1]), alone=False)
+    assert [identities.name(track, names) for track in (0, 1)] == [4, 5]  # one goes on, one is new
+    identities.remember(border([1, 0], [6, 8], places), names)
+    names = identities.names(border([0, 1], [6, 8], places), alone=False)
+    assert [identities.name(track, names) for track in (0, 1)] == [5, 4]
+    names = identities.names(border([0], [6], places[:1]), alone=True)
+    assert identities.name(0, names) == 6
 
 
 def test_chunks_shorter_than_a_window_are_refused(scene, recording):
