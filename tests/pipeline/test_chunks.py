@@ -361,7 +361,7 @@ def test_identities_go_on_from_chunk_to_chunk():
     identities.remember(border([1, 0], [6, 8], places), names)
     names = identities.names(border([0, 1], [6, 8], places), alone=False)
     assert [identities.name(track, names) for track in (0, 1)] == [5, 4]
-    names = identities.names(border([0], [6], places[:1]), alone=True)
+    names = identities.names(border([0], [6], [[0, 0, 0.0]]), alone=True)
     assert identities.name(0, names) == 6
 
 
