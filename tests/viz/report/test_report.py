@@ -216,6 +216,12 @@ def test_entries_of_run_json_that_make_no_sense_are_refused(
         write_report(tmp_path, result.with_run(**{name: value}), scene.rig)
 
 
+def test_a_run_in_memory_may_hold_what_run_json_has_as_text_and_lists(result, scene, tmp_path):
+    told = {"body": tmp_path / "body.npz", "cuts": (5,), "seconds": {"solve": np.float64(1.5)}}
+    page = Page(write_report(tmp_path, result.with_run(**told), scene.rig))
+    assert "body.npz" in page.text
+
+
 def test_a_long_recording_is_thinned_and_says_so(result, scene, tmp_path, monkeypatch):
     whole = write_report(tmp_path, result, scene.rig).stat().st_size
     monkeypatch.setattr("shapepose_fg.viz.report.writing.SCENE_BYTES", 8000)

@@ -18,7 +18,7 @@ from shapepose_fg.core.observation_table import Gate
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.io.calibration import write_rig
 from shapepose_fg.io.solved_setup import CAMERAS
-from shapepose_fg.pipeline import setup, solving
+from shapepose_fg.pipeline import setup, solve_again
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.pipeline.solve_again import Solver, solve_rows
 from shapepose_fg.pipeline.windows import WindowConfig
@@ -87,7 +87,7 @@ def solved_frames(work: Callable[[], Reconstruction]) -> tuple[list[list[int]], 
         return solve(observations, *others, **more)
 
     with pytest.MonkeyPatch.context() as patch:
-        for module in (setup, solving):
+        for module in (setup, solve_again):
             patch.setattr(module, "solve_window", noted)
         return frames, work()
 
