@@ -86,12 +86,6 @@ class Hypotheses:
     def __len__(self) -> int:
         return len(self.carried)
 
-    def rows(self, chosen: NDArray[np.bool_]) -> "Hypotheses":
-        """The `chosen` hypotheses (H,)."""
-        names = ("carried", "world", "there", "candidate", "places", "weight", "price")
-        columns = {name: getattr(self, name)[chosen] for name in names}
-        return replace(self, **columns, joints=self.joints.rows(np.flatnonzero(chosen)))
-
     @classmethod
     def concatenate(cls, parts: Sequence["Hypotheses"]) -> "Hypotheses":
         """Concatenate hypotheses; their worlds are renumbered and stay separate."""
@@ -141,7 +135,7 @@ def explained(
     plain = _plain(found, times)
     if plain.all():
         return found, found.account.choose(found.world)
-    rest = Rest.of(frames, found.rows(plain))
+    rest = Rest.of(frames, found.candidate[plain], found.places[plain])
     found = Hypotheses.concatenate(
         [found, follow_worlds(tracker, rest, _seeds(tracker, rest.frames), keep)]
     )
@@ -182,20 +176,27 @@ class Rest:
     """(K, T, J, 3) joints of the people, who occlude others, metres; NaN where uncertain."""
 
     @classmethod
-    def of(cls, frames: Sequence[Input], people: Hypotheses | None = None) -> "Rest":
-        """What `people` leave; by default, nobody is tracked already."""
-        if people is None or len(people) == 0:
+    def of(
+        cls,
+        frames: Sequence[Input],
+        candidate: NDArray[np.int32] | None = None,
+        places: Array | None = None,
+    ) -> "Rest":
+        """What people with detections `candidate` (K, T, J, V), -1 for none, at `places` leave; by
+        default, nobody is tracked already.
+        """
+        if candidate is None or places is None or len(candidate) == 0:
             index = [np.append(np.arange(len(frame.detections)), -1) for frame in frames]
             return cls(frames, frames, index, np.zeros((0, len(frames), 1, 3)))
         left = [
-            np.setdiff1d(np.arange(len(frame.detections)), people.candidate[:, t])
+            np.setdiff1d(np.arange(len(frame.detections)), candidate[:, t])
             for t, frame in enumerate(frames)
         ]
         rest = [
             replace(frame, detections=frame.detections.rows(own))
             for frame, own in zip(frames, left, strict=True)
         ]
-        return cls(frames, rest, [np.append(own, -1) for own in left], people.places)
+        return cls(frames, rest, [np.append(own, -1) for own in left], places)
 
 
 def times_of(frames: Sequence[Input]) -> Array:
