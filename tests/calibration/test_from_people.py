@@ -4,6 +4,7 @@ refused by name.
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from shapepose_fg.calibration.from_people import Undetermined, calibrate
 from shapepose_fg.calibration.levelling import Measured, scale_of, sigma_of_scale
 from shapepose_fg.calibration.people import Footage
 from shapepose_fg.calibration.relative import refined_pose
+from shapepose_fg.cli.calibrate import _BENT, _CENTRE_OFF
 from shapepose_fg.cli.main import main
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.decompositions import rigid
@@ -354,3 +356,15 @@ def test_the_cameras_of_shelf(shared_data):
     # Measured: 0.26 degrees and 21 mm; Shelf's own calibration is no better known than that.
     assert np.median(turn) < 0.35 and np.median(move) < 0.03
     assert abs(grown - 1) < 3 * found.world.sigma_scale
+
+
+def test_a_guessed_lens_has_the_prior_of_published_ones():
+    """Root mean squares of the table of phones' lenses, to a fifth."""
+    page = Path(__file__).parents[2] / "docs" / "evaluation" / "cameras.md"
+    table = page.read_text(encoding="utf-8").partition("**Published lenses**")[2]
+    rows = [line.split("|")[2:5] for line in table.split("\n\n")[1].splitlines()[2:]]
+    along, across, bent = (
+        np.array([each for each in c if each.strip()], float) for c in zip(*rows, strict=True)
+    )
+    assert pytest.approx(0.01 * np.sqrt(np.mean(np.r_[along, across] ** 2)), rel=0.2) == _CENTRE_OFF
+    assert pytest.approx(np.sqrt(np.mean(bent**2)), rel=0.2) == _BENT

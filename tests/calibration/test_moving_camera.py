@@ -10,10 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from shapepose_fg.calibration.adjustment import Freedom
 from shapepose_fg.calibration.from_people import Undetermined
-from shapepose_fg.calibration.moving_camera import Filmed, Placed
+from shapepose_fg.calibration.moving_camera import Filmed, Placed, Start
 from shapepose_fg.core.camera import Camera
 from shapepose_fg.core.decompositions import rigid
 from shapepose_fg.core.trajectory import Trajectory
+from shapepose_fg.estimation.trajectory_graph import correlated
 from shapepose_fg.simulation.scene import UP, look_at
 from tests.calibration.conftest import moving
 
@@ -110,6 +111,31 @@ def test_the_drift_and_the_unit_of_an_odometry_are_found(walk, filmed):
     turned = Rotation.from_matrix(found[:, :3, :3].mT @ path(OWN_S)[:, :3, :3]).magnitude()
     assert away.max() < 0.08 and np.degrees(turned).max() < 0.8
     assert start.stretch == pytest.approx(1 / 1.02, abs=0.01) and start.share > 0.9
+
+
+@pytest.mark.slow
+def test_errors_are_as_large_as_printed(walk, filmed):
+    """Over six draws of errors of the detector that last, and of the log's drift."""
+    time_s, wTc = OWN_S[:, None], path(OWN_S)
+    lasting = np.linalg.cholesky(
+        correlated(time_s - time_s.T) / correlated(0.0) + 1e-6 * np.eye(len(OWN_S))
+    )
+    steps = np.diff(wTc[:, :3, 3], axis=0)
+    root = np.sqrt(np.linalg.norm(steps, axis=1))[:, None]
+    ratio = []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        drift = np.cumsum(filmed.trajectory.drift * root * rng.normal(size=steps.shape), axis=0)
+        log = wTc.copy()
+        log[1:, :3, 3] += drift
+        off = np.einsum("fg,gpjc->fpjc", lasting, rng.normal(size=filmed.rays[..., :2].shape))
+        rays = filmed.rays.copy()
+        rays[..., :2] += 8 / 1000 * off
+        seen = replace(filmed, rays=rays, trajectory=Trajectory("phone", OWN_S, log))
+        start = seen._refined(Start(np.eye(4), np.eye(4), LATE_S), walk, MOST_S, Freedom(), 0.0)
+        away = seen._placed(start)[:, :3, 3] - wTc[:, :3, 3]
+        ratio.append(np.sqrt((away**2).sum(axis=1).mean()) / start.sigma_move_m)
+    assert 0.5 < np.mean(np.square(ratio)) < 2.0
 
 
 def test_an_unknown_focal_length_is_found_too(walk, filmed):
