@@ -86,7 +86,7 @@ class NumberStream:
         self.taken = 0
         """Number of values that have been taken so far."""
         self._words = chain.from_iterable(map(str.split, text_lines(path)))
-        self._most = path.stat().st_size // 2 + 1
+        self._most = path.stat().st_size // 2 + 1 if path.exists() else 0
 
     def take(self, count: int, missing: str = "more numbers are expected") -> list[str]:
         """The next `count` values as text; InputError with the text `missing` if there are fewer.
