@@ -33,7 +33,6 @@ from shapepose_fg.estimation.window_solution import (
     PersonGraph,
     WindowSolution,
     statuses,
-    strong_detections,
     tied,
 )
 
@@ -138,7 +137,7 @@ def _solution(
         covariance += carried_covariance(final, nothing, sigmas, views, config.observations)
     covariance += mirrored_spread(X, rows.mirrored, config.joints)
     inlier, nowhere = evidence.inlier, np.full(X.shape, np.nan)
-    strong = strong_detections(rows, inlier)
+    strong = inlier & rows.strong
     known = np.where(inlier.any(axis=-1), Known.WEAK, Known.BODY)
     known = np.where(strong.sum(axis=-1) >= 2, Known.SEEN, known)
     known = np.where(np.isfinite(X).all(axis=-1), known, Known.UNKNOWN)

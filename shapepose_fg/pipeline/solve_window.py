@@ -5,6 +5,9 @@ detections.
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import compress
+
+import numpy as np
 
 from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.core.camera import Views
@@ -14,17 +17,21 @@ from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.alternation import alternate
 from shapepose_fg.estimation.asynchronous_views import widened
 from shapepose_fg.estimation.body_solution import solve_bodies
-from shapepose_fg.estimation.draft import Draft, draft
+from shapepose_fg.estimation.draft import Draft, draft, worth_a_draft
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
+from shapepose_fg.estimation.in_time import near_in_time
 from shapepose_fg.estimation.motion_densities import MotionModel
 from shapepose_fg.estimation.smoothing import smoothed
 from shapepose_fg.estimation.user_factors import ExtraFactors, functions_of
 from shapepose_fg.estimation.window_solution import WindowSolution
-from shapepose_fg.tracking.reassociation import LEAST_PROBABILITY, changed, reassociate
+from shapepose_fg.tracking.reassociation import LEAST_PROBABILITY, reassociate
 
 _SETTLED = 0.002
 """Share of changed detections below which reassociation ends: in crowds after three or four rounds
 with six cameras, after eight or more with three."""
+_CHANGED_S, _SMOOTHED_S = 0.2, 0.5
+"""Time around a changed detection, s, in which others may change in the next round, and in which
+joints are estimated anew for that."""
 
 
 @dataclass(frozen=True)
@@ -70,34 +77,65 @@ def solve_window(
     began = time.perf_counter()
     motion = MotionModel.load(config.joints, config.motion, config.law)
 
-    # Assignment: detections near people's initial joints and bodies, iterated.
-    drafted: Draft | None = None
-    for n in range(assigning.rounds if assigning is not None and len(observations) > 0 else 0):
-        assert assigning is not None
-        drafted = draft(observations, views, fitter, config, drafted)
-        places, covariance = drafted.places, drafted.covariance
-        if assigning.over_time:
-            times_s = observations.time_s.mean(axis=1)
-            places, covariance = smoothed(places, covariance, observations.track, times_s, motion)
-            covariance = widened(covariance, observations, places, views)
-        least = (
-            None if assigning.over_time else n / max(assigning.rounds - 1, 1) * LEAST_PROBABILITY
-        )
-        before = observations
-        observations = reassociate(
-            assigning.frames, before, places, covariance, assigning.skeleton, least
-        )
-        views = views if views.rows_known is None else views.rows(rows_in(before, observations))
-        if assigning.over_time and changed(before, observations) < _SETTLED:
-            break
-    assigned = time.perf_counter()
+    if assigning is not None:
+        observations, views = assigned(observations, views, fitter, config, motion, assigning)
+    seconds = {"associate again": time.perf_counter() - began}
 
     functions = functions_of(extra_factors)
     if config.refine.with_body and fitter.model is not None:
         solution = solve_bodies(observations, views, fitter, config, motion, functions)
     else:
         solution = alternate(observations, views, fitter, config, functions)
-    solution.seconds.update(
-        {"associate again": assigned - began, "solve": time.perf_counter() - assigned}
-    )
+    seconds["solve"] = time.perf_counter() - began - seconds["associate again"]
+    solution.seconds.update(seconds)
     return solution
+
+
+def assigned(
+    observations: Observations,
+    views: Views,
+    fitter: BodyFitter,
+    config: EstimatorConfig,
+    motion: MotionModel,
+    assigning: Assigning,
+) -> tuple[Observations, Views]:
+    """The rows with the detections near people's initial joints and bodies, iterated; and their
+    views.
+
+    Over time, a further round is for frames near those in which a detection changed.
+    """
+    drafted: Draft | None = None
+    frames, every = assigning.frames, (observations, views)
+    frame_s = np.array([each.time_s.mean() for each in frames])
+    asked = np.ones(len(frames), dtype=bool)
+    for n in range(assigning.rounds if len(observations) > 0 else 0):
+        observations, views = every
+        over_time = assigning.over_time
+        around = near_in_time(asked[:, None], frame_s, _SMOOTHED_S)[:, 0]
+        near = np.flatnonzero(
+            np.isin(observations.frame, [each.frame for each in compress(frames, around)])
+        )
+        here, seen_by = observations.rows(near), views.rows(near)
+        if over_time:
+            worth = worth_a_draft(here)
+            drafted = draft(here.rows(worth), seen_by.rows(worth), fitter, config, drafted)
+            times_s, least = here.time_s.mean(axis=1), None
+            places, covariance = smoothed(*drafted.among(here), here.track, times_s, motion)
+            covariance = widened(covariance, here, places, seen_by)
+        else:
+            drafted = draft(here, seen_by, fitter, config, drafted)
+            places, covariance = drafted.places, drafted.covariance
+            least = n / max(assigning.rounds - 1, 1) * LEAST_PROBABILITY
+        again = list(compress(frames, asked))
+        new = reassociate(again, here, places, covariance, assigning.skeleton, least)
+        kept = ~np.isin(observations.frame, [each.frame for each in again])
+        now = Observations.concatenate([observations.rows(kept), new])
+        every = now, views if views.rows_known is None else views.rows(rows_in(observations, now))
+        if over_time:
+            was = here.rows(rows_in(here, new))
+            other = (was.candidate != new.candidate) & (was.seen | new.seen)
+            if other.sum() < _SETTLED * np.maximum(now.seen.sum(), 1):
+                break
+            marked = np.isin([each.frame for each in frames], new.frame[other.any(axis=(1, 2))])
+            asked = near_in_time(marked[:, None], frame_s, _CHANGED_S)[:, 0]
+    return every

@@ -5,7 +5,6 @@ drawn.
 """
 
 import threading
-from dataclasses import dataclass
 from functools import lru_cache
 
 import cv2
@@ -23,21 +22,6 @@ _FAR_M = 100.0
 _NUMBER = np.float32(2.0**-20)
 """Colour step per vertex number: OpenCV takes colours from 0 to 1, and float32 represents these
 steps exactly."""
-_FLAT = (
-    cv2.TriangleRasterizeSettings()
-    .setShadingType(cv2.RASTERIZE_SHADING_FLAT)
-    .setCullingMode(cv2.RASTERIZE_CULLING_CW)
-)
-
-
-@dataclass(frozen=True)
-class Surface:
-    """The first surface along the ray of every pixel."""
-
-    depth: NDArray[np.float32]
-    """(H, W) depth along the optical axis, metres; inf if the ray hits nothing."""
-    face: NDArray[np.int32]
-    """(H, W) index of the visible face; -1 if there is none."""
 
 
 def look_at(eye: Array, target: Array, up: Array) -> Array:
@@ -55,23 +39,15 @@ def look_at(eye: Array, target: Array, up: Array) -> Array:
     return rigid(np.column_stack([right, np.cross(forward, right), forward]), eye)
 
 
-def zoom(camera: Camera, box: tuple[float, float, float, float], width: int) -> Camera:
-    """The camera of an enlarged window of the image: `box` (left, top, right, bottom) px, `width`
-    px wide.
-    """
-    left, top, right, bottom = box
-    scale = width / (right - left)
-    K = camera.K.copy()
-    # The edges of pixels are scaled, not their centres, hence the half pixels.
-    K[:2, 2] = (K[:2, 2] + 0.5 - (left, top)) * scale - 0.5
-    K[:2, :2] *= scale
-    return Camera(camera.name, K, camera.wTc, (width, max(1, round((bottom - top) * scale))))
-
-
 def scaled(camera: Camera, scale: float) -> Camera:
     """Return the camera with an image of `scale` times the size, and without lens distortion."""
     width, height = camera.image_size
-    return zoom(camera, (0.0, 0.0, width, height), max(1, round(width * scale)))
+    smaller, K = max(1, round(width * scale)), camera.K.copy()
+    scale = smaller / width
+    # The edges of pixels are scaled, not their centres, hence the half pixels.
+    K[:2, 2] = (K[:2, 2] + 0.5) * scale - 0.5
+    K[:2, :2] *= scale
+    return Camera(camera.name, K, camera.wTc, (smaller, max(1, round(height * scale))))
 
 
 def first_surface_at(
@@ -81,7 +57,7 @@ def first_surface_at(
     surface along the rays of these pixels.
 
     The vertex is the first corner of the visible face. Depth is inf and vertex -1 if the ray hits
-    nothing. Equal to the result of `rasterise`, in half the time. At most 2**20 points.
+    nothing. At most 2**20 points.
     """
     width, height = camera.image_size
     # In double precision: single-precision products round differently on different processors,
@@ -90,13 +66,8 @@ def first_surface_at(
     near = points[2] <= NEAR_M
     if near.any():  # OpenCV would draw a face that extends behind the camera across the whole image
         faces = faces[~near[faces].any(axis=1)]
-    if len(faces) == 0:
-        return np.full(row.shape, np.inf, dtype=np.float32), np.full(row.shape, -1, dtype=np.intp)
-    colour, depth = _canvas.blank(height, width)
     corners, number = _as_opengl(points, camera), _numbers(points.shape[1])
-    cv2.triangleRasterize(
-        corners, faces, number, colour, depth, np.eye(4), 1.0, NEAR_M, _FAR_M, _FLAT
-    )
+    colour, depth = _drawn(corners, faces, number, (width, height), cv2.RASTERIZE_SHADING_FLAT)
     met = colour[row, column, 0]
     vertex = np.where(met >= 0, np.rint(met / _NUMBER), -1).astype(np.intp)
     return np.where(met >= 0, depth[row, column], np.float32(np.inf)), vertex
@@ -149,33 +120,47 @@ def _numbers(count: int) -> NDArray[np.float32]:
     return number
 
 
-def rasterise(xy: Real, depth: Real, faces: Whole, size: tuple[int, int]) -> Surface:
-    """Draw triangles with corners at pixels `xy` (N, 2) and `depth` (N,) into an image of `size`
-    (W, H), by OpenCV.
+def shaded(xy: Real, depth: Real, faces: Whole, colour: Real, size: tuple[int, int]) -> Real:
+    """Picture (H, W, 3) of triangles, `size` (W, H); -1 where there is none.
 
-    1/depth is interpolated linearly in the image, so depth is exact inside a face. Faces with a
-    corner that is NaN, or nearer than `NEAR_M`, are dropped. Back faces are culled, which is
-    correct, and twice as fast, for closed meshes with faces that are counter-clockwise when seen
-    from outside. At most 2**20 faces are drawn.
+    Their corners are at pixels `xy` (N, 2) and at `depth` (N,), metres, with `colour` (N, 3), 0 to
+    1, which is interpolated between them. Faces with a corner that is NaN, or nearer than `NEAR_M`,
+    are dropped.
     """
-    width, height = size
     drawable = np.isfinite(xy).all(axis=1) & (depth > NEAR_M)
-    index = np.flatnonzero(drawable[faces].all(axis=1))
-    if len(index) == 0:
-        nothing = np.full((height, width), np.inf, dtype=np.float32)
-        return Surface(nothing, np.full((height, width), -1, dtype=np.int32))
     # As in `_as_opengl`, for pixels: OpenCV scales x / z and y / z by its own focal length.
-    focal = height / 2 / np.tan(0.5)
+    width, height = size
     middle = np.array([width / 2, height / 2]) - 0.5
-    flat = (xy - middle) * depth[:, None] / focal * (1.0, -1.0)
-    corners = np.column_stack([flat, -depth])[faces[index]].reshape(-1, 3).astype(np.float32)
-    number = np.repeat(_numbers(len(index)), 3, axis=0)
-    colour = np.full((height, width, 3), -1.0, dtype=np.float32)
-    met = np.full((height, width), _FAR_M, dtype=np.float32)
-    each = np.arange(len(corners), dtype=np.int32).reshape(-1, 3)
-    cv2.triangleRasterize(corners, each, number, colour, met, np.eye(4), 1.0, NEAR_M, _FAR_M, _FLAT)
-    hit = colour[..., 0] >= 0
-    face = np.where(
-        hit, index[np.where(hit, np.rint(colour[..., 0] / _NUMBER), 0).astype(np.intp)], -1
-    )
-    return Surface(np.where(hit, met, np.float32(np.inf)), face.astype(np.int32))
+    flat = (xy - middle) * depth[:, None] / (height / 2 / np.tan(0.5)) * (1.0, -1.0)
+    corners = np.where(drawable[:, None], np.column_stack([flat, -depth]), 0.0)
+    seen = faces[drawable[faces].all(axis=1)]
+    return _drawn(corners.astype(np.float32), seen, colour, size, cv2.RASTERIZE_SHADING_SHADED)[
+        0
+    ].copy()
+
+
+def _drawn(
+    corners: NDArray[np.float32],
+    faces: Whole,
+    colour: Real,
+    size: tuple[int, int],
+    shading: int,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Colour (H, W, 3), -1 where there is no face, and depth (H, W), metres, by OpenCV; valid until
+    the next call.
+
+    1/depth is interpolated linearly in the image, so depth is exact inside a face. Back faces are
+    culled, which is correct, and twice as fast, for closed meshes with faces that are
+    counter-clockwise when seen from outside.
+    """
+    picture, depth = _canvas.blank(size[1], size[0])
+    settings = cv2.TriangleRasterizeSettings().setShadingType(shading)
+    settings.setCullingMode(cv2.RASTERIZE_CULLING_CW)
+    if len(faces) > 0:
+        cv2.triangleRasterize(
+            corners,
+            np.ascontiguousarray(faces, dtype=np.int32),
+            np.ascontiguousarray(colour, dtype=np.float32),
+            picture, depth, np.eye(4), 1.0, NEAR_M, _FAR_M, settings,
+        )  # fmt: skip
+    return picture, depth

@@ -6,12 +6,10 @@ import pytest
 from shapepose_fg.core.camera import Camera
 from shapepose_fg.core.drawing import vertex_normals
 from shapepose_fg.viz.rendering import (
-    Surface,
     first_surface_at,
     look_at,
-    rasterise,
     scaled,
-    zoom,
+    shaded,
 )
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -45,19 +43,30 @@ def rays(camera: Camera) -> np.ndarray:
     return np.stack([column, row, np.ones_like(row)], axis=-1) @ np.linalg.inv(camera.K).T
 
 
-def drawn(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> Surface:
-    return rasterise(*camera.project(vertices), faces, camera.image_size)
+def drawn(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Depth and vertex in all pixels."""
+    row, column = np.mgrid[: camera.image_size[1], : camera.image_size[0]]
+    return first_surface_at(vertices, faces.astype(np.int32), camera, column, row)
+
+
+def of_pixels(
+    xy: np.ndarray, depth: np.ndarray, faces: np.ndarray, size: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Depth and vertex in all pixels of a picture, of corners at pixels `xy`."""
+    K = np.array([[20.0, 0, size[0] / 2], [0, 20.0, size[1] / 2], [0, 0, 1]])
+    points = np.column_stack([xy, np.ones(len(xy))]) @ np.linalg.inv(K).T * depth[:, None]
+    return drawn(points, faces, Camera("c", K, np.eye(4), size))
 
 
 def test_depth_of_a_sphere(camera: Camera):
     vertices, faces = sphere(200)
-    surface = drawn(vertices, faces, camera)
+    depth, vertex = drawn(vertices, faces, camera)
     centre = camera.cTw[:, 3]
     # |s ray - centre| = 1, the smaller root.
     ray = rays(camera)
     a, b = (ray**2).sum(-1), ray @ centre
     root = b**2 - a * (centre @ centre - 1)
-    hit = surface.face >= 0
+    hit = vertex >= 0
     assert 0.995 < hit.sum() / (root > 0).sum() <= 1.0  # the facets lie inside the sphere
     inner = (
         root > 0.3
@@ -65,22 +74,22 @@ def test_depth_of_a_sphere(camera: Camera):
     expected = (b[inner] - np.sqrt(root[inner])) / a[inner]
     # A facet's edge is pi / 199 long, its diagonal d = 0.022, and lies d^2 / 8 = 6e-5 under the
     # sphere; root > 0.3 is a slope of at most 1 / sqrt(0.3).
-    assert np.abs(surface.depth[inner] - expected).max() < 1.2e-4
-    assert np.isinf(surface.depth[~hit]).all()
+    assert np.abs(depth[inner] - expected).max() < 1.2e-4
+    assert np.isinf(depth[~hit]).all()
 
 
 def test_depth_of_a_tilted_plane(camera: Camera):
     corners = np.array([[-0.4, -0.5, 0.3], [0.5, -0.4, -0.2], [0.3, 0.5, 0.1], [-0.6, 0.6, 0.6]])
     normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
     corners[3] -= normal * (normal @ (corners[3] - corners[0])) / (normal @ normal)
-    surface = drawn(corners, np.array([[0, 1, 2], [0, 2, 3]]), camera)
+    depth, vertex = drawn(corners, np.array([[0, 1, 2], [0, 2, 3]]), camera)
     n = camera.cTw[:, :3] @ normal
     point = camera.cTw[:, :3] @ corners[0] + camera.cTw[:, 3]
     expected = (n @ point) / (rays(camera) @ n)
-    hit = surface.face >= 0
+    hit = vertex >= 0
     assert hit.sum() > 500
     assert (
-        np.abs(surface.depth[hit] - expected[hit]).max() < 1e-4
+        np.abs(depth[hit] - expected[hit]).max() < 1e-4
     )  # OpenCV keeps depths of 5 cm to 100 m in float32
 
 
@@ -90,39 +99,50 @@ def test_the_nearer_of_two_quads_wins_and_neighbours_leave_no_gap():
     )  # no edge on a pixel's centre
     xy = np.concatenate([square, square + np.array([5, 3])])
     faces = np.array([[2, 1, 0], [3, 2, 0], [6, 5, 4], [7, 6, 4]])  # counter-clockwise as seen
-    surface = rasterise(xy, np.repeat([3.0, 2.0], 4), faces, (24, 20))
+    depth, vertex = of_pixels(xy, np.repeat([3.0, 2.0], 4), faces, (24, 20))
     row, column = np.mgrid[:20, :24]
     first = (column >= 2) & (column <= 12) & (row >= 2) & (row <= 12)
     second = (column >= 7) & (column <= 17) & (row >= 5) & (row <= 15)
     expected = np.where(second, 2.0, np.where(first, 3.0, np.inf))
-    np.testing.assert_allclose(surface.depth, expected, rtol=1e-5)
-    assert set(np.unique(surface.face[second])) <= {2, 3}
-    assert set(np.unique(surface.face[first & ~second])) <= {0, 1}
+    np.testing.assert_allclose(depth, expected, rtol=1e-5)
+    assert (vertex[second] >= 4).all()
+    assert ((vertex >= 0) & (vertex < 4))[first & ~second].all()
 
 
 def test_nearer_in_the_middle_only_where_planes_cross():
     xy = np.array([[-0.5, -0.5], [20.5, -0.5], [20.5, 10.5], [-0.5, 10.5]] * 2)
     depth = np.array([1.0, 3, 3, 1, 3, 1, 1, 3])
     faces = np.array([[2, 1, 0], [3, 2, 0], [6, 5, 4], [7, 6, 4]])  # counter-clockwise as seen
-    surface = rasterise(xy, depth, faces, (21, 11))
-    assert (surface.face[:, :10] < 2).all()
-    assert (surface.face[:, 11:] >= 2).all()
+    met, vertex = of_pixels(xy, depth, faces, (21, 11))
+    assert (vertex[:, :10] < 4).all()
+    assert (vertex[:, 11:] >= 4).all()
     # 1/depth is linear: halfway between 1 m and 3 m it is 2/3.
-    np.testing.assert_allclose(surface.depth[5, 10], 1.5, rtol=1e-6)
+    np.testing.assert_allclose(met[5, 10], 1.5, rtol=1e-5)
 
 
 def test_what_is_behind_the_camera_or_nan_is_not_drawn(camera: Camera):
     vertices, faces = sphere(20)
+
+    def any_drawn(vertices: np.ndarray, faces: np.ndarray) -> bool:
+        white = np.ones((len(vertices), 3))
+        xy, depth = camera.project(vertices)
+        picture = shaded(xy, depth, faces, white, camera.image_size)
+        assert (picture >= 0).any() == (picture == 1).any()
+        return bool((picture >= 0).any())
+
     behind = vertices + 2 * camera.centre
-    assert (drawn(behind, faces, camera).face == -1).all()
+    assert (drawn(behind, faces, camera)[1] == -1).all() and not any_drawn(behind, faces)
     around = (
         vertices + camera.centre
     )  # the camera is in the middle: no face crosses the image plane whole
-    assert np.isfinite(drawn(around, faces[:, ::-1], camera).depth).any()
+    assert np.isfinite(drawn(around, faces[:, ::-1], camera)[0]).any()
+    assert any_drawn(around, faces[:, ::-1])
     vertices = vertices.copy()
     vertices[:200] = np.nan
-    assert (drawn(vertices, faces, camera).face >= 0).any()
-    assert (drawn(np.zeros((0, 3)), np.zeros((0, 3), dtype=int), camera).face == -1).all()
+    assert any_drawn(vertices, faces)
+    assert not any_drawn(np.zeros((0, 3)), np.zeros((0, 3), dtype=int))
+    depth, vertex = drawn(np.zeros((0, 3)), np.zeros((0, 3), dtype=int), camera)
+    assert np.isinf(depth).all() and (vertex == -1).all()
 
 
 def test_look_at_puts_the_target_in_the_middle_and_up_up(camera: Camera):
@@ -134,12 +154,9 @@ def test_look_at_puts_the_target_in_the_middle_and_up_up(camera: Camera):
         look_at(np.array([0.0, 0, 2]), np.zeros(3), UP)
 
 
-def test_zoom_and_scale_move_points_as_the_pixels_move(camera: Camera):
+def test_scale_moves_points_as_the_pixels_move(camera: Camera):
     points = np.array([[0.3, -0.2, 0.5], [-0.4, 0.1, 0.0]])
     xy, _ = camera.project(points)
-    window = zoom(camera, (40.0, 30.0, 120.0, 90.0), 320)
-    assert window.image_size == (320, 240)
-    np.testing.assert_allclose(window.project(points)[0], (xy + 0.5 - (40, 30)) * 4 - 0.5)
     np.testing.assert_allclose(scaled(camera, 0.5).project(points)[0], (xy + 0.5) / 2 - 0.5)
 
 
@@ -152,34 +169,29 @@ def test_normals_of_a_sphere():
     assert np.abs(normals - vertices)[away_from_poles].max() < 0.03
 
 
-def test_the_fast_way_meets_the_same_surfaces(camera: Camera):
+def test_shading_shows_the_surfaces_that_are_met(camera: Camera):
     """Two spheres, one through the other, from outside, from near and from inside, by a camera with
-    skew.
+    skew; each has its own grey.
     """
     ball, faces = sphere(40)
     points = np.concatenate([ball, 0.6 * ball + (0.5, 0.7, 0.2)])
     mesh = np.concatenate([faces, faces + len(ball)])
-    width, height = camera.image_size
-    row, column = np.mgrid[:height, :width]
+    grey = np.repeat([0.25, 0.75], len(ball))
     hits = []
     for eye, target in (
         ((4.0, 1, 0.5), (0, 0, 0)),
         ((1.0, 0.1, 1), (0.5, 0.7, 0.2)),
         ((0, 0, 0.1), (3.0, 1, 0)),
     ):
-        shifted = np.array([[200.0, 3.0, 70.0], [0, 180.0, 66.0], [0, 0, 1]])
+        skewed = np.array([[200.0, 3.0, 70.0], [0, 180.0, 66.0], [0, 0, 1]])
         seen_from = Camera(
-            "c", shifted, look_at(np.array(eye), np.array(target), UP), camera.image_size
+            "c", skewed, look_at(np.array(eye), np.array(target), UP), camera.image_size
         )
-        exact = drawn(points, mesh, seen_from)
-        depth, vertex = first_surface_at(points, mesh.astype(np.int32), seen_from, column, row)
-        hit = exact.face >= 0
-        hits.append(hit.mean())
-        assert np.mean((vertex >= 0) != hit) < 1e-3  # pixel centres on an edge, to float32
-        both = (vertex >= 0) & hit
-        assert np.mean(vertex[both] != mesh[exact.face[both], 0]) < 2e-3
-        assert np.quantile(np.abs(depth[both] - exact.depth[both]), 0.999) < 1e-4
-        assert np.isinf(depth[vertex < 0]).all()
+        colour = np.repeat(grey[:, None], 3, axis=1)
+        picture = shaded(*seen_from.project(points), mesh, colour, camera.image_size)
+        _, vertex = drawn(points, mesh, seen_from)
+        hits.append((vertex >= 0).mean())
+        expected = np.where(vertex >= 0, grey[vertex], -1)
+        # Pixel centres on an edge, to float32.
+        assert np.mean(np.abs(picture - expected[..., None]).max(axis=-1) > 1e-3) < 2e-3
     assert min(hits) > 0.3  # also from inside the first ball, whose backs are not drawn
-    nothing = first_surface_at(points[:0], mesh[:0].astype(np.int32), camera, column, row)
-    assert np.isinf(nothing[0]).all() and (nothing[1] == -1).all()

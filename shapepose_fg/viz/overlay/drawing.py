@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from shapepose_fg.core.arrays import Array, Index, Mask, Real, Whole
 from shapepose_fg.core.camera import Camera
-from shapepose_fg.core.drawing import bones_of, colour_of
+from shapepose_fg.core.drawing import bones_of, colour_of, vertex_normals
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import Known, Reconstruction
 from shapepose_fg.core.storage.files import write_atomically
 from shapepose_fg.io.footage.footage import Picture
 from shapepose_fg.io.footage.placement import Placement
 from shapepose_fg.viz.bodies import joined
-from shapepose_fg.viz.rendering import NEAR_M, rasterise
+from shapepose_fg.viz.rendering import NEAR_M, shaded
 
 Colour = tuple[int, int, int]
 """Blue, green, red, 0 to 255."""
@@ -98,19 +98,13 @@ def draw_bodies(
     if len(vertices) == 0:
         return picture
     points, corners = joined(vertices, faces)
-    xy, depth = view.project(points)
-    surface = rasterise(xy, depth, corners, view.size)
-    row, column = np.nonzero(surface.face >= 0)
-    met = surface.face[row, column]
-    first, second, third = points[corners[met].T]
-    normal = np.cross(second - first, third - first)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-    light = 0.35 + 0.65 * np.clip(-(normal @ view.camera.wTc[:3, 2]), 0.0, 1.0)
-    own = np.array(colours, dtype=np.float64)[met // len(faces)]
+    normals = vertex_normals(points, corners)
+    light = 0.35 + 0.65 * np.clip(-(normals @ view.camera.wTc[:3, 2]), 0.0, 1.0)
+    own = np.repeat(np.array(colours, dtype=np.float64) / 255, vertices.shape[1], axis=0)
+    surface = 255 * shaded(*view.project(points), corners, light[:, None] * own, view.size)
+    met = (surface >= 0).all(axis=2)
     drawn = picture.copy()
-    drawn[row, column] = (
-        (1 - _OPACITY) * picture[row, column] + _OPACITY * light[:, None] * own
-    ).astype(np.uint8)
+    drawn[met] = ((1 - _OPACITY) * picture[met] + _OPACITY * surface[met]).astype(np.uint8)
     return drawn
 
 
