@@ -5,6 +5,7 @@ are relative paths, and what only the site has (navigation, commands, settings, 
 it is built, by docs/generated.py.
 """
 
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -27,6 +28,7 @@ exclude_patterns = [".*", "build", "dist", "demo", "results", "tests", "**/*.egg
 extensions = ["myst_parser", "sphinx.ext.autodoc"]
 
 myst_enable_extensions = ["colon_fence", "deflist"]
+myst_disable_syntax = ["myst_line_comment"]  # a line may begin with %
 myst_heading_anchors = 4
 suppress_warnings = ["misc.highlighting_failure"]
 
@@ -50,7 +52,18 @@ def setup(app: Any) -> None:
     """Connect what is added to the pages while the site is built."""
     app.connect("source-read", generated.complete)
     app.connect("autodoc-process-docstring", generated.as_text)
+    app.connect("html-page-context", _whole_options)
     app.connect("build-finished", _start)
+
+
+def _whole_options(app: Any, name: str, template: str, context: dict[str, Any], tree: Any) -> None:
+    """Wrap the options of commands in spans, so that no line is broken behind their hyphens."""
+    context["body"] = re.sub(
+        r'<div class="highlight-bash.*?</pre>',
+        lambda code: re.sub(r"(?<=[>\s])-[\w-]+", r'<span class="option">\g<0></span>', code[0]),
+        context.get("body", ""),
+        flags=re.DOTALL,
+    )
 
 
 def _start(app: Any, error: Exception | None) -> None:

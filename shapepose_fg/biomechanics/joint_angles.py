@@ -71,15 +71,12 @@ DEFINITIONS = (
 """The angles; docs/joint_angles.md describes them."""
 _BONES_ALONG = {"hip": "knee", "knee": "ankle", "shoulder": "elbow", "elbow": "wrist"}
 """Bones with a long axis: the joint at its proximal end, and the one at its distal end."""
-_MOVED = np.delete(
-    np.arange(NUM_BETAS + 3 * len(SMPL_24) + 3),
-    [NUM_BETAS + 3 * SMPL_24.index(name) for name in ("pelvis", "spine1", "spine2", "spine3")],
-)
-"""Columns of the Jacobian of the body's keypoints for which the joints of a single frame have
-information: all but the flexion of pelvis and trunk."""
 _SHARED = 2.0
 """Number of a person's joints whose errors count as one, since they are marginals of one graph with
 one body (coverage of `scripts/measure_angles.py`)."""
+_WEIGHT = 2.0
+"""Factor of the information of joints in the angles: with 1 the prior bends knees (errors of
+`scripts/measure_angles.py`)."""
 _STEP = 1e-4
 """Step of the central differences, rad."""
 _BLOCK = 256
@@ -286,35 +283,36 @@ def _rotations(
 
     The joints x that a view saw, with covariances C, measure the keypoints of the body, which have
     the Jacobian J. With the precision P of the prior of shape and pose, the covariance is
-    (J^T C^-1 J / `_SHARED` + P)^-1. The bodies are moved by a Gauss-Newton step to these joints;
-    the flexion of pelvis and trunk stays as it was fitted over time, because the joints of a single
-    frame hardly determine it.
+    (J^T C^-1 J / `_SHARED` + P)^-1. The bodies are moved by a Gauss-Newton step to the joints and
+    the mean of the prior of poses, on which the flexion of pelvis and trunk depends.
     """
     points, jacobian = model.keypoints_with_jacobian(posed)
     count, columns = len(points), jacobian.shape[-1]
     volume = np.linalg.det(np.nan_to_num(people.covariance))  # 0 if it is unknown or singular
-    seen = Known.observed(people.known) & (volume > 0)
-    known = seen[..., None, None]
-    weight = np.linalg.inv(np.where(known, people.covariance, np.eye(3))) * known / _SHARED
+    placed = volume > 0
+    seen, known = placed & Known.observed(people.known), placed[..., None, None]
+    weight = np.linalg.inv(np.where(known, people.covariance, np.eye(3))) * known
     flat = jacobian.reshape(count, -1, columns)
     weighted = (weight @ jacobian).reshape(flat.shape)
     information = flat.swapaxes(1, 2) @ weighted
-    prior = PosePrior.default().marginal_precision(np.arange(NUM_ANGLES))
+    by_views = flat.swapaxes(1, 2) @ (weighted * np.repeat(seen, 3, axis=1)[..., None])
+    poses, prior = PosePrior.default(), np.zeros_like(information)
     blocks = np.zeros((count, 23, 3, 23, 3))
     blocks[:, np.arange(23), :, np.arange(23)] = right_jacobian_inverse(posed.body_pose).swapaxes(
         0, 1
     )
     blocks = blocks.reshape(count, NUM_ANGLES, NUM_ANGLES)
-    information[:, 13:82, 13:82] += blocks.swapaxes(1, 2) @ prior @ blocks
-    information[:, range(NUM_BETAS), range(NUM_BETAS)] += 1
+    pulls = blocks.swapaxes(1, 2) @ poses.marginal_precision(np.arange(NUM_ANGLES))
+    prior[:, 13:82, 13:82] = pulls @ blocks
+    prior[:, range(NUM_BETAS), range(NUM_BETAS)] = 1
     # So that a row with few joints has an inverse.
-    information[:, range(columns), range(columns)] += 1e-6
-    covariance = np.linalg.inv(information)[:, 10:82, 10:82]
-    residual = np.where(seen[..., None], people.joints - points, 0).reshape(count, -1, 1)
-    pull = weighted.swapaxes(1, 2) @ residual
-    step = np.zeros((count, columns, 1))
-    step[:, _MOVED] = np.linalg.solve(information[:, _MOVED[:, None], _MOVED], pull[:, _MOVED])
-    step = step[..., 0]
+    prior[:, range(columns), range(columns)] += 1e-6
+    covariance = np.linalg.inv(by_views / _SHARED + prior)[:, 10:82, 10:82]
+    residual = np.where(placed[..., None], people.joints - points, 0).reshape(count, -1, 1)
+    pull = _WEIGHT * weighted.swapaxes(1, 2) @ residual
+    pull[:, 13:82] += pulls @ (poses.mean - posed.body_pose.reshape(count, -1))[..., None]
+    pull *= placed.any(axis=1)[:, None, None]  # bodies without covariances stay
+    step = np.linalg.solve(_WEIGHT * information + prior, pull)[..., 0]
     local = posed.local @ exp_so3(step[:, 10:82].reshape(-1, 24, 3))
     return (
         posed.betas + step[:, :10],

@@ -321,16 +321,15 @@ def _with_moving(
 
 
 _CAPTION = (
-    "±: one sigma, relative to the rig; shared: share of its people seen by another camera, too; "
+    "±: one sigma of rotation and position, relative to the rig; shared: share of its people seen "
+    "by another camera, too; "
     "halves: difference between its poses from the first and the second half of the recording"
 )
 
 
 def _figures(found: "Calibrated", focal: bool) -> tuple[list[str], list[tuple[str, list[str]]]]:
     """The cameras with standard deviations: headings, and the values of each camera."""
-    heads = ["people", "shared", "x y z, m", "rotation ± °", "position ± mm", "halves, °"] + [
-        "focal, px"
-    ] * focal
+    heads = ["people", "shared", "x y z, m", "± °", "± mm", "halves, °"] + ["focal, px"] * focal
     rows = []
     for each in found.as_dict()["cameras"]:
         place = " ".join(f"{value:.2f}" for value in each["centre_m"])

@@ -168,8 +168,8 @@ def bars(unit: str = "") -> Iterator["Progress"]:
     global _shown
     from rich.progress import (
         BarColumn,
-        MofNCompleteColumn,
         Progress,
+        TaskProgressColumn,
         TextColumn,
         TimeRemainingColumn,
     )
@@ -178,8 +178,7 @@ def bars(unit: str = "") -> Iterator["Progress"]:
     columns = (
         TextColumn("{task.description}", markup=False),
         BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn(unit),
+        TaskProgressColumn(f"{{task.completed:.0f}}/{{task.total:.0f}} {unit}", ""),
     )
     is_shown = _is_terminal(on) and _shown is None
     made = Progress(

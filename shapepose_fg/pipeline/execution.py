@@ -10,7 +10,8 @@ from shapepose_fg.pipeline.workers import Pool, suitable_workers, workers
 
 Shared = TypeVar("Shared")
 Progress = Callable[[int, int], None]
-"""Called with the number of frames that are done and the number of all frames."""
+"""Called with the number of frames that are done and the number of all frames. If trajectories of
+moving cameras are refined first, this is half of the work on each frame."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,10 @@ class Execution:
     chunks."""
     progress: Progress | None = None
     """Called while frames are solved."""
+
+    def tell(self, frames: int) -> Callable[[int], object]:
+        """A function to be called with the number of frames that are done, out of `frames`."""
+        return lambda done: None if self.progress is None else self.progress(done, frames)
 
     def worth(self, frames: int) -> "Execution":
         """Return a copy with a suitable number of workers for this many frames, if none

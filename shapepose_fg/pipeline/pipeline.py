@@ -3,7 +3,7 @@ return rows.
 """
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -192,9 +192,9 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
         if fitter is None:
             fitter = make_fitter(config.body, BodyModel.default().with_keypoints(skeleton.joints))
         check_fitter(fitter)
-    setup = _with_refined(
-        kept, task, Setup(rig, skeleton, config, fitter, task.extra_factors), book
-    )
+    tell, passes = execution.tell(len(frames)), 1 + (unrefined(rig) and config.temporal)
+    setup = Setup(rig, skeleton, config, fitter, task.extra_factors)
+    setup = _with_refined(kept, task, setup, book, lambda done: tell(done // passes))
     sample = Sample(setup, detections, times)
     offsets = kept_offsets(kept, sample, book)
     if offsets is not None:
@@ -212,8 +212,7 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
         for part in windows.after(parts.checkpoint(windows.read, frames, nobody), pool, chunk):
             parts.append(part)
             done += part.notes.frames
-            if execution.progress is not None:
-                execution.progress(done, len(frames))
+            tell((done + (passes - 1) * len(frames)) // passes)
         result = Assembly(parts, skeleton.joints, rig.names)
         if config.temporal and len(parts) > 0:
             with book.stage("follow"):
@@ -251,8 +250,16 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
     return result.with_run(**_summary(notes, config, frames, result), **more)
 
 
-def _with_refined(kept: KeptArrays, task: Task, setup: Setup, book: Notebook) -> Setup:
-    """The set-up with refined trajectories for moving cameras; a run stores them."""
+def _with_refined(
+    kept: KeptArrays,
+    task: Task,
+    setup: Setup,
+    book: Notebook,
+    tell: Callable[[int], object] = lambda done: None,
+) -> Setup:
+    """The set-up with refined trajectories for moving cameras; a run stores them. `tell` gets the
+    number of frames that are done.
+    """
     rig, config = setup.rig, setup.config
     if not unrefined(rig) or not config.temporal:
         return setup
@@ -264,7 +271,7 @@ def _with_refined(kept: KeptArrays, task: Task, setup: Setup, book: Notebook) ->
         every = np.arange(frames.start, frames.stop)
         windows = SolvedWindows(setup, thinned, pictures, times, frames, cuts, every, Notebook())
         with book.stage("trajectories"):
-            known = refine(windows, task.camera_factors)
+            known = refine(windows, task.camera_factors, tell)
         keep(kept, known)
     return replace(setup, rig=known)
 

@@ -5,7 +5,7 @@ jointly (`estimation/trajectory_graph.py`), and last the poses of the whole reco
 in which each window's people are replaced by their marginal on the poses.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -63,9 +63,13 @@ def keep(kept: KeptArrays, rig: Rig) -> None:
         )
 
 
-def refine(windows: SolvedWindows, camera_factors: CameraFactors | None = None) -> Rig:
+def refine(
+    windows: SolvedWindows,
+    camera_factors: CameraFactors | None = None,
+    tell: Callable[[int], object] = lambda done: None,
+) -> Rig:
     """The rig of `windows` with trajectories refined by the people of the recording, and their
-    covariances.
+    covariances. `tell` gets the number of frames that are done.
     """
     rig, time_s = windows.setup.rig, windows.times.of_views(len(windows.setup.rig))
     frames = np.arange(windows.frames.start, windows.frames.stop)
@@ -83,6 +87,7 @@ def refine(windows: SolvedWindows, camera_factors: CameraFactors | None = None) 
             poses[own[0] :] = passing.corrected(whole.odometry[own[0] :])
             poses[own] = graph.poses
             of_people += graph.of_poses()
+            tell(int(own[-1]) + 1)
     poses, covariance = _smoothed(whole, poses, of_people)
     refined = [
         _refined(trajectory, whole.time_s, poses[:, n], whole.odometry[:, n], covariance[:, n])

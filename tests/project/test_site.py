@@ -57,6 +57,8 @@ def test_the_site_is_complete_and_needs_no_network(tmp_path):
     for path in site.rglob("*.html"):
         loaded = Page(path.read_text(encoding="utf-8")).loaded
         assert [each for each in loaded if urlsplit(each).netloc] == [], path
+    moving = (site / "docs/moving_cameras.html").read_text(encoding="utf-8")
+    assert "of 95\n%. They contain" in moving, "a line that begins with % is no comment"
     start = (site / "index.html").read_text(encoding="utf-8")
     for guide in ("biomechanics", "research", "robots", "phones"):
         assert f'href="docs/guides/{guide}.html"' in start

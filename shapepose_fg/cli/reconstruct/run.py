@@ -165,11 +165,11 @@ def _about_moving(task: Task) -> list[str]:
         spans = [(first, last) for each, first, last in spells if each == view]
         count, where = (
             sum(last - first for first, last in spans),
-            ", ".join(f"{a}-{b - 1}" for a, b in spans[:4]),
+            ", ".join(f"{a}:{b}" for a, b in spans[:4]),
         )
         told.append(
-            f"{rig.names[view]}: {count} pictures are outside its trajectory and are not used "
-            f"(frames {where}{' ...' * (len(spans) > 4)})"
+            f"{rig.names[view]}: frames outside its trajectory are not used: {count} "
+            f"({where}{' ...' * (len(spans) > 4)})"
         )
         if count == len(times):
             path, time_s = rig.trajectories[int(rig.carrier[view])], times.frame_s
