@@ -68,6 +68,8 @@ $(VENV)/installed-docs: $(VENV)/installed
 # By pip: PyTorch comes from where its settings say, as a small build for processors.
 $(VENV)/installed-all: $(VENV)/installed
 	$(MAKE) --no-print-directory EXTRA=ci install
+# Its OpenCV would replace the headless one.
+	$(BIN)/python -m pip $(PIP) --no-deps trackeval==1.3.0
 	touch $@
 
 # The newest pip: older ones take twice as long to find out what to install.
