@@ -111,10 +111,8 @@ def assigned(
     for n in range(assigning.rounds if len(observations) > 0 else 0):
         observations, views = every
         over_time = assigning.over_time
-        around = near_in_time(asked[:, None], frame_s, _SMOOTHED_S)[:, 0]
-        near = np.flatnonzero(
-            np.isin(observations.frame, [each.frame for each in compress(frames, around)])
-        )
+        near = near_in_time(asked[:, None], frame_s, _SMOOTHED_S)[:, 0]
+        near = np.isin(observations.frame, [f.frame for f in compress(frames, near)])
         here, seen_by = observations.rows(near), views.rows(near)
         if over_time:
             worth = worth_a_draft(here)

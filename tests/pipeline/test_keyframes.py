@@ -9,12 +9,13 @@ import pytest
 
 from factors import CONSTANT_VELOCITY
 from shapepose_fg.body.model.rotation import exp_so3, log_so3
-from shapepose_fg.core.frame_times import FrameTimes, spaced
+from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.reconstruction import Known, Reconstruction, Status
 from shapepose_fg.estimation.motion_densities import MotionModel
 from shapepose_fg.evaluation.metrics import covariance_calibration, joint_metrics, match_people
 from shapepose_fg.pipeline.keyframes import (
     keyframes,
+    spaced,
     strays_m,
     with_bodies_between,
     with_rows_between,
