@@ -5,9 +5,6 @@ detections.
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import compress
-
-import numpy as np
 
 from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.core.camera import Views
@@ -19,19 +16,15 @@ from shapepose_fg.estimation.asynchronous_views import widened
 from shapepose_fg.estimation.body_solution import solve_bodies
 from shapepose_fg.estimation.draft import Draft, draft, worth_a_draft
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
-from shapepose_fg.estimation.in_time import near_in_time
 from shapepose_fg.estimation.motion_densities import MotionModel
 from shapepose_fg.estimation.smoothing import smoothed
 from shapepose_fg.estimation.user_factors import ExtraFactors, functions_of
 from shapepose_fg.estimation.window_solution import WindowSolution
-from shapepose_fg.tracking.reassociation import LEAST_PROBABILITY, reassociate
+from shapepose_fg.tracking.reassociation import LEAST_PROBABILITY, changed, reassociate
 
 _SETTLED = 0.002
 """Share of changed detections below which reassociation ends: in crowds after three or four rounds
 with six cameras, after eight or more with three."""
-_CHANGED_S, _SMOOTHED_S = 0.2, 0.5
-"""Time around a changed detection, s, in which others may change in the next round, and in which
-joints are estimated anew for that."""
 
 
 @dataclass(frozen=True)
@@ -101,39 +94,24 @@ def assigned(
 ) -> tuple[Observations, Views]:
     """The rows with the detections near people's initial joints and bodies, iterated; and their
     views.
-
-    Over time, a further round is for frames near those in which a detection changed.
     """
     drafted: Draft | None = None
-    frames, every = assigning.frames, (observations, views)
-    frame_s = np.array([each.time_s.mean() for each in frames])
-    asked = np.ones(len(frames), dtype=bool)
     for n in range(assigning.rounds if len(observations) > 0 else 0):
-        observations, views = every
-        over_time = assigning.over_time
-        near = near_in_time(asked[:, None], frame_s, _SMOOTHED_S)[:, 0]
-        near = np.isin(observations.frame, [f.frame for f in compress(frames, near)])
-        here, seen_by = observations.rows(near), views.rows(near)
+        before, over_time = observations, assigning.over_time
         if over_time:
-            worth = worth_a_draft(here)
-            drafted = draft(here.rows(worth), seen_by.rows(worth), fitter, config, drafted)
-            times_s, least = here.time_s.mean(axis=1), None
-            places, covariance = smoothed(*drafted.among(here), here.track, times_s, motion)
-            covariance = widened(covariance, here, places, seen_by)
+            asked = worth_a_draft(before)
+            drafted = draft(before.rows(asked), views.rows(asked), fitter, config, drafted)
+            times_s, least = before.time_s.mean(axis=1), None
+            places, covariance = smoothed(*drafted.among(before), before.track, times_s, motion)
+            covariance = widened(covariance, before, places, views)
         else:
-            drafted = draft(here, seen_by, fitter, config, drafted)
+            drafted = draft(before, views, fitter, config, drafted)
             places, covariance = drafted.places, drafted.covariance
             least = n / max(assigning.rounds - 1, 1) * LEAST_PROBABILITY
-        again = list(compress(frames, asked))
-        new = reassociate(again, here, places, covariance, assigning.skeleton, least)
-        kept = ~np.isin(observations.frame, [each.frame for each in again])
-        now = Observations.concatenate([observations.rows(kept), new])
-        every = now, views if views.rows_known is None else views.rows(rows_in(observations, now))
-        if over_time:
-            was = here.rows(rows_in(here, new))
-            other = (was.candidate != new.candidate) & (was.seen | new.seen)
-            if other.sum() < _SETTLED * np.maximum(now.seen.sum(), 1):
-                break
-            marked = np.isin([each.frame for each in frames], new.frame[other.any(axis=(1, 2))])
-            asked = near_in_time(marked[:, None], frame_s, _CHANGED_S)[:, 0]
-    return every
+        observations = reassociate(
+            assigning.frames, before, places, covariance, assigning.skeleton, least
+        )
+        views = views if views.rows_known is None else views.rows(rows_in(before, observations))
+        if over_time and changed(before, observations) < _SETTLED:
+            break
+    return observations, views

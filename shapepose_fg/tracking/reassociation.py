@@ -61,6 +61,14 @@ def reassociate(
     return Observations.concatenate(parts)
 
 
+def changed(before: Observations, now: Observations) -> float:
+    """Share of detection slots, used before or now in the same rows, that hold another detection
+    now.
+    """
+    seen = before.seen | now.seen
+    return float((before.candidate != now.candidate)[seen].sum() / max(seen.sum(), 1))
+
+
 def _given_out(
     frame: Input, joints: Array, sigma_m: Array, skeleton: Skeleton
 ) -> tuple[Index, Array]:

@@ -152,39 +152,6 @@ def test_a_detection_that_is_improbable_loses_its_hold_on_the_draft(fitter):
     assert off[1].mean() < off[0].mean() / 2
 
 
-def test_clear_rows_are_bridged_and_doubtful_ones_are_not():
-    """Two people at 30 Hz; of one, legs are certain in a single view only, for a while."""
-    N, T = 60, 30
-    seen = np.full((N, 25, 4), 0.8)
-    rows = Observations(
-        np.zeros((*seen.shape, 2)),
-        seen,
-        np.zeros((N, 25, 3)),
-        track=np.repeat([3, 5], T),
-        frame=np.tile(np.arange(T), 2),
-        time_s=np.repeat(np.tile(np.arange(T) / 30, 2)[:, None], 4, axis=1),
-    )
-
-    def bridged(rows: Observations) -> np.ndarray:
-        asked = draft.worth_a_draft(rows)
-        for track in (3, 5):
-            there = np.sort(rows.frame[asked][rows.track[asked] == track])
-            assert there[0] == 0 and there[-1] == T - 1
-            assert np.diff(there).max() / 30 <= draft.BRIDGED_S + 1e-6
-        return np.setdiff1d(np.arange(N), asked)
-
-    clear = bridged(rows)
-    assert len(clear) > N / 2
-    doubtful = np.arange(T + 8, T + 20)
-    for column in ("confidence", "probability"):
-        worse = getattr(rows, column).copy()
-        worse[doubtful[:, None, None], np.arange(15, 25)[:, None], [0, 1, 2]] = 0.1
-        worse = replace(rows, **{column: worse})
-        assert set(bridged(worse)) == set(clear) - set(doubtful)
-    order = np.random.default_rng(0).permutation(N)
-    assert set(order[bridged(rows.rows(order))]) == set(clear)
-
-
 I3 = np.eye(3)
 
 
