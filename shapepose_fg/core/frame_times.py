@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from shapepose_fg.core.arrays import Array, Mask
+from shapepose_fg.core.arrays import Array
 
 LEAST_FPS, MOST_FPS = 1e-3, 1e6
 """Lowest and highest accepted frame rate, Hz."""
@@ -174,16 +174,3 @@ def spans_of(frames: Iterable[int]) -> list[range]:
         len(ordered),
     ]
     return [range(ordered[a], ordered[b - 1] + 1) for a, b in pairwise(edges) if b > a]
-
-
-def spaced(time_s: Array, apart_s: float) -> Mask:
-    """(T,) mask for ascending times: first, last, and as few between as leave no gap longer than
-    `apart_s`.
-    """
-    chosen, at, last = np.zeros(len(time_s), dtype=bool), 0, len(time_s) - 1
-    reached = np.searchsorted(time_s, time_s + apart_s + 1e-6, side="right") - 1
-    while at < last:
-        chosen[at] = True
-        at = max(int(reached[at]), at + 1)
-    chosen[last:] = True
-    return chosen

@@ -13,11 +13,6 @@ from shapepose_fg.core.storage.schema import Column, Table
 
 _LATER: Any = None
 """Default of a column that is not given."""
-WEAK_SCORE = 0.3
-"""Score below which a detection is weak: in simulated crowds one in 18 is not the person's, of
-others one in 60."""
-WEAK_PROBABILITY = 0.5
-"""Probability below which a detection is weak."""
 
 
 @dataclass(frozen=True)
@@ -78,11 +73,6 @@ class Observations(Table):
     def seen(self) -> Mask:
         """(N, J, V) whether there is an observation."""
         return self.confidence > 0
-
-    @property
-    def strong(self) -> Mask:
-        """(N, J, V) whether there is an observation that is not weak."""
-        return (self.confidence >= WEAK_SCORE) & (self.probability > WEAK_PROBABILITY)
 
 
 def rows_in(before: Observations, now: Observations) -> Index:

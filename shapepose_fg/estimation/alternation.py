@@ -33,6 +33,7 @@ from shapepose_fg.estimation.window_solution import (
     PersonGraph,
     WindowSolution,
     statuses,
+    strong_detections,
     tied,
 )
 
@@ -137,7 +138,7 @@ def _solution(
         covariance += carried_covariance(final, nothing, sigmas, views, config.observations)
     covariance += mirrored_spread(X, rows.mirrored, config.joints)
     inlier, nowhere = evidence.inlier, np.full(X.shape, np.nan)
-    strong = inlier & rows.strong
+    strong = strong_detections(rows, inlier)
     known = np.where(inlier.any(axis=-1), Known.WEAK, Known.BODY)
     known = np.where(strong.sum(axis=-1) >= 2, Known.SEEN, known)
     known = np.where(np.isfinite(X).all(axis=-1), known, Known.UNKNOWN)

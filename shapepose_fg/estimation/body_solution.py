@@ -46,6 +46,7 @@ from shapepose_fg.estimation.window_solution import (
     PersonGraph,
     WindowSolution,
     statuses,
+    strong_detections,
     tied,
 )
 
@@ -127,7 +128,7 @@ def solve_bodies(
 
     # Uncertainty: unseen joints deviate from their bodies by more, above all those that cameras
     # should see; cameras' poses and sides may be wrong.
-    strong = found.evidence.inlier & observations.strong
+    strong = strong_detections(observations, found.evidence.inlier)
     limbs = limbs_that_hide(config.joints)
     elsewhere = elsewhere_variance(found.joints, observations.frame, strong, views, limbs)
     for person, of_bodies in zip(people, spread, strict=True):

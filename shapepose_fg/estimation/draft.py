@@ -8,8 +8,7 @@ from shapepose_fg.body.fitting.evidence import LEAST_JOINTS
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, FitStatus, JointTargets
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Views
-from shapepose_fg.core.frame_times import spaced
-from shapepose_fg.core.observations import Observations, rows_in, window_rows
+from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.gated_views import (
     ViewEvidence,
@@ -34,11 +33,6 @@ by 1.5 points there, but raised arms sank on real footage."""
 MOVED_M = 0.02
 """Motion of a target, m, above which the body of an initial estimate is fitted again, similar to a
 detector's deviation from the body; or a changed weight. On Shelf a quarter of all fits remain."""
-BRIDGED_S = 0.12
-"""Longest time between two initial estimates of a person, s, over which clear rows are bridged."""
-_CLEAR = 0.8
-"""Share of a row's joints that two views detect strongly at which the row is clear: 99 % of rows
-with six cameras, 81 % of Shelf, 15 % of a crowd before three cameras."""
 
 
 @dataclass(frozen=True)
@@ -55,25 +49,6 @@ class Draft:
     """(N, J, 3) positions, metres; NaN if neither views nor body determine them."""
     covariance: Array
     """(N, J, 3, 3) covariances, m²; NaN like the positions."""
-
-    def among(self, every: Observations) -> tuple[Array, Array]:
-        """Positions and covariances of `every` row; NaN for those without an estimate."""
-        here = rows_in(every, self.observations)
-        found = np.full((len(every), *self.places.shape[1:], 4), np.nan)
-        found[here, ..., 0], found[here, ..., 1:] = self.places, self.covariance
-        return found[..., 0], found[..., 1:]
-
-
-def worth_a_draft(observations: Observations) -> Index:
-    """The rows that need an initial estimate of their own: those that are not clear, and of each
-    person the first, the last, and as few between as leave no gap longer than `BRIDGED_S`. Joints
-    of the others follow by the motion model (`smoothed`).
-    """
-    asked = (observations.strong.sum(axis=2) >= 2).mean(axis=1) < _CLEAR
-    time_s = observations.time_s.mean(axis=1)
-    for mine in window_rows(observations):
-        asked[mine] |= spaced(time_s[mine], BRIDGED_S)
-    return np.flatnonzero(asked)
 
 
 def draft(

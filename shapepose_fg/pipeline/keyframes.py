@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index, Mask, Whole
-from shapepose_fg.core.frame_times import segments, spaced
+from shapepose_fg.core.frame_times import segments
 from shapepose_fg.core.observation_table import Gate
 from shapepose_fg.core.reconstruction import BODY, Known, Reconstruction, Status
 from shapepose_fg.estimation.motion_densities import MotionModel
@@ -20,6 +20,19 @@ from shapepose_fg.estimation.motion_densities import MotionModel
 STRAY_M = 0.03
 """Deviation of a joint from the cubic between keyframes, m, above which a frame between becomes a
 keyframe."""
+
+
+def spaced(time_s: Array, apart_s: float) -> Mask:
+    """(T,) mask for ascending times: first, last, and as few between as leave no gap longer than
+    `apart_s`.
+    """
+    chosen, at, last = np.zeros(len(time_s), dtype=bool), 0, len(time_s) - 1
+    reached = np.searchsorted(time_s, time_s + apart_s + 1e-6, side="right") - 1
+    while at < last:
+        chosen[at] = True
+        at = max(int(reached[at]), at + 1)
+    chosen[last:] = True
+    return chosen
 
 
 def keyframes(time_s: Array, frames: range, cuts: Sequence[int], apart_s: float) -> Mask:

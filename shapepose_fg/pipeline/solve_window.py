@@ -14,7 +14,7 @@ from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.alternation import alternate
 from shapepose_fg.estimation.asynchronous_views import widened
 from shapepose_fg.estimation.body_solution import solve_bodies
-from shapepose_fg.estimation.draft import Draft, draft, worth_a_draft
+from shapepose_fg.estimation.draft import Draft, draft
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.motion_densities import MotionModel
 from shapepose_fg.estimation.smoothing import smoothed
@@ -70,48 +70,34 @@ def solve_window(
     began = time.perf_counter()
     motion = MotionModel.load(config.joints, config.motion, config.law)
 
-    if assigning is not None:
-        observations, views = assigned(observations, views, fitter, config, motion, assigning)
-    seconds = {"associate again": time.perf_counter() - began}
+    # Assignment: detections near people's initial joints and bodies, iterated.
+    drafted: Draft | None = None
+    for n in range(assigning.rounds if assigning is not None and len(observations) > 0 else 0):
+        assert assigning is not None
+        drafted = draft(observations, views, fitter, config, drafted)
+        places, covariance = drafted.places, drafted.covariance
+        if assigning.over_time:
+            times_s = observations.time_s.mean(axis=1)
+            places, covariance = smoothed(places, covariance, observations.track, times_s, motion)
+            covariance = widened(covariance, observations, places, views)
+        least = (
+            None if assigning.over_time else n / max(assigning.rounds - 1, 1) * LEAST_PROBABILITY
+        )
+        before = observations
+        observations = reassociate(
+            assigning.frames, before, places, covariance, assigning.skeleton, least
+        )
+        views = views if views.rows_known is None else views.rows(rows_in(before, observations))
+        if assigning.over_time and changed(before, observations) < _SETTLED:
+            break
+    assigned = time.perf_counter()
 
     functions = functions_of(extra_factors)
     if config.refine.with_body and fitter.model is not None:
         solution = solve_bodies(observations, views, fitter, config, motion, functions)
     else:
         solution = alternate(observations, views, fitter, config, functions)
-    seconds["solve"] = time.perf_counter() - began - seconds["associate again"]
-    solution.seconds.update(seconds)
+    solution.seconds.update(
+        {"associate again": assigned - began, "solve": time.perf_counter() - assigned}
+    )
     return solution
-
-
-def assigned(
-    observations: Observations,
-    views: Views,
-    fitter: BodyFitter,
-    config: EstimatorConfig,
-    motion: MotionModel,
-    assigning: Assigning,
-) -> tuple[Observations, Views]:
-    """The rows with the detections near people's initial joints and bodies, iterated; and their
-    views.
-    """
-    drafted: Draft | None = None
-    for n in range(assigning.rounds if len(observations) > 0 else 0):
-        before, over_time = observations, assigning.over_time
-        if over_time:
-            asked = worth_a_draft(before)
-            drafted = draft(before.rows(asked), views.rows(asked), fitter, config, drafted)
-            times_s, least = before.time_s.mean(axis=1), None
-            places, covariance = smoothed(*drafted.among(before), before.track, times_s, motion)
-            covariance = widened(covariance, before, places, views)
-        else:
-            drafted = draft(before, views, fitter, config, drafted)
-            places, covariance = drafted.places, drafted.covariance
-            least = n / max(assigning.rounds - 1, 1) * LEAST_PROBABILITY
-        observations = reassociate(
-            assigning.frames, before, places, covariance, assigning.skeleton, least
-        )
-        views = views if views.rows_known is None else views.rows(rows_in(before, observations))
-        if over_time and changed(before, observations) < _SETTLED:
-            break
-    return observations, views
