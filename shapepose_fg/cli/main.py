@@ -89,13 +89,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except InputError as error:
         code = _fail(str(error))
     except BrokenPipeError:  # the reader of our output, such as `head`, has ended
-        # Otherwise Python reports at exit that it cannot flush.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _drop_unwritten()
         code = 1
     except (OSError, MemoryError, RuntimeError) as error:
         if (what := failure(error)) is None:
             raise
         is_file = isinstance(error, OSError)
+        _drop_unwritten()
         code = _fail(
             f"{what}; "
             f"{'check the path, permissions and free disk space' if is_file else 'start it again'}"
@@ -124,6 +124,16 @@ def version() -> None:
 
     for name, number in versions().items():
         print(name, number)
+
+
+def _drop_unwritten() -> None:
+    """Drop output that cannot be written; at exit Python would report it, with a code of its
+    own.
+    """
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _fail(message: str) -> int:
