@@ -1,14 +1,16 @@
 """Shelf's annotation: reads the text format of 4D Association, and maps BODY_25 to its joints."""
 
+from contextlib import suppress
 from pathlib import Path
+from typing import Any, NoReturn
 
 import numpy as np
 
 from shapepose_fg.core.arrays import Array
-from shapepose_fg.core.bounds import MOST_NUMBER
+from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.core.storage.files import read_text
 from shapepose_fg.evaluation.metrics import PlainPeople
-from shapepose_fg.io.detections.association_text import NumberStream
 
 SHELF_JOINTS = tuple(
     "RAnkle RKnee RHip LHip LKnee LAnkle RWrist RElbow RShoulder LShoulder LElbow LWrist Neck "
@@ -77,35 +79,56 @@ def read_shelf_ground_truth(path: Path | str) -> PlainPeople:
     person an id and the rows x, y, z and confidence of all joints. InputError that names file and
     line for anything else.
     """
-    numbers, again = NumberStream(Path(path)), "copy the file again"
+    lines = [
+        (place, line.split())
+        for place, line in enumerate(read_text(Path(path)).splitlines(), 1)
+        if line.strip()
+    ]
+    at = 0
 
-    def whole(meaning: str, most: int, count: int = 1) -> list[int]:
-        """The next whole numbers, 0 to `most`."""
-        values = numbers.numbers(numbers.take(count, f"the file ends before {meaning}"))
-        if not ((values == np.rint(values)) & (values >= 0) & (values <= most)).all():
-            got = " ".join(f"{value:g}" for value in values)
-            raise numbers.refuse(numbers.taken - 1, f"must hold {meaning}, got {got}", again)
-        return values.astype(np.int64).tolist()
+    def refuse(complaint: str) -> NoReturn:
+        raise InputError(f"{path}: line {lines[at - 1][0]} {complaint}; copy the file again")
 
-    joints, frames = whole("the number of joints and of frames", 10**7, 2)
-    if joints != len(SHELF_JOINTS):
-        said = f"must say {len(SHELF_JOINTS)} joints, got {joints}"
-        raise numbers.refuse(0, said, again)
+    def take(count: int, meaning: str, kind: type[int] | type[float]) -> list[Any]:
+        """The next line, which must hold `count` finite numbers."""
+        nonlocal at
+        if at == len(lines):
+            end = f"ends after line {lines[at - 1][0]}, before {meaning}"
+            raise InputError(f"{path}: the file {end}; copy the whole file again")
+        at += 1
+        words, values = lines[at - 1][1], list[Any]()
+        if len(words) != count:
+            refuse(f"must hold {meaning}, got {len(words)} values")
+        with suppress(ValueError):
+            values = [kind(word) for word in words]
+        if len(values) == 0 or (kind is float and not np.isfinite(values).all()):
+            refuse(f"must hold {meaning}, all finite numbers, got {' '.join(words)[:40]!r}")
+        return values
+
+    joints, frames = take(2, "the number of joints and of frames", int)
+    if joints != len(SHELF_JOINTS) or not 0 <= frames <= 10**7:
+        refuse(
+            f"must say {len(SHELF_JOINTS)} joints and the number of frames, got {joints} and "
+            f"{frames}"
+        )
     who, rows = list[tuple[int, int]](), list[Array]()
     for frame in range(frames):
-        (people,) = whole(f"the number of people in frame {frame}", 1000)
-        for n in range(people):
-            (person,) = whole(f"a person's id in frame {frame}", MOST_NUMBER)
-            if (frame, person) in who[len(who) - n :]:
-                said = f"the id {person} is twice in frame {frame}"
-                raise numbers.refuse(numbers.taken - 1, said, again)
+        (people,) = take(1, f"the number of people in frame {frame}", int)
+        if not 0 <= people <= 1000:
+            refuse(f"must be the number of people in frame {frame}, got {people}")
+        for _ in range(people):
+            (person,) = take(1, f"a person's id in frame {frame}", int)
+            if (frame, person) in who[-people:] or not 0 <= person < 2**62:
+                refuse(f"gives the id {person} in frame {frame}; ids must be 0 or more and differ")
             who.append((frame, person))
-            ends = f"the file ends within the joints of person {person} in frame {frame}"
-            values = numbers.numbers(numbers.take(4 * joints, ends))
-            rows.append(values.reshape(4, joints)[:3].T)
-    if not numbers.ended:
-        said = f"there are more numbers after the {frames} frames that line 1 promises"
-        raise numbers.refuse(numbers.taken, said, again)
+            meanings = (
+                f"{joints} values of {row} in frame {frame}"
+                for row in ("x", "y", "z", "confidence")
+            )
+            rows.append(np.stack([take(joints, meaning, float) for meaning in meanings], axis=1))
+    if at < len(lines):
+        at += 1
+        refuse(f"goes on after the {frames} frames that line 1 promises")
     frame, person = np.array(who, dtype=np.int64).reshape(-1, 2).T
-    xyz = np.stack(rows) if rows else np.zeros((0, joints, 3))
+    xyz = np.stack(rows)[..., :3] if rows else np.zeros((0, joints, 3))
     return PlainPeople(frame, xyz, person, SHELF_JOINTS, complete=False)

@@ -11,6 +11,7 @@ import pytest
 
 from shapepose_fg.core.detections import Recording
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.storage import files
 from shapepose_fg.core.storage.kept_arrays import InFolder
 from shapepose_fg.io.detection_table import BLOCK_FRAMES
 from shapepose_fg.io.detections import read_detections
@@ -56,7 +57,7 @@ def same(one, other) -> None:
             np.testing.assert_array_equal(found, expected)
 
 
-def test_files_give_the_same_as_memory(text, scene, once, tmp_path):
+def test_pieces_of_any_length_and_files_give_the_same(text, scene, once, tmp_path, monkeypatch):
     whole = read_detections(text, scene.rig)
     assert len(whole) == FRAMES and len(whole[FRAMES - 1]) == 0
     # But for their order and the digits written, frames are those that were written, whichever
@@ -69,6 +70,7 @@ def test_files_give_the_same_as_memory(text, scene, once, tmp_path):
         np.testing.assert_allclose(
             np.sort(whole[frame].affinity), np.sort(given.affinity), atol=1e-6
         )
+    monkeypatch.setattr(files, "PIECE", 777)
     kept = read_detections(text, scene.rig, kept=InFolder(tmp_path / "kept"))
     same(kept, whole)
     assert sorted(file.name for file in (tmp_path / "kept").iterdir()) == [
@@ -152,8 +154,10 @@ def test_a_file_of_all_frames_takes_the_memory_of_its_numbers(tmp_path):
         (0, "4 1", "numbers after the last of the 1 frames"),
     ],
 )
-def test_the_line_of_a_mistake_is_told_wherever_it_is(text, scene, tmp_path, place, word, sentence):
-    """In the last block, which is read when the lines before are forgotten."""
+def test_the_line_of_a_mistake_is_told_wherever_it_is(
+    text, scene, tmp_path, monkeypatch, place, word, sentence
+):
+    """In the last block, whose pieces are read when the lines before are forgotten."""
     detections = tmp_path / "detection"
     detections.mkdir()
     for name in scene.rig.names:
@@ -163,19 +167,25 @@ def test_the_line_of_a_mistake_is_told_wherever_it_is(text, scene, tmp_path, pla
     lines[place] = word
     line = len(lines) + 1 + place
     file.write_text("\n".join(lines) + "\n")
-    with pytest.raises(InputError) as caught:
-        read_detections(tmp_path, scene.rig)
-    said = str(caught.value)
-    assert sentence in said and said.startswith(f"{file}: line ")
+    said = []
+    for piece in (2**20, 501):
+        monkeypatch.setattr(files, "PIECE", piece)
+        with pytest.raises(InputError) as caught:
+            read_detections(tmp_path, scene.rig)
+        said.append(str(caught.value))
+    assert said[0] == said[1] and sentence in said[0] and said[0].startswith(f"{file}: line ")
     if "finite" in sentence:
-        assert f": line {line}: " in said
+        assert f": line {line}: " in said[0]
 
 
-def test_text_is_utf_8_and_may_have_a_mark_and_other_ends_of_lines(text, scene, tmp_path):
+def test_text_is_utf_8_and_may_have_a_mark_and_other_ends_of_lines(
+    text, scene, tmp_path, monkeypatch
+):
     name = scene.rig.names[0]
     content = (text / "detection" / f"{name}.txt").read_bytes()
     for each in scene.rig.names:
         (tmp_path / f"{each}.txt").write_bytes((text / "detection" / f"{each}.txt").read_bytes())
+    monkeypatch.setattr(files, "PIECE", 4096)
     (tmp_path / f"{name}.txt").write_bytes(b"\xef\xbb\xbf" + content.replace(b"\n", b"\r\n"))
     same(read_detections(tmp_path, scene.rig), read_detections(text, scene.rig))
     (tmp_path / f"{name}.txt").write_bytes(content[:100_000] + b"\xff" + content[100_000:])
@@ -184,8 +194,9 @@ def test_text_is_utf_8_and_may_have_a_mark_and_other_ends_of_lines(text, scene, 
 
 
 @pytest.mark.slow
-def test_memory_does_not_grow_with_the_recording(scene, once, tmp_path):
+def test_memory_does_not_grow_with_the_recording(scene, once, tmp_path, monkeypatch):
     """More than twice the frames in as much memory."""
+    monkeypatch.setattr(files, "PIECE", 2**15)  # a tenth of a block
     peaks = []
     for blocks in (2, 5):
         folder = tmp_path / str(blocks)
@@ -217,10 +228,9 @@ def test_numbers_are_read_as_python_reads_them(other, tmp_path):
     file = tmp_path / "numbers.txt"
     file.write_bytes(" \n\t\r\n".join(words).encode())
     stream = NumberStream(file)
-    values = stream.numbers(stream.take(len(words)))
-    assert stream.ended
+    assert stream.reaches(len(words)) and not stream.reaches(len(words) + 1)
     expected = np.array([float(word) for word in words])
-    assert values.tobytes() == expected.tobytes()  # to the last bit, and the sign of zero
+    assert stream.values.tobytes() == expected.tobytes()  # to the last bit, and the sign of zero
 
 
 @pytest.mark.slow

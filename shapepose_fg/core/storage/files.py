@@ -1,5 +1,6 @@
 """Reads files within size limits and with one clear error, and writes them atomically."""
 
+import codecs
 import glob
 import json
 import os
@@ -8,8 +9,7 @@ import stat
 import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from io import BufferedReader, TextIOWrapper
-from itertools import count
+from io import BufferedReader
 from pathlib import Path
 from secrets import token_hex
 from typing import Any, BinaryIO
@@ -20,7 +20,7 @@ SMALL, MIDDLE, BIG, LARGE = 2**20, 2**26, 2**28, 2**32
 """Maximum sizes of files, bytes: settings and small tables; cameras, or detections of one frame;
 times of a recording; detections of a recording."""
 PIECE = SMALL
-"""Number of bytes that are read or written at a time in files that may be larger than memory."""
+"""Number of bytes that are read at a time from files that may be larger than memory."""
 BLOCK_FRAMES = 128
 """Number of frames that are read and stored together."""
 ROWS_AT_ONCE = 4096
@@ -138,28 +138,24 @@ def read_text(path: Path, *, may_be_empty: bool = False, most: int = LARGE) -> s
     return text
 
 
-def text_lines(path: Path) -> Iterator[str]:
-    """Lines of the UTF-8 file at `path`, one after the other; the file may be larger than memory.
-
-    Raises InputError as `read_text` does, and for a line of a million characters.
+def text_pieces(path: Path) -> Iterator[str]:
+    """Text of the UTF-8 file at `path` in pieces of up to `PIECE` bytes. Raises InputError as
+    `read_text` does.
     """
-    empty = True
-    with TextIOWrapper(open_regular(path, most=LARGE), encoding="utf-8-sig") as stream:
-        try:
-            for number in count(1):
-                line = stream.readline(SMALL)
-                if len(line) == SMALL:
-                    raise InputError(
-                        f"{path}: line {number} has a million characters or more; write shorter "
-                        "lines"
-                    )
-                if not line:
-                    break
-                empty = empty and not line.strip()
-                yield line
-        except UnicodeDecodeError:
-            read_text(path)  # its error names the byte
-            raise
+    decoder, at, empty = codecs.getincrementaldecoder("utf-8-sig")(), 0, True
+    with open_regular(path, most=LARGE) as stream:
+        ended = False
+        while not ended:
+            read = stream.read(PIECE)
+            _check_size(path, at + len(read), LARGE)
+            waiting, ended = len(decoder.getstate()[0]), len(read) == 0
+            try:
+                text = decoder.decode(read, final=ended)
+            except UnicodeDecodeError as error:
+                raise not_text(path, at - waiting + error.start) from None
+            at, empty = at + len(read), empty and not text.strip()
+            if len(text) > 0:
+                yield text
     if empty:
         raise _empty(path)
 

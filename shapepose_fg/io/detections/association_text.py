@@ -6,7 +6,6 @@ is a stream of numbers; docs/detection_files.md gives their order.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import chain, islice
 from pathlib import Path
 
 import numpy as np
@@ -15,13 +14,16 @@ from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Camera
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import BODY_25, COCO_18, Skeleton
-from shapepose_fg.core.storage.files import text_lines
+from shapepose_fg.core.storage.files import SMALL, text_pieces
 from shapepose_fg.core.validation import is_number
 from shapepose_fg.io.detection_table import BLOCK_FRAMES
 from shapepose_fg.io.detections.people import OVERSHOOT
 from shapepose_fg.io.detections.view_streams import ViewCandidates, ViewStream
 from shapepose_fg.proposal.assignment import match_best_first
 
+_SPACE = " \n\t"
+"""Characters at which pieces of text end, so that no number, multi-byte character or line end is
+split."""
 SKELETON_TYPES = (
     "SKEL19",
     "SKEL17",
@@ -78,49 +80,90 @@ TEXT_SKELETONS = {
 """Supported skeletons, by their names in this package."""
 
 
+def _whole_words(path: Path) -> Iterator[str]:
+    """Text of the file at `path` in pieces that end at white space; raises InputError as
+    `files.text_pieces` does.
+    """
+    left = ""
+    for piece in text_pieces(path):
+        left += piece
+        cut = 1 + max(left.rfind(space) for space in _SPACE)
+        if cut == 0 and len(left) > SMALL:
+            cut = len(left)
+        if cut > 0:
+            yield left[:cut]
+            left = left[cut:]
+    if left:
+        yield left
+
+
 class NumberStream:
-    """The numbers of a file in order, in lines of any length."""
+    """The numbers of a file in order; only those since the last `forget` are in memory."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.taken = 0
-        """Number of values that have been taken so far."""
-        self._words = chain.from_iterable(map(str.split, text_lines(path)))
-        self._most = path.stat().st_size // 2 + 1 if path.exists() else 0
-
-    def take(self, count: int, missing: str = "more numbers are expected") -> list[str]:
-        """The next `count` values as text; InputError with the text `missing` if there are fewer.
-
-        A file that is too small for them is not read to its end.
-        """
-        words = list(islice(self._words, count if self.taken + count <= self._most else 0))
-        if len(words) < count:
-            raise self.refuse(None, missing, "copy or write the whole file again")
-        self.taken += count
-        return words
-
-    def numbers(self, words: list[str]) -> Array:
-        """The values of the `words` that were taken last, which must be finite."""
-        try:
-            values = np.array(words, dtype=np.float64)
-        except ValueError:
-            values = np.full(1, np.nan)
-        if not np.isfinite(values).all():
-            bad = next(index for index, word in enumerate(words) if not is_number(word))
-            problem = f"{words[bad][:20]!r} is not a finite number"
-            raise self.refuse(self.taken - len(words) + bad, problem, "write the detections again")
-        return values
+        self.first = 0
+        """Number of values that were dropped from memory."""
+        self.values: Array = np.zeros(0)
+        """The values in memory."""
+        self._pieces = _whole_words(path)
+        self._most = path.stat().st_size // 2 + 1
 
     @property
-    def ended(self) -> bool:
-        """Whether there are no further values; to be asked only once."""
-        return next(self._words, None) is None
+    def known(self) -> int:
+        """Number of values that have been read so far."""
+        return self.first + len(self.values)
+
+    def reaches(self, count: int) -> bool:
+        """Whether the file has at least `count` values; they are then in memory."""
+        if count > self._most:  # the file is too small: it need not be read to its end
+            return False
+        parts, known = [self.values], self.known
+        while known < count and (text := next(self._pieces, None)) is not None:
+            parts.append(self._numbers(text, known))
+            known += len(parts[-1])
+        if len(parts) > 1:
+            self.values = np.concatenate(parts)
+        return known >= count
+
+    def forget(self, count: int) -> None:
+        """Drop the first `count` values of the file from memory."""
+        self.values, self.first = self.values[count - self.first :].copy(), count
 
     def refuse(self, index: int | None, problem: str, cure: str) -> InputError:
         """An error about value number `index`; None stands for a value missing at the end."""
-        ends = np.cumsum([len(line.split()) for line in text_lines(self.path)])
-        line = len(ends) if index is None else np.searchsorted(ends, index, side="right") + 1
-        return InputError(f"{self.path}: line {min(line, len(ends))}: {problem}; {cure}")
+        return InputError(f"{self.path}: line {self._line(index)}: {problem}; {cure}")
+
+    def _numbers(self, text: str, first: int) -> Array:
+        """The values of a piece of text, which must be finite; `first` is the number of values
+        before it.
+        """
+        tokens = text.split()
+        try:
+            values = np.array(tokens, dtype=np.float64)
+        except ValueError:
+            values = np.full(1, np.nan)
+        if not np.isfinite(values).all():
+            bad = next(index for index, token in enumerate(tokens) if not is_number(token))
+            problem = f"{tokens[bad][:20]!r} is not a finite number"
+            raise self.refuse(first + bad, problem, "write the detections again")
+        return values
+
+    def _line(self, index: int | None) -> int:
+        """The line, counted from 1, of a value; the last line for None or a value behind the
+        last.
+        """
+        lines, numbers, last = 0, 0, 1
+        for text in _whole_words(self.path):
+            counts = [len(line.split()) for line in text.splitlines()]
+            ends = numbers + np.cumsum(counts)
+            if index is not None and len(ends) > 0 and index < ends[-1]:
+                return lines + int(np.searchsorted(ends, index, side="right")) + 1
+            numbers += sum(counts)
+            last = lines + max(len(counts), 1)
+            # A line that continues in the next piece is not counted as complete.
+            lines += len((text + "|").splitlines()) - 1
+        return last
 
 
 def read_association_text(path: Path, camera: Camera) -> ViewStream:
@@ -140,41 +183,39 @@ def _blocks(
     numbers: NumberStream, kind: TextSkeleton, frame_count: int, camera: Camera
 ) -> Iterator[ViewCandidates]:
     """The candidates in blocks of frames."""
+    position = 2
     for start in range(0, frame_count, BLOCK_FRAMES):
+        numbers.forget(position)
         frames = range(start, min(start + BLOCK_FRAMES, frame_count))
-        words, counts, starts = _layout(numbers, kind, frames, frame_count)
-        view = _candidates(numbers, kind, numbers.numbers(words), counts, starts, start, camera)
+        counts, starts, position = _layout(numbers, kind, frames, frame_count, position)
+        view = _candidates(numbers, kind, counts, starts - numbers.first, start, camera)
         yield with_middles(view, kind.skeleton) if kind.skeleton.middles else view
-    if not numbers.ended:
+    if numbers.reaches(position + 1):
         what = f"there are more numbers after the last of the {frame_count} frames"
         raise numbers.refuse(
-            numbers.taken, what, "correct the number of frames in line 1, or write it again"
+            position, what, "correct the number of frames in line 1, or write it again"
         )
 
 
 def _candidates(
     numbers: NumberStream,
     kind: TextSkeleton,
-    values: Array,
     counts: Index,
     starts: Index,
     start: int,
     camera: Camera,
 ) -> ViewCandidates:
-    """The candidates of the frames from `start` on: the last `values` of the stream, at the indices
-    `starts`.
-    """
-    first = numbers.taken - len(values)
+    """The candidates of the frames from `start` on; `starts` are indices into `numbers.values`."""
     block, within = _expand(counts.ravel())
     frame, joint = np.divmod(block, counts.shape[1])
-    rows = starts[:, :-1].ravel()[block] + within  # rows of x
+    rows, values = starts[:, :-1].ravel()[block] + within, numbers.values  # rows of x
     n = counts[frame, joint]
     fractions, scores = np.column_stack([values[rows], values[rows + n]]), values[rows + 2 * n]
     bad = (scores < 0) | (scores > OVERSHOOT)
     if bad.any():
         index = int(np.argmax(bad))
         raise numbers.refuse(
-            first + int(rows[index] + 2 * n[index]),
+            numbers.first + int(rows[index] + 2 * n[index]),
             f"a candidate's score must lie between 0 and 1, got {scores[index]:g}",
             "write the detections again; scores are the third row of each joint",
         )
@@ -182,7 +223,7 @@ def _candidates(
     if bad.any():
         index = int(np.argmax(bad))
         raise numbers.refuse(
-            first + int(rows[index]),
+            numbers.first + int(rows[index]),
             (
                 f"a candidate is at ({fractions[index, 0]:g}, {fractions[index, 1]:g}) of the "
                 "picture's size"
@@ -196,8 +237,11 @@ def _candidates(
 
 def _header(numbers: NumberStream) -> tuple[TextSkeleton, int]:
     """The skeleton, which must be supported, and the number of frames."""
-    first = "the first line must hold skeleton type and number of frames"
-    number, frame_count = numbers.numbers(numbers.take(2, first))
+    if not numbers.reaches(2):
+        raise numbers.refuse(
+            0, "the first line must hold skeleton type and number of frames", "write both"
+        )
+    number, frame_count = numbers.values[:2]
     kind = next((each for each in TEXT_SKELETONS.values() if each.number == number), None)
     if kind is None:
         known = f" ({SKELETON_TYPES[int(number)]})" if number in range(len(SKELETON_TYPES)) else ""
@@ -214,42 +258,53 @@ def _header(numbers: NumberStream) -> tuple[TextSkeleton, int]:
 
 
 def _layout(
-    numbers: NumberStream, kind: TextSkeleton, frames: range, frame_count: int
-) -> tuple[list[str], Index, Index]:
-    """The values of some frames as text, the number of candidates of each joint in each frame, and
-    the positions of their values.
+    numbers: NumberStream, kind: TextSkeleton, frames: range, frame_count: int, position: int
+) -> tuple[Index, Index, int]:
+    """The number of candidates of each joint in each frame, and the positions of their values.
 
-    These are `counts` (T, J); and `starts` (T, J + 1), the positions of the first x of each joint
-    and, in the last column, of the first affinity of the frame.
+    Returns `counts` (T, J); `starts` (T, J + 1), the positions of the first x of each joint and, in
+    the last column, of the first affinity of the frame; and the position of the next frame.
+    `position` is that of the first frame. Each count is known only after the block before it has
+    been skipped, hence a loop over blocks; within blocks the work is vectorised.
     """
-    words, counts, starts = list[str](), list[list[int]](), list[list[int]]()
+
+    def reach(count: int, what: str) -> None:
+        if not numbers.reaches(count):
+            problem = f"the file ends in frame {frame} of {frame_count}, where {what} should be"
+            raise numbers.refuse(None, problem, "copy or write the whole file again")
+
+    known, counts, starts = numbers.known, [], []
     for frame in frames:
-        ends = f"the file ends in frame {frame} of {frame_count}, where"
-        counts.append([])
-        starts.append([])
+        frame_counts, frame_starts = [], []
         for name in kind.joints:
-            told = numbers.take(1, f"{ends} the number of candidates of {name} should be")
-            n = float(told[0]) if is_number(told[0]) else numbers.numbers(told)[0]
+            if position >= known:
+                reach(position + 1, f"the number of candidates of {name}")
+                known = numbers.known
+            n = numbers.values[position - numbers.first]
             if n < 0 or n != int(n):
                 raise numbers.refuse(
-                    numbers.taken - 1,
+                    position,
                     f"frame {frame} must give the number of candidates of {name}, got {n:g}",
                     (
                         "there is a number too few or too many before this line; write the "
                         "detections again"
                     ),
                 )
-            counts[-1].append(int(n))
-            starts[-1].append(len(words) + 1)
-            words += told
-            if n > 0:
-                words += numbers.take(3 * int(n), f"{ends} the candidates of {name} should be")
-        starts[-1].append(len(words))
+            frame_counts.append(int(n))
+            frame_starts.append(position + 1)
+            position += 1 + 3 * int(n)
+            if position > known:
+                reach(position, f"the candidates of {name}")
+                known = numbers.known
+        frame_starts.append(position)
         for first, second in kind.limbs:
-            if count := counts[-1][first] * counts[-1][second]:
-                between = f"{kind.joints[first]}-{kind.joints[second]}"
-                words += numbers.take(count, f"{ends} the affinities of {between} should be")
-    return words, np.array(counts, dtype=np.intp), np.array(starts, dtype=np.intp)
+            position += frame_counts[first] * frame_counts[second]
+            if position > known:
+                reach(position, f"the affinities of {kind.joints[first]}-{kind.joints[second]}")
+                known = numbers.known
+        counts.append(frame_counts)
+        starts.append(frame_starts)
+    return np.array(counts, dtype=np.intp), np.array(starts, dtype=np.intp), position
 
 
 def _pairs(values: Array, kind: TextSkeleton, counts: Index, starts: Index) -> tuple[Index, Array]:

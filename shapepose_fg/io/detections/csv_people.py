@@ -12,7 +12,7 @@ import numpy as np
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import SKELETONS
-from shapepose_fg.core.storage.files import ROWS_AT_ONCE, open_regular, text_lines
+from shapepose_fg.core.storage.files import ROWS_AT_ONCE, open_regular, text_pieces
 from shapepose_fg.core.validation import is_number
 from shapepose_fg.io.camera_names import MOST_FRAME, last_number, match_names
 from shapepose_fg.io.detections.people import CameraPeople, PeopleBlock
@@ -186,7 +186,18 @@ def _port(path: Path, camera: int, cameras: Sequence[str], ports: list[int]) -> 
 
 def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
     """Non-empty lines and their numbers; InputError for a line that is too long or invalid CSV."""
-    reader = csv.reader(text_lines(path))
+
+    def lines() -> Iterator[str]:
+        rest = ""
+        for piece in text_pieces(path):
+            *whole, rest = (rest + piece).split("\n")
+            yield from (f"{line}\n" for line in whole)
+            if len(rest) > 2**20:
+                raise InputError(f"{path}: a line has more than a million characters; {_RERUN}")
+        if rest:
+            yield rest
+
+    reader = csv.reader(lines())
     try:
         for row in reader:
             if len(row) > 10_000:
