@@ -86,7 +86,7 @@ def test_the_command_finds_poses_and_times_from_people_alone(
     base = ["calibrate", "--calibration", "lenses.json", "--detections", "detection", "--fps", "25"]
     for more, code, said in (
         (
-            ["--times", "times.csv", "--most", "8", "--report", "page.html"],
+            ["--times", "times.csv", "--most", "6", "--report", "page.html"],
             0,
             "--timestamps times.csv",
         ),
@@ -126,7 +126,7 @@ def test_the_command_finds_the_start_of_a_camera_with_a_log(
     log = Trajectory("cam2", time_s, np.tile(oTc, (300, 1, 1)))
     write_trajectory(log, Path("log.tum"))
     base = ["calibrate", "--calibration", "lenses.json", "--detections", "detection", "--fps", "25"]
-    base += ["--times", "times.csv", "--most", "8", "--trajectory", "cam2=log.tum"]
+    base += ["--times", "times.csv", "--most", "6", "--trajectory", "cam2=log.tum"]
 
     def run(*more: str) -> tuple[int, str]:
         with pytest.raises(SystemExit) as ended:
