@@ -45,9 +45,9 @@ class Curve:
     name: str
     """Name of the angle."""
     low: float
-    """Angle at the bottom of the box, degrees."""
+    """Smallest angle of both sides, degrees."""
     high: float
-    """Angle at the top of the box, degrees."""
+    """Largest angle of both sides, degrees."""
     lines: tuple[str, ...]
     """Path of the right side, and of the left one."""
     bands: tuple[str, ...]
@@ -58,11 +58,12 @@ class Curve:
         """Draw `name` of rows in the increasing frames `frame` (N,)."""
         places = [NAMES.index(f"{side}_{name}") for side in ("right", "left")]
         middle, spread = angles.degrees[:, places], 2 * np.nan_to_num(angles.sigma[:, places])
-        low, high = np.floor(np.nanmin(middle)) - 5, np.ceil(np.nanmax(middle)) + 5
+        margin = max(5.0, float(np.median(spread)))  # single uncertain frames are cut off
+        low, high = float(np.nanmin(middle)), float(np.nanmax(middle))
         x = 200 * (frame - frame[0]) / max(float(np.ptp(frame)), 1)
 
         def path(values: Array, x: Array) -> str:
-            y = (60 * (high - values) / (high - low)).clip(0, 60)
+            y = (60 * (high + margin - values) / (high - low + 2 * margin)).clip(0, 60)
             pairs = zip(x.tolist(), y.tolist(), strict=True)
             return "M" + "L".join(f"{a:.1f} {b:.1f}" for a, b in pairs if b == b)
 
