@@ -9,7 +9,7 @@ from itertools import chain, repeat
 import gtsam
 import numpy as np
 
-from factors import body_keys, jacobian_factor, shape_key
+from factors import body_keys, shape_key
 from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.estimation.body_window import HELD, BodyState, BodyWindow
 
@@ -24,20 +24,26 @@ def gtsam_step(window: BodyWindow, state: BodyState) -> tuple[Array, Array]:
     shapes = [shape_key(n) for n in range(len(betas))]
     graph = gtsam.GaussianFactorGraph()
     H, pull = frame_systems(window, state)
-    H[:, 10:, 10:] += HELD * np.eye(N)
+    pull[:, 10:] -= window.last.pull
+    at = np.arange(10, 10 + N)
+    H[:, at, at] += HELD
+    motion = list[gtsam.HessianFactor]()
+    if window.links is not None:
+        H[:, at, at] += window.links.diagonal[:T]
+        none, still = np.zeros((N, N)), np.zeros(N)
+        for k in range(1, min(T, 1 + window.links.beyond.shape[-1])):
+            couplings = map(np.diag, window.links.beyond[: T - k, :, k - 1])
+            motion += map(
+                gtsam.HessianFactor, keys[:-k].tolist(), keys[k:].tolist(), repeat(none),
+                couplings, repeat(still), repeat(none), repeat(still), repeat(0.0),
+            )  # fmt: skip
     frames = map(
         gtsam.HessianFactor, keys.tolist(), shapes * (T // len(shapes)), H[:, 10:, 10:],
         H[:, 10:, :10],
         pull[:, 10:], H[:, :10, :10], pull[:, :10], repeat(0.0),
     )  # fmt: skip
-    unit = gtsam.noiseModel.Unit.Create
-    priors = map(gtsam.JacobianFactor, shapes, repeat(np.eye(10)), -betas, repeat(unit(10)))
-    motion = list[gtsam.JacobianFactor]()
-    if window.links is not None:
-        for matrices, residual in window.links.linear(state.root, state.others):
-            for t, right in enumerate(-residual):
-                terms = [(int(keys[t + k]), each[t]) for k, each in enumerate(matrices)]
-                motion.append(jacobian_factor(terms, right, unit(N)))
+    unit = gtsam.noiseModel.Unit.Create(10)
+    priors = map(gtsam.JacobianFactor, shapes, repeat(np.eye(10)), -betas, repeat(unit))
     deque(map(graph.push_back, chain(frames, priors, motion)), maxlen=0)
     try:
         found = graph.optimize(gtsam.Ordering([*keys.tolist(), *shapes]))

@@ -87,17 +87,18 @@ def draft(
         fitted.put(new, first)
         body.put(new[placed], begun.rows(placed))
     for reach_m in NARROWING_M:
-        around = np.where(body.ok[:, None, None], body.joints, X)
-        evidence = linearise(observations, sigmas, around, views, config.observations, reach_m)
-        targets = joint_targets(evidence, enough)
-        rows = changed_targets(fitted, targets, MOVED_M, 2.0)
-        rows = rows[(reach_m == NARROWING_M[-1]) | ~near[rows]]
-        if len(rows) == 0:
+        asked = np.arange(N) if reach_m == NARROWING_M[-1] else new
+        given, seen_by, around = observations.rows(asked), views.rows(asked), body.rows(asked)
+        around = np.where(around.ok[:, None, None], around.joints, X[asked])
+        evidence = linearise(given, sigmas[asked], around, seen_by, config.observations, reach_m)
+        targets = joint_targets(evidence, enough[asked])
+        moved = changed_targets(fitted.rows(asked), targets, MOVED_M, 2.0)
+        if len(moved) == 0:
             continue
-        again = fitter.fit(targets.rows(rows))
-        fitted.put(rows, targets.rows(rows))
+        again = fitter.fit(targets.rows(moved))
+        fitted.put(asked[moved], targets.rows(moved))
         placed = np.flatnonzero(again.ok)
-        body.put(rows[placed], again.rows(placed))
+        body.put(asked[moved[placed]], again.rows(placed))
     places, covariance = drafted(evidence, body)
     return Draft(observations, body, fitted, places, covariance)
 

@@ -5,6 +5,9 @@ detections.
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import compress
+
+import numpy as np
 
 from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.core.camera import Views
@@ -16,6 +19,7 @@ from shapepose_fg.estimation.asynchronous_views import widened
 from shapepose_fg.estimation.body_solution import solve_bodies
 from shapepose_fg.estimation.draft import Draft, draft
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
+from shapepose_fg.estimation.in_time import near_in_time
 from shapepose_fg.estimation.motion_densities import MotionModel
 from shapepose_fg.estimation.smoothing import smoothed
 from shapepose_fg.estimation.user_factors import ExtraFactors, functions_of
@@ -25,6 +29,9 @@ from shapepose_fg.tracking.reassociation import LEAST_PROBABILITY, changed, reas
 _SETTLED = 0.002
 """Share of changed detections below which reassociation ends: in crowds after three or four rounds
 with six cameras, after eight or more with three."""
+_CHANGED_S, _SMOOTHED_S = 0.2, 0.5
+"""Time around a changed detection, s, in which others may change in the next round, and in which
+joints are estimated anew for that."""
 
 
 @dataclass(frozen=True)
@@ -70,26 +77,8 @@ def solve_window(
     began = time.perf_counter()
     motion = MotionModel.load(config.joints, config.motion, config.law)
 
-    # Assignment: detections near people's initial joints and bodies, iterated.
-    drafted: Draft | None = None
-    for n in range(assigning.rounds if assigning is not None and len(observations) > 0 else 0):
-        assert assigning is not None
-        drafted = draft(observations, views, fitter, config, drafted)
-        places, covariance = drafted.places, drafted.covariance
-        if assigning.over_time:
-            times_s = observations.time_s.mean(axis=1)
-            places, covariance = smoothed(places, covariance, observations.track, times_s, motion)
-            covariance = widened(covariance, observations, places, views)
-        least = (
-            None if assigning.over_time else n / max(assigning.rounds - 1, 1) * LEAST_PROBABILITY
-        )
-        before = observations
-        observations = reassociate(
-            assigning.frames, before, places, covariance, assigning.skeleton, least
-        )
-        views = views if views.rows_known is None else views.rows(rows_in(before, observations))
-        if assigning.over_time and changed(before, observations) < _SETTLED:
-            break
+    if assigning is not None and len(observations) > 0:
+        observations, views = _assigned(observations, views, fitter, config, assigning, motion)
     assigned = time.perf_counter()
 
     functions = functions_of(extra_factors)
@@ -101,3 +90,48 @@ def solve_window(
         {"associate again": assigned - began, "solve": time.perf_counter() - assigned}
     )
     return solution
+
+
+def _assigned(
+    observations: Observations,
+    views: Views,
+    fitter: BodyFitter,
+    config: EstimatorConfig,
+    assigning: Assigning,
+    motion: MotionModel,
+) -> tuple[Observations, Views]:
+    """The rows with the detections near people's initial joints and bodies, iterated; and their
+    views.
+
+    Over time, a further round is for frames near those in which a detection changed.
+    """
+    drafted: Draft | None = None
+    frames = assigning.frames
+    frame_s = np.array([each.time_s.mean() for each in frames])
+    asked = np.ones(len(frames), dtype=bool)
+    for n in range(assigning.rounds):
+        around = near_in_time(asked[:, None], frame_s, _SMOOTHED_S)[:, 0]
+        here = [each.frame for each in compress(frames, around)]
+        near = np.flatnonzero(np.isin(observations.frame, here))
+        before, seen_by = observations.rows(near), views.rows(near)
+        drafted = draft(before, seen_by, fitter, config, drafted)
+        places, covariance = drafted.places, drafted.covariance
+        least = n / max(assigning.rounds - 1, 1) * LEAST_PROBABILITY
+        if assigning.over_time:
+            times_s, least = before.time_s.mean(axis=1), None
+            places, covariance = smoothed(places, covariance, before.track, times_s, motion)
+            covariance = widened(covariance, before, places, seen_by)
+        again = list(compress(frames, asked))
+        now = reassociate(again, before, places, covariance, assigning.skeleton, least)
+        kept = observations.rows(~np.isin(observations.frame, [each.frame for each in again]))
+        new = Observations.concatenate([kept, now])
+        new = new.rows(np.argsort(new.frame, kind="stable"))
+        views = views if views.rows_known is None else views.rows(rows_in(observations, new))
+        observations = new
+        if assigning.over_time:
+            other = changed(before.rows(rows_in(before, now)), now)
+            if other.sum() < _SETTLED * new.seen.sum():
+                break
+            marked = np.isin([each.frame for each in frames], now.frame[other.any(axis=(1, 2))])
+            asked = near_in_time(marked[:, None], frame_s, _CHANGED_S)[:, 0]
+    return observations, views

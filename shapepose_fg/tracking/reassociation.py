@@ -61,12 +61,11 @@ def reassociate(
     return Observations.concatenate(parts)
 
 
-def changed(before: Observations, now: Observations) -> float:
-    """Share of detection slots, used before or now in the same rows, that hold another detection
+def changed(before: Observations, now: Observations) -> Mask:
+    """(N, J, V) detection slots, used before or now in the same rows, that hold another detection
     now.
     """
-    seen = before.seen | now.seen
-    return float((before.candidate != now.candidate)[seen].sum() / max(seen.sum(), 1))
+    return np.asarray((before.candidate != now.candidate) & (before.seen | now.seen))
 
 
 def _given_out(
