@@ -20,7 +20,8 @@ from shapepose_fg.calibration.people import People
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.decompositions import nearest_rotation
-from shapepose_fg.estimation.trajectory_graph import ANYWHERE_M, optimised
+from shapepose_fg.core.scales import ANYWHERE_M
+from shapepose_fg.estimation.trajectory_graph import optimised
 from shapepose_fg.setup_check import fit
 
 LENS = [9, 10, 11, 12]

@@ -9,9 +9,10 @@ import numpy as np
 
 from shapepose_fg.body.model.rotation import hat
 from shapepose_fg.calibration.relative import Together
-from shapepose_fg.calibration.tracks import FAST_S, Tracks, block_frames, fast_part
+from shapepose_fg.calibration.tracks import Tracks, block_frames, fast_part
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Views
+from shapepose_fg.core.scales import LASTS_S
 from shapepose_fg.setup_check.matching import centres_of
 from shapepose_fg.setup_check.offset_scan import normals
 
@@ -81,7 +82,7 @@ class Pairwise:
                 pace = max(float(np.median(np.diff(self.tracks[a].frame[rows]))), 1.0)
                 who = self.tracks[a].track[rows] * len(self.tracks[b].first) + track
                 miss, change = (
-                    fast_part(each, known, who, FAST_S * self.fps / pace)
+                    fast_part(each, known, who, LASTS_S * self.fps / pace)
                     for each in (np.clip(miss, -width, width), change)
                 )
                 width = 3.8 * np.median(np.abs(miss[known]))

@@ -18,15 +18,14 @@ from shapepose_fg.core.camera import Camera, Rig, Views
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import FrameTimes
+from shapepose_fg.core.scales import SURE
 from shapepose_fg.estimation.trajectory_graph import correlated
 from shapepose_fg.setup_check.diagnosis import build_of, put_right
 from shapepose_fg.setup_check.evidence import gather
-from shapepose_fg.setup_check.findings import SURE, Finding, Kind
-from shapepose_fg.setup_check.fit import CENTRE, FOCAL, MOVE, TURN, Q, difference
+from shapepose_fg.setup_check.findings import Finding, Kind
+from shapepose_fg.setup_check.fit import CENTRE, FOCAL, MOVE, ROUNDS, TURN, Q, difference
 from shapepose_fg.setup_check.small_errors import Problem
 
-_ROUNDS = 4
-"""Maximum number of rounds, each with people associated by the cameras of the round before."""
 _STILL_DEG = 0.03
 """Rotation per round below which cameras have converged, degrees."""
 FILM = (
@@ -177,11 +176,11 @@ def refine(
     fit = partial(
         settle,
         now=start,
-        rounds=_ROUNDS,
+        rounds=ROUNDS,
         given=start,
         times=times,
         freedom=freedom,
-        told=Steps(progress, 3 * _ROUNDS),
+        told=Steps(progress, 3 * ROUNDS),
         reference=reference,
     )
     found = fit(footage)

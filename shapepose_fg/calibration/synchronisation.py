@@ -24,7 +24,7 @@ from shapepose_fg.setup_check.offset_scan import LEAST_MISS, scan
 
 _STEP_S = 0.1
 """Step of the first scan of offsets, s: people's joints move by 10 cm."""
-_LEAST_S = 3.0
+LEAST_S = 3.0
 """Minimum common duration of two cameras, s; a third of the recording if that is less."""
 _AROUND_S = 0.6
 """Distance below which two offsets are the same, s."""
@@ -58,8 +58,6 @@ class Synchronised:
     drift: Array
     """(V,) drift, seconds per second that the camera falls behind; 0 in recordings of under four
     minutes."""
-    drift_sigma: Array
-    """(V,) standard deviation of the drift."""
     middle_s: float
     """Time for which the offset is stated, on the camera's own clock, s."""
 
@@ -119,13 +117,11 @@ def synchronise(
     offset, sigma, sure = offsets(seen, rig, fps, first, most_s, np.zeros(len(rig)), progress)
     middle, none = (first.start + first.stop) / 2 / fps, np.zeros(len(rig))
     if len(first) == len(frames):
-        return Synchronised(offset, sigma, sure, none, none, middle)
+        return Synchronised(offset, sigma, sure, none, middle)
     seen = at_regular_times(Sightings.of(detections, frames[-end:]), time_s, fps)
-    later, later_sigma, _ = offsets(seen, rig, fps, frames[-end:], _DRIFT_S, offset, progress)
+    later, *_ = offsets(seen, rig, fps, frames[-end:], _DRIFT_S, offset, progress)
     lasts = (frames.stop - end / 2) / fps - middle
-    return Synchronised(
-        offset, sigma, sure, (later - offset) / lasts, np.hypot(sigma, later_sigma) / lasts, middle
-    )
+    return Synchronised(offset, sigma, sure, (later - offset) / lasts, middle)
 
 
 def offsets(
@@ -153,7 +149,7 @@ def offsets(
             )
     pairs = list(combinations(range(len(rig)), 2))
     step = max(1, round(_STEP_S * fps))
-    common = min(_LEAST_S * fps, len(frames) / 3)
+    common = min(LEAST_S * fps, len(frames) / 3)
     most = min(round(most_s * fps), int(len(frames) - common)) // step * step
     lags = np.arange(-most, most + 1, step)
     curves = {}

@@ -8,12 +8,10 @@ onnx.proto, before the bytes are passed to a library.
 from pathlib import Path
 
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.storage.files import read_bytes
+from shapepose_fg.core.storage.files import MOST_DEPTH, read_bytes
 
 MOST_BYTES = 2**29
 """Largest file, bytes; networks of people's joints have 2 to 400 MB."""
-_MOST_DEPTH = 100
-"""Maximum depth of nested messages; protobuf's own limit."""
 _MOST_FIELDS = 2**20
 """Maximum number of fields of the visited messages; networks have ten thousand to a hundred
 thousand."""
@@ -72,8 +70,8 @@ def _is_whole(content: memoryview) -> bool:
     waiting, fields = [("model", 0, len(content), 0)], 0
     while len(waiting) > 0:
         message, at, end, depth = waiting.pop()
-        if depth > _MOST_DEPTH:
-            raise _Broken(f"its graphs are over {_MOST_DEPTH} messages deep")
+        if depth > MOST_DEPTH:
+            raise _Broken(f"its graphs are over {MOST_DEPTH} messages deep")
         inner = _MESSAGES[message]
         while at < end:
             fields += 1

@@ -9,13 +9,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.body.fitting.evidence import LEAST_JOINTS
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, FitStatus, JointTargets
 from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.notes import Problem
 from shapepose_fg.core.observations import Observations, window_rows
 from shapepose_fg.core.reconstruction import Known
+from shapepose_fg.core.scales import LEAST_JOINTS, RECENT_S
 from shapepose_fg.estimation.body_frames import BodyFrames
 from shapepose_fg.estimation.body_window import BodyWindow, Marginals
 from shapepose_fg.estimation.camera_pose_uncertainty import carried_covariance
@@ -53,8 +53,6 @@ from shapepose_fg.estimation.window_solution import (
 GATE_M = 0.1
 """rho_2D of Eq. 2 in windows, as a length at the joint's depth, at the initial estimate and in
 every round; more for detectors with larger errors."""
-RECENT_S = 0.25
-"""Time since a view last detected a joint, s, within which its motion determines it."""
 
 
 def solve_bodies(

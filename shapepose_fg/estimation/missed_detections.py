@@ -6,10 +6,8 @@ import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.core.camera import Views, beside_segment
+from shapepose_fg.core.scales import LEAST_VIEWS
 
-LEAST_VIEWS = 3
-"""Minimum number of views with the joint in plain view but no detection; fewer often miss it by
-chance."""
 MISSED = 0.2
 """Share of joints in plain view with a missing or weak detection, in simulated crowds. One, two,
 three, four views miss 0.18, 0.046, 0.010 and 0.003 of them simultaneously, as if independent."""

@@ -22,14 +22,11 @@ from shapepose_fg.body.shapes import SubjectShapes, recognise
 from shapepose_fg.core.arrays import Array, Index, Whole
 from shapepose_fg.core.reconstruction import BODY, Reconstruction
 from shapepose_fg.core.rows import Rows
+from shapepose_fg.core.scales import BATCH, ROUNDS
 from shapepose_fg.estimation.floor import LOOK_S, Floor
 
-_BATCH = 64
-"""Rows per batch: their Hessians fit into the cache."""
 _NOT_ROBUST = 1e9
 """Width of the robust kernel, standard deviations, at which it has no effect."""
-_STEPS = 2
-"""Gauss-Newton steps from a window's body to one with another shape."""
 
 
 @dataclass(frozen=True)
@@ -163,7 +160,7 @@ def with_shape(
         targets = EnergyTargets(xyz, alike)
         held = Held(betas[some], np.full(len(some), SETTLED), free[:, 13:-3])
         free[:, :10] = betas[some]
-        for _ in range(_STEPS):
+        for _ in range(ROUNDS):
             body = energy.evaluate(free, targets, _NOT_ROBUST, held, nothing(len(some)))
             free = energy.retract(free, body.step)
         made = replace(energy.complete(free), betas=betas[some])
@@ -180,8 +177,8 @@ def _batches(rows: WindowBodies, energy: BodyEnergy) -> Iterator[tuple[Index, Wi
     bodies relative to their translations.
     """
     ok = np.flatnonzero(np.isfinite(rows.betas).all(axis=1))
-    for at in range(0, len(ok), _BATCH):
-        mine = rows.rows(some := ok[at : at + _BATCH])
+    for at in range(0, len(ok), BATCH):
+        mine = rows.rows(some := ok[at : at + BATCH])
         yield some, mine, energy.parameters(mine.body, mine.transl)
 
 

@@ -11,6 +11,7 @@ from shapepose_fg.core.compiled import kernel, part
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.kernel_geometry import solved
 from shapepose_fg.core.rows import Rows
+from shapepose_fg.core.scales import DETECTOR_M, ROUNDS
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.proposal.nearby import FrameArrays, nearby
 
@@ -20,11 +21,6 @@ _FAR_M = 0.15
 """Maximum distance of a joint from the ray of its detection, m."""
 _SURE_AFFINITY = 0.5
 """Minimum mean affinity of a detection for a joint without a position."""
-DETECTOR_M = 0.03
-"""Measured error of a detector, m: the scale of the Cauchy kernel for triangulation, of the
-distances of rays from joints, and of the errors of bone lengths."""
-_ROUNDS = 2
-"""Number of reweighted triangulations of a joint."""
 _STRETCH = (1.0, 0.9, 0.8)
 """Maximum distance over one, two and three bones, as a share of their summed maximum lengths."""
 
@@ -172,7 +168,7 @@ def _triangulate(chosen, rays, confidence, centres, weight, places, gap_m):
             for v in range(views):
                 weight[v] = confidence[chosen[h, j, v]] if chosen[h, j, v] >= 0 else 0.0
                 seen += chosen[h, j, v] >= 0
-            for _ in range(_ROUNDS if seen >= 2 else 0):
+            for _ in range(ROUNDS if seen >= 2 else 0):
                 _nearest(chosen[h, j], rays, weight, centres, places[h, j])
                 for v in range(views):
                     d = chosen[h, j, v]

@@ -8,9 +8,10 @@ from itertools import combinations
 import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.core.scales import SURE
 from shapepose_fg.setup_check import fit
 from shapepose_fg.setup_check.evidence import Look
-from shapepose_fg.setup_check.findings import SURE, Finding, Kind, one_of
+from shapepose_fg.setup_check.findings import Finding, Kind, one_of
 from shapepose_fg.setup_check.fit import (
     ERROR,
     FOCAL,

@@ -12,6 +12,7 @@ from annotated_types import Interval
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.bounds import Settings
 from shapepose_fg.core.rows import Rows
+from shapepose_fg.core.scales import WALK_M_S
 from shapepose_fg.core.skeleton import Skeleton
 
 _BONE_SIGMA_M = 0.015
@@ -32,8 +33,6 @@ _PACE_S = 0.2
 _COASTS_S = 0.5
 """Longest extrapolation of a person out of sight, s; as long as a track is followed without
 evidence."""
-_WALK_MPS = 1.5
-"""Growth of the maximum distance with the gap, m/s: people walk at 1.4 m/s."""
 
 
 @dataclass(frozen=True)
@@ -152,7 +151,7 @@ def _pairs(
     gap_s = begin_s[after] - end_s[before]
     moved = ends.velocity[before] * np.minimum(gap_s, _COASTS_S)[:, None]
     apart_m = np.linalg.norm(ends.place[after, 0] - ends.place[before, 1] - moved, axis=-1)
-    reach_m = config.reach_m + _WALK_MPS * gap_s
+    reach_m = config.reach_m + WALK_M_S * gap_s
     may = (gap_s <= config.longest_gap_s) & (apart_m <= reach_m)
     for cut in cuts_s:
         may &= ~((end_s[before] < cut) & (begin_s[after] >= cut))

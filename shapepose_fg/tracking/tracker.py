@@ -20,11 +20,12 @@ from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.rows import Rows
+from shapepose_fg.core.scales import LOST_M
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.gated_views import ObservationConfig
 from shapepose_fg.proposal.nearby import FrameArrays
 from shapepose_fg.tracking.measuring import Trust, measured
-from shapepose_fg.tracking.motion_filter import LOST_M, Bones, JointStates, predicted
+from shapepose_fg.tracking.motion_filter import Bones, JointStates, predicted
 from shapepose_fg.tracking.view_assignment import Predicted, assign
 
 FindPeople = Callable[[Detections, Rig], Observations]
