@@ -26,7 +26,7 @@ from shapepose_fg.calibration.levelling import (
     scale_of,
     sigma_of_scale,
 )
-from shapepose_fg.calibration.people import LEAST_PEOPLE, Footage, missed_px
+from shapepose_fg.calibration.people import Footage, missed_px
 from shapepose_fg.calibration.refinement import FILM, Steps, Undetermined, halves, settle
 from shapepose_fg.calibration.relative import Relative, relative
 from shapepose_fg.calibration.synchronisation import LEAST_S
@@ -38,7 +38,7 @@ from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.scales import OUTLIER_SIGMA
 from shapepose_fg.setup_check.fit import FOCAL, MOVE, TURN
-from shapepose_fg.setup_check.matching import Sightings
+from shapepose_fg.setup_check.matching import MIN_SIGHTINGS, Sightings
 
 _BURST_S, _BURSTS = 10.0, 6
 """Duration of the intervals in which people are tracked, s, and their number, spread over the
@@ -255,14 +255,14 @@ def _judged(
         adjusted, world, apart_deg, apart_m, held, counts, counts / np.maximum(seen, 1), missed
     )
     sigma = np.degrees(adjusted.sigma(TURN))
-    few, vague = counts < LEAST_PEOPLE, sigma > _MOST_SIGMA_DEG
+    few, vague = counts < MIN_SIGHTINGS, sigma > _MOST_SIGMA_DEG
     torn = apart_deg > _MOST_APART_DEG
     kinds = (
         (
             few,
             counts,
             (
-                f"only {{}} people are seen by another camera, too, but at least {LEAST_PEOPLE} "
+                f"only {{}} people are seen by another camera, too, but at least {MIN_SIGHTINGS} "
                 "are needed"
             ),
         ),

@@ -33,7 +33,7 @@ from shapepose_fg.estimation.floor import TILT_RAD
 from shapepose_fg.estimation.gated_views import MIN_DEPTH_M
 from shapepose_fg.estimation.trajectory_graph import correlated
 from shapepose_fg.setup_check.fit import POSE, Q, by_parameters, seen_by
-from shapepose_fg.setup_check.matching import Sightings, follow, median_of
+from shapepose_fg.setup_check.matching import MIN_SIGHTINGS, Sightings, follow, median_of
 
 _STEP_S = 0.2
 """Time between the moments at which people are placed, s."""
@@ -49,9 +49,9 @@ _PEAKS, _TRIED = 3, 60
 """Number of offsets for each pair of tracks, and of all registrations, that are tried."""
 _OTHER_S, _OTHER_DEG = 1.0, 10.0
 """Distances above which two starts are different, s and degrees."""
-_LEAST_SHARE, _LEAST_LEAD, _LEAST_PEOPLE = 0.7, 1.25, 25
-"""Minimum share of the people in view that agree with the start, minimum ratio of their number to
-that of any other start, and minimum number."""
+_LEAST_SHARE, _LEAST_LEAD = 0.7, 1.25
+"""Minimum share of the people in view that agree with the start, and minimum ratio of their number
+to that of any other start."""
 _KNOT_S = 3.0
 """Time between the knots between which an odometry drifts linearly, s."""
 _DRIFTS = np.log(3.0)
@@ -311,7 +311,7 @@ class Filmed:
         def refuse(why: str) -> Undetermined:
             return Undetermined((f"camera {self.camera.name}: {why}; {cure}",))
 
-        if min(len(self.own_s), len(placed.time_s)) < _LEAST_PEOPLE:
+        if min(len(self.own_s), len(placed.time_s)) < MIN_SIGHTINGS:
             raise refuse("too few people are seen by it, or by two other cameras")
         tried = sorted(self._registered(placed, most_s), key=lambda each: -each.agreeing)[:_TRIED]
         tried = [self._judged(each, placed, _NEAR_M[0]) for each in tried]
@@ -322,7 +322,7 @@ class Filmed:
             if rival and all(self._differ(each, other) for other in best):
                 best.append(self._refined(each, placed, most_s, lens, sigma_scale))
         best.sort(key=lambda each: -each.agreeing)
-        if not best or best[0].agreeing < _LEAST_PEOPLE or best[0].share < _LEAST_SHARE:
+        if not best or best[0].agreeing < MIN_SIGHTINGS or best[0].share < _LEAST_SHARE:
             raise refuse("no start of its trajectory agrees with the people of the other cameras")
         first = best[0]
         others = [each.agreeing for each in best[1:] if self._differ(each, first)]
@@ -433,7 +433,7 @@ class Filmed:
         for near_m in _NEAR_M:
             rows, frame, person, away, _ = self._matched(start, placed, near_m)
             used = away < near_m
-            if used.sum() < _LEAST_PEOPLE:
+            if used.sum() < MIN_SIGHTINGS:
                 break
             count = np.ceil((self.own_s[-1] - self.own_s[0]) / _KNOT_S) * (near_m == _NEAR_M[-1])
             knots_s = np.linspace(self.own_s[0], self.own_s[-1], 1 + int(count))

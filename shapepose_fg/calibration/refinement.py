@@ -12,7 +12,7 @@ import numpy as np
 from shapepose_fg.body.model.rotation import exp_so3
 from shapepose_fg.calibration.adjustment import LENS, Adjusted, Freedom, adjust, misfit
 from shapepose_fg.calibration.levelling import apart, grown, scaled
-from shapepose_fg.calibration.people import LEAST_PEOPLE, Footage, People, missed_px
+from shapepose_fg.calibration.people import Footage, People, missed_px
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Camera, Rig, Views
 from shapepose_fg.core.detections import DetectionSequence
@@ -24,6 +24,7 @@ from shapepose_fg.setup_check.diagnosis import build_of, put_right
 from shapepose_fg.setup_check.evidence import gather
 from shapepose_fg.setup_check.findings import Finding, Kind
 from shapepose_fg.setup_check.fit import CENTRE, FOCAL, MOVE, ROUNDS, TURN, Q, difference
+from shapepose_fg.setup_check.matching import MIN_SIGHTINGS
 from shapepose_fg.setup_check.small_errors import Problem
 
 _STILL_DEG = 0.03
@@ -250,11 +251,11 @@ def settle(
     adjusted: Adjusted | None = None
     for step in range(rounds):
         people = footage.people(now)
-        if len(people) < LEAST_PEOPLE or not people.seen.any():
+        if len(people) < MIN_SIGHTINGS or not people.seen.any():
             raise Undetermined(
                 (
                     f"only {len(people)} people are seen by two cameras at once, but at least "
-                    f"{LEAST_PEOPLE} are needed; {FILM}",
+                    f"{MIN_SIGHTINGS} are needed; {FILM}",
                 )
             )
         prior = given if scale is None else given.at_poses(now.wTc)
@@ -307,7 +308,7 @@ def _undetermined(adjusted: Adjusted, freedom: Freedom, counts: Index) -> list[s
     }
     notes = []
     for view, camera in enumerate(adjusted.rig.cameras):
-        if counts[view] < LEAST_PEOPLE:
+        if counts[view] < MIN_SIGHTINGS:
             few = f"shares only {counts[view]} people with other cameras, too few"
             notes.append(f"camera {camera.name}: {few}; it is not changed")
             continue

@@ -47,3 +47,15 @@ STEP = 1e-4
 """Step of numerical derivatives, rad or m."""
 BATCH = 64
 """Number of rows that are processed together: their matrices fit into the cache."""
+LARGEST = 1e6
+"""Largest number in a file, metres, pixels or hertz: beyond it, doubles are too coarse for joints,
+and the file is damaged."""
+LONGEST_NAME = 200
+"""Maximum number of characters of a name in a file."""
+MOST_ITEMS = 2**20
+"""Maximum number of items of a file that are kept in memory together; real ones have fewer."""
+SAMPLES = 2000
+"""Number of samples of bodies from which distances are estimated, to 3 %."""
+SAME_PERSON_M = 0.25
+"""Mean distance of the joints of two people, m, below which they are one: a pelvis is 20 cm
+deep."""

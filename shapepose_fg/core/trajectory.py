@@ -9,6 +9,7 @@ import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.decompositions import is_rotation, rigid
+from shapepose_fg.core.scales import LARGEST
 
 DRIFT = 0.01
 """Default drift of an odometry, per metre: wheel and visual odometry drift by about 1 % of the
@@ -17,8 +18,6 @@ LONGEST_GAP_S = 0.5
 """Longest gap between poses that is interpolated, s: the carrier moves up to 0.7 m at walking
 speed, or turns up to 45 degrees."""
 _MOST_DRIFT = 1.0
-MOST_METRES = 1e6
-"""Maximum coordinate of a position, m; farther away, double precision is too coarse for joints."""
 UNIT_LENGTH = 0.01
 """Largest deviation of the length of a quaternion from 1: files have two or more digits."""
 _START_M, _START_RAD = 0.05, 0.02
@@ -67,8 +66,8 @@ class Trajectory:
             )
         if not (np.isfinite(time_s).all() and np.isfinite(wTb).all()):
             raise refuse("times and poses must be finite")
-        if (most := float(np.abs(wTb[:, :3, 3]).max())) > MOST_METRES:
-            raise refuse(f"poses must be at most {MOST_METRES:g} m away, got {most:.3g}")
+        if (most := float(np.abs(wTb[:, :3, 3]).max())) > LARGEST:
+            raise refuse(f"poses must be at most {LARGEST:g} m away, got {most:.3g}")
         if (np.diff(time_s) <= 0).any():
             raise refuse(
                 "times must increase, but do not at pose "

@@ -8,13 +8,11 @@ onnx.proto, before the bytes are passed to a library.
 from pathlib import Path
 
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.scales import MOST_ITEMS
 from shapepose_fg.core.storage.files import MOST_DEPTH, read_bytes
 
 MOST_BYTES = 2**29
 """Largest file, bytes; networks of people's joints have 2 to 400 MB."""
-_MOST_FIELDS = 2**20
-"""Maximum number of fields of the visited messages; networks have ten thousand to a hundred
-thousand."""
 _FIXED_BYTES = {1: 8, 5: 4}
 """Lengths, bytes, of protobuf's wire types with a fixed length."""
 
@@ -75,8 +73,8 @@ def _is_whole(content: memoryview) -> bool:
         inner = _MESSAGES[message]
         while at < end:
             fields += 1
-            if fields > _MOST_FIELDS:
-                raise _Broken(f"it has over {_MOST_FIELDS} fields")
+            if fields > MOST_ITEMS:
+                raise _Broken(f"it has over {MOST_ITEMS} fields")
             start, (tag, at) = at, _varint(content, at, end)
             field, kind = tag >> 3, tag & 7
             if field == 0 or tag >= 2**32 or at - start > max(1, -(-tag.bit_length() // 7)):

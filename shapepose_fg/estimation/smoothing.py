@@ -6,7 +6,7 @@ import numpy as np
 
 from factors import Motion
 from shapepose_fg.core.arrays import Array, Whole
-from shapepose_fg.core.scales import DETECTOR_M, WALK_M_S
+from shapepose_fg.core.scales import DETECTOR_M, ROUNDS, WALK_M_S
 from shapepose_fg.estimation.in_time import motion_of
 from shapepose_fg.estimation.kernels import solve_chains
 from shapepose_fg.estimation.motion_densities import MotionModel
@@ -14,7 +14,6 @@ from shapepose_fg.estimation.motion_densities import MotionModel
 KERNEL = 6.0
 """Squared distance from the smoothed joint, in variances, at which an initial estimate has half its
 weight."""
-_ROUNDS = 3
 _UNKNOWN = 1e6
 
 
@@ -44,7 +43,7 @@ def smoothed(
     density = motion.density(np.maximum(speed, WALK_M_S), turning=turning).reshape(T - 1, C)
     moving, below = motion_information(motion.law, np.diff(times), density)
     n, weight, mean, of_mean = motion.law.order, information, place, 1.0 / information
-    for _ in range(_ROUNDS):
+    for _ in range(ROUNDS):
         diagonal, right = moving.copy(), np.zeros((3, C, T, n))
         diagonal[..., 0, 0] += weight
         right[..., 0] = np.moveaxis(place * weight[..., None], -1, 0)

@@ -18,10 +18,10 @@ from shapepose_fg.core.joint_names import keypoint_names, layouts_called
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.result_files import PEOPLE
 from shapepose_fg.core.run_summary import covered_frames, has_identities
+from shapepose_fg.core.scales import LARGEST
 from shapepose_fg.core.skeleton import SMPL_24
 from shapepose_fg.core.storage.files import MIDDLE, read_bytes, read_json
 from shapepose_fg.core.storage.npz import NpzFile, read_npz
-from shapepose_fg.core.trajectory import MOST_METRES
 from shapepose_fg.evaluation.metrics import PlainPeople
 from shapepose_fg.evaluation.shelf import SHELF_JOINTS, read_shelf_ground_truth
 from shapepose_fg.io.export.motion_files import OPEN_BODY
@@ -127,7 +127,7 @@ def _table(place: object, rows: list[tuple[int, int, Array]], names: tuple[str, 
     size = np.linalg.norm(box[np.isfinite(box).all(axis=1) & box.any(axis=1)], axis=1)
     median = float(np.median(size)) if len(size) > 0 else 1.0
     largest = np.abs(joints[~np.isnan(joints)]).max(initial=0)
-    if not (_SIZE_M[0] < median < _SIZE_M[1] and largest < MOST_METRES):
+    if not (_SIZE_M[0] < median < _SIZE_M[1] and largest < LARGEST):
         raise InputError(
             f"{place}: joints must be metres, but people are {median:.3g} m large and up to "
             f"{largest:.3g} m from the origin; check the unit"
@@ -215,7 +215,7 @@ def _amass(files: list[Path], turn: Array, fps: float | None, body: Path | None)
             or (betas.ndim, rates.size) != (1, 1)
             or any(each.dtype.kind not in "fiu" for each in (poses, trans, betas, rates))
             or numbers.dtype.kind not in "iu"
-            or not all((np.abs(each) < MOST_METRES).all() for each in (poses, trans, betas))
+            or not all((np.abs(each) < LARGEST).all() for each in (poses, trans, betas))
         ):
             raise InputError(
                 f"{file}: must hold finite poses (F, 66 or more), trans (F, 3) and betas (10 or "

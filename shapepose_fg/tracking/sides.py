@@ -21,13 +21,11 @@ from shapepose_fg.core.detections import Input
 from shapepose_fg.core.scales import BODY_M, LIKELY, LOOK_S, LOST_M, OUTLIER_SIGMA
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.mirrored_sides import DOUBTED
+from shapepose_fg.proposal.nearby import NEAR_M
 from shapepose_fg.proposal.people_2d import group_people
 from shapepose_fg.tracking.motion_filter import JointStates
 from shapepose_fg.tracking.tracker import Tracker, Tracks
 
-_NEAR_M = 0.05
-"""Standard deviation of a detection from a perfectly predicted joint, as a length at
-its depth, m."""
 _FITS = 3.0
 """Maximum mean squared distance, in variances, between a 2D person and its predicted person."""
 _EXCHANGED = 0.02
@@ -69,7 +67,7 @@ class _Compared:
         view, joint = found.view[rows], found.joint[rows]
         xy, depth = rig.project(joints.position)  # (V, A, J, 2), (V, A, J)
         unit_px = (
-            rig.focal_px[:, None, None] / np.maximum(depth, 0.2) * np.hypot(_NEAR_M, joints.sigma_m)
+            rig.focal_px[:, None, None] / np.maximum(depth, 0.2) * np.hypot(NEAR_M, joints.sigma_m)
         )
         # Sums over the joints of each part (G, parts, A), with the sides as they are, or exchanged.
         same, turned = np.zeros((2, len(groups), states.shape[1] + 1, len(ids)))

@@ -10,6 +10,7 @@ from shapepose_fg.core.compiled import kernel
 from shapepose_fg.core.scales import FARTHEST_M, ROUNDS
 from shapepose_fg.proposal.nearby import (
     LEAST_AFFINITY,
+    NEAR_M,
     OVERLAP_M,
     FrameArrays,
     claim,
@@ -17,9 +18,6 @@ from shapepose_fg.proposal.nearby import (
     share,
 )
 
-_NEAR_M = 0.06
-"""Standard deviation of the nearness score around an exact prediction, as a length at the joint's
-depth, m."""
 _FAR_M = 0.12
 """Distance, plus twice the prediction's sigma, up to which a detection is near, m."""
 _REACH_M = 0.8
@@ -171,7 +169,7 @@ def _assign(
         sought[e] = lost[a, j]
         nearness[e] = -np.inf
         if sought[e] or distance_m[e] < gate_m[a, j]:
-            nearness[e] = np.exp(-0.5 * distance_m[e] ** 2 / (_NEAR_M**2 + sigma_m[a, j] ** 2))
+            nearness[e] = np.exp(-0.5 * distance_m[e] ** 2 / (NEAR_M**2 + sigma_m[a, j] ** 2))
     for n in range(1 + ROUNDS):
         for e in range(count if n > 0 else 0):
             a, j, v = person[e], of_joint[detection[e]], arrays.of_view[detection[e]]

@@ -15,9 +15,9 @@ from shapepose_fg.core.errors import naming
 from shapepose_fg.core.notes import Notes
 from shapepose_fg.core.observation_table import ObservationTable
 from shapepose_fg.core.reconstruction import Reconstruction, Status
+from shapepose_fg.core.scales import LARGEST
 from shapepose_fg.core.storage.kept_arrays import ANEW, KeptArrays
 from shapepose_fg.core.storage.schema import Column, columns_of
-from shapepose_fg.core.trajectory import MOST_METRES
 from shapepose_fg.pipeline.runs.chunks import Border
 from shapepose_fg.pipeline.windows import StreamState
 from shapepose_fg.tracking.identities import MOST_FRAMES, FollowState, observed, people_at
@@ -195,16 +195,16 @@ _NUMBERS = partial(Column, dtype=np.int64, most=MOST_NUMBER)
 _ROWS = {
     "track": _NUMBERS("N"),
     "candidate": Column("N J V", np.intp),
-    "initial": Column("N J 3", most=MOST_METRES),
-    "evidence": Column("N", most=MOST_METRES),
+    "initial": Column("N J 3", most=LARGEST),
+    "evidence": Column("N", most=LARGEST),
 }
 """Columns of a row that is not solved yet; the rest comes from the cameras."""
 _FOLLOWED = {"at": _NUMBERS("2"), "state.numbers": _NUMBERS("2"), "state.rows": _NUMBERS("D")}
 _FOLLOWED |= {
     "state.ids": _NUMBERS("A"),
-    "state.mean": Column("A J S", most=MOST_METRES, finite=True),
+    "state.mean": Column("A J S", most=LARGEST, finite=True),
 }
-_FOLLOWED["state.covariance"] = Column("A J S S", most=MOST_METRES**2, finite=True)
+_FOLLOWED["state.covariance"] = Column("A J S S", most=LARGEST**2, finite=True)
 _FOLLOWED |= {f"rows.{name}": column for name, column in _ROWS.items()}
 _FOLLOWED |= {f"border.{name}": column for name, column in columns_of(Border).items()}
 """Columns of `checkpoint_arrays`."""
