@@ -110,9 +110,8 @@ def relative(one: Tracks, other: Tracks, fps: float) -> Relative | None:
     frames = np.intersect1d(one.frame, other.frame)
     if len(frames) == 0:
         return None
-    looks = np.unique(
-        (frames // max(1, round(LEAST_STEP_S * fps))) * max(1, round(LEAST_STEP_S * fps))
-    )
+    every = max(1, round(LEAST_STEP_S * fps))
+    looks = np.unique(frames // every * every)
     looks = looks[np.unique(np.linspace(0, len(looks) - 1, ANCHORS).astype(np.intp))]
     seen = Together(one, other, looks)
     guesses = _guesses(one, other, seen)

@@ -150,11 +150,7 @@ def _alike(a: Border, b: Border) -> float:
         return 1.0 + share if share >= _SAME else 0.0
     apart = np.linalg.norm(a.place[first] - b.place[second], axis=-1)
     apart = apart[np.isfinite(apart)]
-    return (
-        1.0 - float(apart.mean()) / SAME_PERSON_M
-        if len(apart) > 0 and apart.mean() < SAME_PERSON_M
-        else 0.0
-    )
+    return max(0.0, 1.0 - float(apart.mean()) / SAME_PERSON_M) if len(apart) > 0 else 0.0
 
 
 class Identities:
