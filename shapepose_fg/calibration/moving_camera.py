@@ -27,8 +27,9 @@ from shapepose_fg.core.camera import Camera, Rig, Views
 from shapepose_fg.core.decompositions import nearest_rotation, rigid
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.rows import Rows
-from shapepose_fg.core.scales import ANYWHERE_M, MOST_STEPS, STEP, SURE
+from shapepose_fg.core.scales import ANYWHERE_M, MOST_STEPS, STEP, SURE, TINY
 from shapepose_fg.core.trajectory import Trajectory
+from shapepose_fg.estimation.camera_pose_uncertainty import POSES_LAST_S
 from shapepose_fg.estimation.floor import TILT_RAD
 from shapepose_fg.estimation.gated_views import MIN_DEPTH_M
 from shapepose_fg.estimation.trajectory_graph import correlated
@@ -52,8 +53,6 @@ _OTHER_S, _OTHER_DEG = 1.0, 10.0
 _LEAST_SHARE, _LEAST_LEAD = 0.7, 1.25
 """Minimum share of the people in view that agree with the start, and minimum ratio of their number
 to that of any other start."""
-_KNOT_S = 3.0
-"""Time between the knots between which an odometry drifts linearly, s."""
 _DRIFTS = np.log(3.0)
 """Standard deviation of the log of the ratio of an odometry's drift to the stated one."""
 _LEVEL_RAD = np.radians(6.0)
@@ -61,9 +60,8 @@ _LEVEL_RAD = np.radians(6.0)
 _CONVERGED = 0.01
 """The change of all parameters below which
 it has converged, prior standard deviations."""
-_SAMPLES, _LEAST_VARIANCE = 30, 1e-6
-"""Number of frames for which the uncertainty of poses is averaged; step of numerical derivatives;
-and minimum share of a parameter's variance that is an error of its own."""
+_SAMPLES = 30
+"""Number of frames for which the uncertainty of poses is averaged."""
 _RIGID, _LONG_M, _FEWEST = 0.1, 0.25, 3
 """Maximum relative variation of the distance of two joints of a bone, its minimum, m, and minimum
 number of bones that give the distance of a person."""
@@ -150,7 +148,7 @@ def _moved_by(people: People, found: Adjusted) -> Array:
     sigma = np.sqrt(np.maximum(np.diag(square), 0.0))
     scale = np.where(sigma > 0, sigma, 1.0)
     values, vectors = np.linalg.eigh(square / scale / scale[:, None])
-    kept = values > _LEAST_VARIANCE
+    kept = values > TINY
     errors = (sigma[:, None] * vectors[:, kept] * np.sqrt(values[kept])).T
     views, points = Views.of(rig), np.nan_to_num(people.points)
     xy, at, by_place = seen_by(points, views)
@@ -435,7 +433,9 @@ class Filmed:
             used = away < near_m
             if used.sum() < MIN_SIGHTINGS:
                 break
-            count = np.ceil((self.own_s[-1] - self.own_s[0]) / _KNOT_S) * (near_m == _NEAR_M[-1])
+            count = np.ceil((self.own_s[-1] - self.own_s[0]) / POSES_LAST_S) * (
+                near_m == _NEAR_M[-1]
+            )
             knots_s = np.linspace(self.own_s[0], self.own_s[-1], 1 + int(count))
             given = replace(start, knots_s=knots_s)
             frame, rays = frame[used], self.rays[frame[used], person[used]]

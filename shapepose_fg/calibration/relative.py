@@ -18,6 +18,7 @@ from shapepose_fg.calibration.tracks import Tracks
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.compiled import kernel
 from shapepose_fg.core.decompositions import basis_across
+from shapepose_fg.core.scales import MOST_STEPS
 from shapepose_fg.setup_check.evidence import ANCHORS, KERNEL
 from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS, depths_of_meeting
 
@@ -33,8 +34,6 @@ _SAMPLES = 60
 in simulated recordings."""
 _FINALISTS = 6
 """Number of hypotheses that are refined."""
-_STEPS = 12
-"""Maximum number of evaluations for a hypothesis."""
 
 
 @dataclass(frozen=True)
@@ -227,7 +226,7 @@ def refined_pose(R: Array, t: Array, a: Array, b: Array, size: Array) -> tuple[A
         return (b * Ea).sum(axis=1) / scale
 
     usual = max(KERNEL / 2, float(np.median(np.abs(residuals(np.zeros(5))))))
-    found = least_squares(residuals, np.zeros(5), loss="cauchy", f_scale=usual, max_nfev=_STEPS)
+    found = least_squares(residuals, np.zeros(5), loss="cauchy", f_scale=usual, max_nfev=MOST_STEPS)
     return moved(found.x)
 
 

@@ -59,3 +59,11 @@ SAMPLES = 2000
 SAME_PERSON_M = 0.25
 """Mean distance of the joints of two people, m, below which they are one: a pelvis is 20 cm
 deep."""
+UNSEEN_S = 0.5
+"""Time for which somebody or something that is not seen moves on as before, s."""
+SPEED_S = 0.05
+"""Time over which the velocity of a joint is measured, s: over less, noise dominates."""
+HUGE = 1e6
+"""As good as infinite: a variance of which nothing follows, a precision that fixes."""
+TINY = 1e-6
+"""As good as 0, where exactly 0 would make a system singular."""

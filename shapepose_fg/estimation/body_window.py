@@ -26,7 +26,7 @@ from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.rows import Rows
-from shapepose_fg.core.scales import LASTS_S, WELL_SEEN_M
+from shapepose_fg.core.scales import LASTS_S, TINY, WELL_SEEN_M
 from shapepose_fg.estimation.asynchronous_views import carried_to_frames, leads, velocities_of
 from shapepose_fg.estimation.contact import (
     FREE_M2_S,
@@ -55,8 +55,6 @@ errors of poses that nothing shows are larger than their Gaussian when they are 
 STEPS, SETTLED_M = 8, 2e-3
 """Most steps of the solver; it ends when joints move by less on average, metres. GTSAM's last step
 then moves them by a tenth of that."""
-HELD = 1e-6
-"""Information on every unknown, so that what nothing determines stays where it is."""
 DAMPING = 1e-3
 
 
@@ -207,7 +205,7 @@ class BodyWindow:
         """
         velocity = velocities(self.joints(state), self.times_s)[:, feet]
         seen = np.asarray(self.last.evidence.sigma_m[:, feet] < WELL_SEEN_M)
-        of_views = inverses(self.last.evidence.information[:, feet] + HELD * np.eye(3))
+        of_views = inverses(self.last.evidence.information[:, feet] + TINY * np.eye(3))
         first, last, lasts = moments(self.times_s)
         covariance = _AVERAGED * (of_views[first] + of_views[last])
         covariance = covariance / lasts[:, None, None, None] ** 2
@@ -402,7 +400,7 @@ class BodyWindow:
             )
         M = (beyond.shape[-1] + 1) * N + 11
         kept, front = np.zeros((T, M, -(-N // 16) * 16)), np.zeros((M, M))
-        eliminated(here.system, root, diagonal + HELD, beyond, here.pull, damping, kept, front)
+        eliminated(here.system, root, diagonal + TINY, beyond, here.pull, damping, kept, front)
         return kept, front
 
     def _step(self, state: BodyState, here: Around, damping: float) -> tuple[Array, Array]:
@@ -506,7 +504,7 @@ class Marginals:
         flat = slope.reshape(T, 3 * J, -1)
         own = (flat @ self.poses).reshape(slope.shape) @ slope.mT
         both = (flat[1:] @ self.steps[:-1]).reshape(slope[1:].shape) @ slope[:-1].mT
-        goes = both @ inverses(own[:-1] + HELD * np.eye(3))
+        goes = both @ inverses(own[:-1] + TINY * np.eye(3))
         first, last, lasts = moments(self.window.times_s)
         across = own[first]
         for k in range(int((last - first).max(initial=0))):

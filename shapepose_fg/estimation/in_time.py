@@ -5,12 +5,7 @@ smoothing.
 import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index, Mask
-from shapepose_fg.core.scales import KNOWN_M, LOOK_S
-
-SPEED_S = 0.05
-"""Time before and after a frame for estimating a velocity, s; at least one frame."""
-_HOP_S = 0.045
-"""Minimum duration of a displacement for a speed, s; over less, noise dominates."""
+from shapepose_fg.core.scales import KNOWN_M, LOOK_S, SPEED_S
 
 
 def motion_of(points: Array, variance: Array, times_s: Array) -> tuple[Array, Array]:
@@ -39,12 +34,12 @@ def motion_of(points: Array, variance: Array, times_s: Array) -> tuple[Array, Ar
 
 
 def _hop_ends(known: Mask, times_s: Array) -> tuple[Index, Index]:
-    """(T, J) for each frame, the nearest earlier and later frames, at least `_HOP_S` away, in which
-    a joint is `known` (T, J); the frame itself if none.
+    """(T, J) for each frame, the nearest earlier and later frames, at least `SPEED_S` away, in
+    which a joint is `known` (T, J); the frame itself if none.
     """
     T, at = len(times_s), np.arange(len(times_s))[:, None]
-    before = np.searchsorted(times_s, times_s - _HOP_S, side="right") - 1
-    after = np.searchsorted(times_s, times_s + _HOP_S)
+    before = np.searchsorted(times_s, times_s - SPEED_S + 1e-9, side="right") - 1
+    after = np.searchsorted(times_s, times_s + SPEED_S - 1e-9)
     earlier = np.maximum.accumulate(np.where(known, at, -1))[np.minimum(before, at[:, 0] - 1)]
     later = np.minimum.accumulate(np.where(known, at, T)[::-1])[::-1][
         np.clip(after, at[:, 0] + 1, T) % T

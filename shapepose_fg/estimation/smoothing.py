@@ -6,7 +6,7 @@ import numpy as np
 
 from factors import Motion
 from shapepose_fg.core.arrays import Array, Whole
-from shapepose_fg.core.scales import DETECTOR_M, ROUNDS, WALK_M_S
+from shapepose_fg.core.scales import DETECTOR_M, HUGE, ROUNDS, WALK_M_S
 from shapepose_fg.estimation.in_time import motion_of
 from shapepose_fg.estimation.kernels import solve_chains
 from shapepose_fg.estimation.motion_densities import MotionModel
@@ -14,7 +14,6 @@ from shapepose_fg.estimation.motion_densities import MotionModel
 KERNEL = 6.0
 """Squared distance from the smoothed joint, in variances, at which an initial estimate has half its
 weight."""
-_UNKNOWN = 1e6
 
 
 def smoothed(
@@ -37,9 +36,7 @@ def smoothed(
     speed, turning = (each.reshape(T - 1, len(people), J) for each in motion_of(*by_time, times))
     known = np.asarray(np.isfinite(variance) & np.isfinite(place).all(axis=-1))
     place = np.where(known[..., None], place, 0.0).reshape(C, T, 3)
-    information = np.where(known, 1.0 / np.where(known, variance, 1.0), 1.0 / _UNKNOWN).reshape(
-        C, T
-    )
+    information = np.where(known, 1.0 / np.where(known, variance, 1.0), 1.0 / HUGE).reshape(C, T)
     density = motion.density(np.maximum(speed, WALK_M_S), turning=turning).reshape(T - 1, C)
     moving, below = motion_information(motion.law, np.diff(times), density)
     n, weight, mean, of_mean = motion.law.order, information, place, 1.0 / information

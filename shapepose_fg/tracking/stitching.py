@@ -12,7 +12,7 @@ from annotated_types import Interval
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.bounds import Settings
 from shapepose_fg.core.rows import Rows
-from shapepose_fg.core.scales import WALK_M_S
+from shapepose_fg.core.scales import UNSEEN_S, WALK_M_S
 from shapepose_fg.core.skeleton import Skeleton
 
 _BONE_SIGMA_M = 0.015
@@ -30,9 +30,6 @@ _BRIEF_S = 1.0
 """Longest gap over which tracks are joined without knowing their build, s."""
 _PACE_S = 0.2
 """Duration over which the velocity at the end of a track is measured, s."""
-_COASTS_S = 0.5
-"""Longest extrapolation of a person out of sight, s; as long as a track is followed without
-evidence."""
 
 
 @dataclass(frozen=True)
@@ -149,7 +146,7 @@ def _pairs(
     before = np.repeat(np.arange(len(end_s)), count)
     after = order[np.arange(len(before)) + np.repeat(first - np.cumsum(count) + count, count)]
     gap_s = begin_s[after] - end_s[before]
-    moved = ends.velocity[before] * np.minimum(gap_s, _COASTS_S)[:, None]
+    moved = ends.velocity[before] * np.minimum(gap_s, UNSEEN_S)[:, None]
     apart_m = np.linalg.norm(ends.place[after, 0] - ends.place[before, 1] - moved, axis=-1)
     reach_m = config.reach_m + WALK_M_S * gap_s
     may = (gap_s <= config.longest_gap_s) & (apart_m <= reach_m)

@@ -17,10 +17,10 @@ from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.errors import InputError, naming, optional
 from shapepose_fg.core.reconstruction import Reconstruction
-from shapepose_fg.core.scales import MOST_ITEMS
+from shapepose_fg.core.scales import MOST_ITEMS, UNSEEN_S
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.core.storage.files import MIDDLE, open_regular
-from shapepose_fg.core.trajectory import LONGEST_GAP_S, Trajectory
+from shapepose_fg.core.trajectory import Trajectory
 from shapepose_fg.io.camera_names import listing
 from shapepose_fg.io.detections.lines import view_of
 from shapepose_fg.io.ros.definitions import check_definition, definition, type_name
@@ -116,7 +116,7 @@ def read_views(
             with naming(file, _CURE_POSES):
                 (pose,), (covariances,), (there,) = frames.at(frame, np.array([time_s]))
             stands = not (carrier[camera] or frames.moves(frame))
-            if now_s < (begun_s if stands else time_s) + LONGEST_GAP_S and not there:
+            if now_s < (begun_s if stands else time_s) + UNSEEN_S and not there:
                 return
             waiting.popleft()
             if there or stands:
@@ -160,7 +160,7 @@ def read_views(
                 tidied_s = logged_s
     yield from placed(math.inf)
     for (camera, frame), count in unplaced.items():
-        what = f"frame {frame} has no pose within {LONGEST_GAP_S:g} s"
+        what = f"frame {frame} has no pose within {UNSEEN_S:g} s"
         note(f"{file}: {count} pictures of {camera} are left out: {what}")
     if number == 0:
         raise InputError(f"{file}: there are no detections in it; {_CURE}")
