@@ -433,10 +433,9 @@ class Filmed:
             used = away < near_m
             if used.sum() < MIN_SIGHTINGS:
                 break
-            count = np.ceil((self.own_s[-1] - self.own_s[0]) / POSES_LAST_S) * (
-                near_m == _NEAR_M[-1]
-            )
-            knots_s = np.linspace(self.own_s[0], self.own_s[-1], 1 + int(count))
+            begin, end = self.own_s[[0, -1]]
+            count = np.ceil((end - begin) / POSES_LAST_S) * (near_m == _NEAR_M[-1])
+            knots_s = np.linspace(begin, end, 1 + int(count))
             given = replace(start, knots_s=knots_s)
             frame, rays = frame[used], self.rays[frame[used], person[used]]
             prior = np.array([*sigmas, lens.focal, lens.lens])
