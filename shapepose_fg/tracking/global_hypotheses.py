@@ -18,7 +18,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from shapepose_fg.core.detections import Input
-from shapepose_fg.core.scales import LOOK_S, LOST_M, ROUNDS
+from shapepose_fg.core.scales import BODY_M, LOOK_S, LOST_M, ROUNDS
 from shapepose_fg.proposal.nearby import FrameArrays
 from shapepose_fg.tracking.motion_filter import JointStates
 from shapepose_fg.tracking.track_selection import EvidenceTable, SelectedTracks, weighed
@@ -37,9 +37,6 @@ again, and the best different one: on ten simulated recordings, most before thre
 _PLAIN = 0.25
 """Minimum evidence per second, over any window of `LOOK_S` s, of a person to whom no
 alternatives are sought; in simulated crowds, they are found only for people with less."""
-_SAME_M = 0.02
-"""Maximum distance between joints of two worlds with the same detections for these to
-be merged, m."""
 _GAIN = 0.01
 """Minimum relative gain of evidence for another round."""
 
@@ -384,7 +381,7 @@ def _twins(
         who = who[sorted(range(len(names)), key=names.__getitem__)]
         other = kept.setdefault(tuple(sorted(names)), who)
         apart = np.linalg.norm(tracks.joints.position[who] - tracks.joints.position[other], axis=-1)
-        if other is not who and (apart[known[who] & known[other]] < _SAME_M).all():
+        if other is not who and (apart[known[who] & known[other]] < BODY_M).all():
             gone, same = np.append(gone, who), np.append(same, other)
     return gone, same
 

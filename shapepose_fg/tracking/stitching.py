@@ -12,14 +12,12 @@ from annotated_types import Interval
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.bounds import Settings
 from shapepose_fg.core.rows import Rows
-from shapepose_fg.core.scales import UNSEEN_S, WALK_M_S
+from shapepose_fg.core.scales import UNSEEN_S, WALK_M_S, WELL_SEEN_M
 from shapepose_fg.core.skeleton import Skeleton
 
 _BONE_SIGMA_M = 0.015
 """Standard deviation of a bone's mean length in a track, m; detector errors are correlated over
 time."""
-_PLACE_SIGMA_M = 0.05
-"""Minimum standard deviation of the centre of the core joints, m."""
 LEAST_ROWS = 10
 """Minimum number of rows with a bone for its length in a track to be known."""
 _BUILD = 2.0
@@ -179,8 +177,8 @@ def _costs(apart_m: Array, reach_m: Array, unlike: Array) -> Array:
     Distances `apart_m` (K,) are Gaussian on the floor, with `reach_m` (K,) as two standard
     deviations; `unlike` (K,) is the sum of squared differences of bone lengths, in variances.
     """
-    sigma_m = np.maximum(reach_m / 2, _PLACE_SIGMA_M)
-    return (apart_m / sigma_m) ** 2 + 4 * np.log(sigma_m / _PLACE_SIGMA_M) + unlike
+    sigma_m = np.maximum(reach_m / 2, WELL_SEEN_M)
+    return (apart_m / sigma_m) ** 2 + 4 * np.log(sigma_m / WELL_SEEN_M) + unlike
 
 
 def _matched(before: Index, after: Index, cost: Array) -> dict[int, int]:
