@@ -19,7 +19,8 @@ joint = result["joint_names"].tolist().index("LKnee")
 height = result["joints"][:, joint, 2]
 sigma = np.sqrt(result["covariance"][:, joint, 2, 2])
 names = result["known_names"][result["known"][:, joint]]
-print("the knee is known as:", dict(zip(*np.unique(names, return_counts=True), strict=True)))
+for name, count in zip(*np.unique(names, return_counts=True), strict=True):
+    print(f"the knee is {name} in {count} rows")
 
 figure, axes = plt.subplots(figsize=(8, 4))
 for person in np.unique(result["person"]):

@@ -28,9 +28,9 @@ carriers = reconstruct(detections, scene.rig, times=times, extra_factors=carries
 print("made and inactive:", carriers.run["extra_factors"])
 
 figure, axes = plt.subplots(figsize=(8, 4))
-for people, style in ((without, ":"), (carriers, "-")):
+for people, style, what in ((without, ":", "without the factor"), (carriers, "-", "with it")):
     apart = np.linalg.norm(people.joints[:, RIGHT] - people.joints[:, LEFT], axis=1)
-    print("median distance of the wrists, m:", np.round(np.median(apart), 2))
+    print(f"{what}: median distance of the wrists {np.median(apart):.2f} m")
     for person in np.unique(people.person):
         mine = people.person == person
         axes.plot(people.time_s[mine], apart[mine], style, color=COLOURS[person])

@@ -21,7 +21,7 @@ figure, axes = plt.subplots(figsize=(8, 4))
 for person in np.unique(people.person):
     mine = people.person == person
     axes.plot(people.time_s[mine], near[mine], color=COLOURS[person], label=f"person {person}")
-    print(f"person {person}: at most {near[mine].max():.1%}")
+    print(f"person {person}: within 40 cm with a probability of up to {near[mine].max():.0%}")
 axes.axhline(0.05, color="grey", linestyle=":")
 axes.set(xlabel="time, s", ylabel="probability to be within 40 cm", ylim=(-0.02, 1.02))
 axes.set_title("the machine stops above the dotted line, 5 %")

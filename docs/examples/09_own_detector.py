@@ -6,6 +6,7 @@ from drawing import draw_people, room, save
 
 from shapepose_fg import reconstruct
 from shapepose_fg.core.detections import Detections, Recording
+from shapepose_fg.core.reconstruction import Known
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.simulation import built_in_scene
 
@@ -47,7 +48,8 @@ def detections_of(frame):
 
 recording = Recording(BODY_25, [detections_of(frame) for frame in range(len(scene))])
 people = reconstruct(recording, scene.rig)
-print("feet come from the body:", set(people.known[:, BODY_25.index("LHeel")].tolist()))
+heel = people.known[:, BODY_25.index("LHeel")]
+print("the left heel is known from:", *{Known(each).name for each in heel.tolist()})
 
 truth = scene.truth_at(11)
 figure = plt.figure(figsize=(8, 6))

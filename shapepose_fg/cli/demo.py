@@ -8,9 +8,9 @@ from shapepose_fg.cli.terminal import progress as progress_bar
 from shapepose_fg.core.storage.output_folder import prepare_output
 
 SCENE = """\
-Built-in scene: 4 people in close motion, 6 cameras, 60 frames. A simulated
-detector sees them with noise, misses, false candidates and occlusion; from what
-it saw the people are reconstructed, over time."""
+Built-in scene: 4 people in close motion, 6 cameras, 60 frames. The people are
+reconstructed from 2D detections that are simulated with noise, misses, false
+candidates and occlusion, and compared with the truth."""
 _FILES = {
     "people.npz": "joints, covariances and bodies",
     "run.json": "settings and times",
@@ -45,10 +45,10 @@ def demo(
         people = reconstruct(detections, scene.rig, times=times, execution=execution)
     show_scores({"demo": score(people_of(people), people_of(truth_of(scene)))})
     people.save(output)
-    print()
-    for name, content in _FILES.items():
-        print(f"{output / name}  {content}")
+    files = {output / name: content for name, content in _FILES.items()}
     if report:
-        print(f"{write_report(output, people, scene.rig)}  open it in a browser")
+        files[write_report(output, people, scene.rig)] = "open it in a browser"
     else:
         (output / REPORT).unlink(missing_ok=True)
+    width = max(len(str(file)) for file in files)
+    print("", *(f"{file!s:<{width}}  {content}" for file, content in files.items()), sep="\n")

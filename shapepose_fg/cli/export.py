@@ -38,6 +38,6 @@ def export(
     output = inside(results_folder(take.results), "export") if output is None else output
     more = {"markers": MarkerSet(markers), "fill_gaps_s": fill_gaps, "body": take.body}
     done = export_result(take.results, wanted, output, **how, **more)
-    for file in (file for written in done.values() for file in written.files):
+    for file in dict.fromkeys(file for written in done.values() for file in written.files):
         print(file)
-    note(*(told for written in done.values() for told in written.notes))
+    note(*dict.fromkeys(told for written in done.values() for told in written.notes))

@@ -108,14 +108,22 @@ def table(
     from rich.text import Text
 
     cells = [list(row) for row in rows]
-    columns = (" ".join(map(str, column)).split() for column in zip(heads, *cells, strict=True))
-    # Narrower columns would break words.
-    widths = [max(map(len, words), default=0) for words in columns]
-    gap = 2 if sum(widths) + 2 * len(heads) <= console().width else 1
+    columns = [[str(each) for each in column] for column in zip(heads, *cells, strict=True)]
+    # Without room for whole lines, heads are broken at blanks, then cells too; words stay whole.
+    lines = (
+        columns,
+        [[*head.split(), *column] for head, *column in columns],
+        [" ".join(column).split() for column in columns],
+    )
+    widest = [[max(map(len, each), default=0) for each in parts] for parts in lines]
+    room = console().width
+    fitting = ((w, gap) for w in widest for gap in (2, 1) if sum(w) + gap * len(w) <= room + gap)
+    widths, gap = next(fitting, (widest[-1], 1))
     made = Table(box=None, pad_edge=False, padding=(0, gap, 0, 0), header_style="dim")
-    for n, head in enumerate(heads):
+    for n, (head, width) in enumerate(zip(heads, widths, strict=True)):
+        most = None if widths is widest[-1] else width
         side = "left" if n < left else "right"
-        made.add_column(head, justify=side, min_width=widths[n], overflow="fold")
+        made.add_column(head, justify=side, min_width=width, max_width=most, overflow="fold")
     for row in cells:
         made.add_row(*row)
     return Group(made, Text(caption, style="dim")) if caption else made

@@ -6,7 +6,6 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.errors import InputError, optional
 from shapepose_fg.detection2d.onnx_file import read_onnx
 
 Backend = Literal["opencv", "onnxruntime"]
@@ -131,16 +130,11 @@ def _try_elsewhere(file: Path, content: bytes) -> None:
         )
 
 
-def _with_onnxruntime(file: Path, content: bytes, device: str) -> tuple[Any, ...]:
-    """`forward` and the following fields of `OnnxNetwork`, by onnxruntime; on the CPU with as many
-    threads as OpenCV has.
+def runtime_for(device: str) -> tuple[Any, str, str]:
+    """onnxruntime, its provider for `device`, and the number of the device, "" for the first;
+    InputError if it is not installed, or has no such provider.
     """
-    try:
-        onnxruntime: Any = import_module("onnxruntime")
-    except ImportError:
-        raise InputError(
-            f'{file}: onnxruntime is not installed; pip install "shapepose-fg[detect]"'
-        ) from None
+    onnxruntime: Any = optional("onnxruntime", "detect")
     kind, _, number = device.partition(":")
     provider, there = (
         f"{PROVIDERS.get(kind)}ExecutionProvider",
@@ -154,6 +148,14 @@ def _with_onnxruntime(file: Path, content: bytes, device: str) -> tuple[Any, ...
             f"--device {device}: the installed onnxruntime supports {known}; install the "
             "onnxruntime package for this device"
         )
+    return onnxruntime, provider, number
+
+
+def _with_onnxruntime(file: Path, content: bytes, device: str) -> tuple[Any, ...]:
+    """`forward` and the following fields of `OnnxNetwork`, by onnxruntime; on the CPU with as many
+    threads as OpenCV has.
+    """
+    onnxruntime, provider, number = runtime_for(device)
     options: Any = onnxruntime.SessionOptions()
     options.intra_op_num_threads = min(cv2.getNumThreads(), os.cpu_count() or 1)
     options.log_severity_level = 4

@@ -13,7 +13,7 @@ from shapepose_fg.core.validation import validated
 from shapepose_fg.detection2d.boxes import BoxForm, BoxNetwork
 from shapepose_fg.detection2d.download import NamedNetwork, named_networks
 from shapepose_fg.detection2d.heat_maps import HeatMapNetwork
-from shapepose_fg.detection2d.onnx_network import OnnxNetwork
+from shapepose_fg.detection2d.onnx_network import OnnxNetwork, runtime_for
 from shapepose_fg.detection2d.top_down import KeypointForm, TopDownNetwork
 from shapepose_fg.io.skeleton_file import find_skeleton
 
@@ -37,11 +37,16 @@ def open_network(
     own. An ONNX file without `boxes` is OpenPose-like; `openpose` are further arguments of
     `HeatMapNetwork.load`. InputError, one sentence, if it cannot be opened.
     """
-    named = _named("--network", network)
-    if network.endswith(".toml"):
-        form = read_form(Path(network))
-    elif named is None and boxes is None:
+    named, described = _named("--network", network), network.endswith(".toml")
+    if not described and named is None and boxes is None:
         return HeatMapNetwork.load(network, device=device, **openpose)
+    for name in (name for name, value in openpose.items() if value is not None):
+        raise InputError(
+            f"--{name.replace('_', '-')} is for networks such as OpenPose; leave it out"
+        )
+    runtime_for(device)  # fails before anything is downloaded
+    if described:
+        form = read_form(Path(network))
     elif named is None:
         form = KeypointForm(network=network)
     elif named.boxes is None:
@@ -53,10 +58,6 @@ def open_network(
         form, boxes = (
             KeypointForm(network=str(named_file(network)), size=named.size),
             boxes or named.boxes,
-        )
-    for name in (name for name, value in openpose.items() if value is not None):
-        raise InputError(
-            f"--{name.replace('_', '-')} is for networks such as OpenPose; leave it out"
         )
     people = form.boxes
     if boxes is not None:

@@ -35,8 +35,8 @@ FIGURES = {
     "hota": "HOTA, %",
     "det_a": "DetA, %",
     "ass_a": "AssA, %",
-    "inside_50": "inside 50 %, %",
-    "inside_95": "inside 95 %, %",
+    "inside_50": "in 50 % region, %",
+    "inside_95": "in 95 % region, %",
 }
 """Figures of a table, with headings."""
 

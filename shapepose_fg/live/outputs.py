@@ -99,8 +99,8 @@ def _target(
 
 
 def line_of(kind: str, people: Reconstruction, time_s: float, covariances: str = "joints") -> str:
-    """The people of a frame as a line of JSON: metres, m², m/s; null where unknown. Covariances
-    that a level of `COVARIANCES` leaves out are missing.
+    """The people of a frame as a line of JSON: metres, m², m/s, seconds to 1e-6; null where
+    unknown. Covariances that a level of `COVARIANCES` leaves out are missing.
     """
     columns = ("joints", "velocity", *COVARIANCES[covariances])
     rows = [
@@ -113,7 +113,7 @@ def line_of(kind: str, people: Reconstruction, time_s: float, covariances: str =
         | {name: _plain(getattr(people, name)[n], "covariance" in name) for name in columns}
         for n in range(len(people))
     ]
-    line = {"kind": kind, "time_s": time_s, "people": rows}
+    line = {"kind": kind, "time_s": round(time_s, 6), "people": rows}
     return json.dumps(line, allow_nan=False, separators=(",", ":")) + "\n"
 
 

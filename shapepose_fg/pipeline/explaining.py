@@ -133,7 +133,7 @@ def explain(
     given = {name_of(function) for function in functions_of(extra_factors)}
     missing = tuple(name for name in told.extra_factors if name not in given)
     return Explanation(
-        person, joint, frame, when if np.isfinite(when) else None,
+        person, joint, frame, round(when, 6) if np.isfinite(when) else None,
         tuple(place.tolist()) if known else None, sigma if known and np.isfinite(sigma) else None,
         Known(people.known[row, number]).name.lower(), str(people.status[row]), views, *shares,
         findings, factors, missing,

@@ -504,7 +504,7 @@ def test_demo_compares_with_the_truth_and_leaves_a_report(
     # What is asked of the whole scene holds of its first frames too.
     assert all(float(share[name]) == 100 for name in ("PCP, %", "MOTA, %", "IDF1, %"))
     assert float(share["MPJPE, mm"]) <= 30 and float(share["recall, %"]) >= 98
-    assert 80 < float(share["inside 95 %, %"]) <= 100
+    assert 80 < float(share["in 95 % region, %"]) <= 100
     assert len(Reconstruction.load("demo")) == 20
     assert (tmp_path / "demo" / "report.html").is_file()
 

@@ -74,6 +74,14 @@ def test_words_of_a_table_stay_whole_on_a_narrow_terminal(columns, capsys, monke
     assert max(map(len, lines)) <= max(columns, 37)  # the longest words, with a gap of one
 
 
+def test_cells_stay_whole_where_broken_heads_make_room(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "46")
+    row = ("cam01", "-0.05 13.50 1.53", "1556 ± 2.2 %", "0.5")
+    show(table(("camera", "x y z, m", "focal, px", "rotation ± °"), [row]))
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-1].split() == " ".join(row).split() and len(lines[-1]) <= 46
+
+
 def test_names_and_keys_of_files_reach_no_terminal_as_they_are(tmp_path, capsys):
     """Keys of TOML and JSON, names of files and recordings, arguments."""
     escaped = json.dumps(ESCAPES)

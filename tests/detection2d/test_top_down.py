@@ -5,6 +5,7 @@
 import json
 import re
 import shlex
+import sys
 from importlib.metadata import distributions, requires
 from pathlib import Path
 
@@ -247,6 +248,16 @@ def test_networks_in_each_other_s_place_are_refused(tmp_path):
         match="no known skeleton has 5 joints; describe it in a TOML file of the network",
     ):
         open_network(five, yolox, Path)
+
+
+def test_what_is_missing_is_said_before_a_network_is_downloaded(monkeypatch):
+    with pytest.raises(InputError, match="--layout is for networks such as OpenPose"):
+        open_network("rtmpose-m", None, pytest.fail, layout="tf-pose")
+    with pytest.raises(InputError, match="--device cuda"):
+        open_network("rtmpose-m", None, pytest.fail, "cuda")
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(InputError, match=r"onnxruntime is not installed; pip install .*detect"):
+        open_network("rtmpose-m", None, pytest.fail)
 
 
 def test_people_are_the_same_one_by_one_and_many_at_once(tmp_path):

@@ -72,7 +72,9 @@ def summary_table(
             else f"{each['way_m']:.1f} m, as given"
         )
         table.add_row("moving", f"{' '.join(each['cameras'])}: {words}")
-    count = f"{len(result.parts_of)} people over time" if over_time else "without identities"
+    known = len(result.parts_of)
+    count = f"{known} {'person' if known == 1 else 'people'} over time"
+    count = count if over_time else "without identities"
     table.add_row(
         "people",
         f"{count}, {per_frame.mean():.1f} a frame ({per_frame.min()} to {per_frame.max()})",

@@ -5,8 +5,10 @@ In the recording's own axes, metres; missing values are not drawn.
 """
 
 import json
+import os
 import shutil
 import subprocess
+import sys
 import sysconfig
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -43,6 +45,13 @@ def shown(first: Any, url: str | None) -> Iterator[Any]:
     layout. InputError if that fails.
     """
     stream, rr = new_stream(), optional("rerun", "view")
+    displays = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
+    if url is None and sys.platform == "linux" and not any(map(os.environ.get, displays)):
+        raise InputError(
+            "the rerun viewer cannot be started, because there is no display; write a file (such "
+            "as by `shapepose-fg export RESULTS rrd`), and open it elsewhere by `rerun FILE`, or "
+            "in a browser by `rerun --web-viewer FILE`"
+        )
     try:
         if url is not None:
             stream.connect_grpc(url, default_blueprint=first)

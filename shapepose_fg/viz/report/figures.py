@@ -13,6 +13,7 @@ from shapepose_fg.biomechanics.joint_angles import NAMES, JointAngles, joint_ang
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.core.arrays import Array, Index, Mask, Real, Whole
 from shapepose_fg.core.camera import Axis
+from shapepose_fg.core.frame_times import ASSUMED_FPS
 from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.reconstruction import Known, Reconstruction, sigma_m
 from shapepose_fg.core.run_summary import CameraEntry, covered_frames
@@ -45,24 +46,27 @@ class Curve:
     name: str
     """Name of the angle."""
     low: float
-    """Angle at the bottom of the box, degrees."""
+    """Smallest angle of both sides, degrees."""
     high: float
-    """Angle at the top of the box, degrees."""
+    """Largest angle of both sides, degrees."""
     lines: tuple[str, ...]
     """Path of the right side, and of the left one."""
     bands: tuple[str, ...]
     """Two standard deviations around each."""
+    frames: tuple[int, int]
+    """The first and the last frame that are drawn."""
 
     @classmethod
     def of(cls, name: str, angles: JointAngles, frame: Whole) -> "Curve":
         """Draw `name` of rows in the increasing frames `frame` (N,)."""
         places = [NAMES.index(f"{side}_{name}") for side in ("right", "left")]
         middle, spread = angles.degrees[:, places], 2 * np.nan_to_num(angles.sigma[:, places])
-        low, high = np.floor(np.nanmin(middle)) - 5, np.ceil(np.nanmax(middle)) + 5
+        margin = max(5.0, float(np.median(spread)))  # single uncertain frames are cut off
+        low, high = float(np.nanmin(middle)), float(np.nanmax(middle))
         x = 200 * (frame - frame[0]) / max(float(np.ptp(frame)), 1)
 
         def path(values: Array, x: Array) -> str:
-            y = (60 * (high - values) / (high - low)).clip(0, 60)
+            y = (60 * (high + margin - values) / (high - low + 2 * margin)).clip(0, 60)
             pairs = zip(x.tolist(), y.tolist(), strict=True)
             return "M" + "L".join(f"{a:.1f} {b:.1f}" for a, b in pairs if b == b)
 
@@ -71,7 +75,8 @@ class Curve:
             path(np.concatenate([each + two, (each - two)[::-1]]), np.concatenate([x, x[::-1]]))
             for each, two in zip(middle.T, spread.T, strict=True)
         )
-        return cls(name.replace("_", " "), low, high, lines, bands)
+        ends = int(frame[0]), int(frame[-1])
+        return cls(name.replace("_", " "), low, high, lines, bands, ends)
 
 
 @dataclass(frozen=True)
@@ -174,12 +179,16 @@ def angle_curves(people: Reconstruction, up: Axis, model: BodyModel) -> dict[int
     """The curves of the people with the most rows, by number of the person."""
     numbers, counts = np.unique(people.person, return_counts=True)
     drawn = dict[int, list[Curve]]()
-    # Maximum numbers of people with curves, and of frames of each, so that the page stays small and
-    # quick to make: 2 ms per row.
-    for who in np.sort(numbers[np.argsort(-counts, kind="stable")[:8]]).tolist():
+    chosen = np.sort(numbers[np.argsort(-counts, kind="stable")[:8]]).tolist()
+    # Maximum number of rows of a person, so that the page stays small and quick to make: 2 ms per
+    # row. Of longer recordings the beginning is drawn: steps over 0.15 s would not show a gait.
+    most, times_s = 640 // max(len(chosen), 1), people.time_s
+    times_s = np.where(np.isfinite(times_s), times_s, people.frame / ASSUMED_FPS)
+    for who in chosen:
         rows = np.flatnonzero(people.person == who)
         rows = rows[np.argsort(people.frame[rows], kind="stable")]
-        rows = rows[:: -(-len(rows) // 80)]
+        longest = max(1, int(0.15 * len(rows) / max(float(np.ptp(times_s[rows])), 0.15)))
+        rows = rows[:: min(-(-len(rows) // most), longest)][:most]
         angles = joint_angles(people.rows(rows), up, model)
         drawn[who] = [
             Curve.of(name, angles, people.frame[rows])

@@ -177,6 +177,15 @@ def test_view_without_a_viewer_is_one_sentence(copied, capfd):
     assert "the rerun viewer cannot be reached at nonsense" in capfd.readouterr().err
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems always have a display")
+def test_view_without_a_display_names_another_way(copied, capfd, monkeypatch):
+    pytest.importorskip("rerun")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
+        monkeypatch.delenv(name, raising=False)
+    assert run("view", copied, "--statistics") == 2
+    assert "there is no display; write a file" in capfd.readouterr().err
+
+
 def test_rerun_sends_no_statistics(tmp_path, monkeypatch):
     """On a machine where rerun was never used they are on; `rerun analytics disable` is what its
     manual says.

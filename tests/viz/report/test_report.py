@@ -18,8 +18,11 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.observation_table import Gate
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.io.solved_setup import model_of
 from shapepose_fg.pipeline.pipeline import PipelineConfig
-from shapepose_fg.viz.report.figures import camera_figures, known_counts
+from shapepose_fg.simulation import built_in_scene
+from shapepose_fg.simulation.files import truth_of
+from shapepose_fg.viz.report.figures import angle_curves, camera_figures, known_counts
 from shapepose_fg.viz.report.writing import report_of, write_report
 from tests.io.export.conftest import AWAY, FIRST, FPS, FRAMES, GUESSED, LOST
 
@@ -236,6 +239,17 @@ def test_a_long_recording_is_thinned_and_says_so(result, scene, tmp_path, monkey
     assert kept.tolist() == list(range(FIRST, FIRST + FRAMES, int(every[1])))
     # Figures are still those of every frame.
     assert "person 3100–12324" in thin.text
+
+
+def test_angles_of_a_long_recording_are_drawn_at_steps_that_show_a_gait():
+    scene = built_in_scene(people=1, frames=40)
+    frame, truth = np.arange(4000), truth_of(scene)
+    long = replace(truth.rows(frame % 40), frame=frame, time_s=frame / 25)
+    (curve,) = (each for each in angle_curves(long, "z", model_of({}))[0] if "knee" in each.name)
+    points = curve.lines[0].count("L") + 1
+    assert curve.frames[0] == 0 and 1000 < curve.frames[1] < 4000
+    assert curve.frames[1] / (points - 1) / 25 <= 0.15
+    assert angle_curves(long.rows(frame < 1), "z", model_of({}))[0][0].frames == (0, 0)
 
 
 def test_nobody_found_is_a_page_too(scene, tmp_path):

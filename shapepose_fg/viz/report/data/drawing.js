@@ -250,7 +250,7 @@ class Painter {
       } });
     }
   }
-  /** A person's number above the head. */
+  /** A person's number above the head, and above a raised hand. */
   label(items, row, person) {
     const { ctx, eye, recording } = this, middle = recording.middle(row);
     if (!middle) return;
@@ -269,10 +269,10 @@ class Painter {
       const wide = Math.max(18, ctx.measureText(text).width + 10);
       ctx.fillStyle = this.shades[person].dark;
       ctx.beginPath();
-      ctx.roundRect(p[0] - wide / 2, p[1] - 9, wide, 18, 9);
+      ctx.roundRect(p[0] - wide / 2, p[1] - 18, wide, 18, 9);
       ctx.fill();
       ctx.fillStyle = "#ffffff";
-      ctx.fillText(text, p[0], p[1] + 0.5);
+      ctx.fillText(text, p[0], p[1] - 8.5);
     } });
   }
   /** A camera as the pyramid that it sees; without an index as it was before, dashed and without a name. */
@@ -318,10 +318,14 @@ class Painter {
       ctx.lineWidth = 3;
       ctx.strokeStyle = this.theme.paper;
       const name = camera.name.length > 18 ? `…${camera.name.slice(-17)}` : camera.name;
-      const above = Math.min(...points.map((p) => (p ? p[1] : centre[1])), centre[1]) - 4;
-      ctx.strokeText(name, centre[0], above);
+      const drawn = [centre, ...points.filter(Boolean)];
+      if (!drawn.some(([x, y]) => x > 0 && x < eye.width && y > 0 && y < eye.height)) return;
+      const half = ctx.measureText(name).width / 2 + 4;
+      const along = Math.max(half, Math.min(eye.width - half, centre[0]));
+      const above = Math.max(16, Math.min(...drawn.map((p) => p[1])) - 4);
+      ctx.strokeText(name, along, above);
       ctx.fillStyle = this.theme.ink;
-      ctx.fillText(name, centre[0], above);
+      ctx.fillText(name, along, above);
     } });
   }
   /** The edge of a camera's picture, and shade outside it. */
