@@ -67,3 +67,5 @@ HUGE = 1e6
 """As good as infinite: a variance of which nothing follows, a precision that fixes."""
 TINY = 1e-6
 """As good as 0, where exactly 0 would make a system singular."""
+SURFACE_M = 0.015
+"""Additional error of a point on a body's surface, and of its soles, m."""

@@ -9,7 +9,7 @@ import numpy as np
 from shapepose_fg.body.model.soles import SINK_M
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.decompositions import basis_across
-from shapepose_fg.estimation.uncertainty import SURFACE_M
+from shapepose_fg.core.scales import SURFACE_M
 
 LOOK_S = 1.5
 """Time for which a standing foot counts as one look, s: the correlation time of errors
