@@ -12,7 +12,7 @@ from dataclasses import replace
 from itertools import combinations, product
 
 import numpy as np
-from scipy.signal import fftconvolve
+from scipy.fft import next_fast_len
 
 from shapepose_fg.calibration.relative import relative
 from shapepose_fg.calibration.synchronisation import AROUND_S
@@ -146,7 +146,9 @@ def _add_likeness(
     for begin_one, one in a:
         for begin_other, other in b:
             apart = np.arange(1 - len(one), len(other))
-            dots = fftconvolve(other, one[::-1], axes=0).sum(axis=1)
+            size = next_fast_len(len(apart), real=True)
+            waves = np.fft.rfft(other, size, axis=0) * np.fft.rfft(one[::-1], size, axis=0)
+            dots = np.fft.irfft(waves.sum(axis=1), size)[: len(apart)]
             start, stop = np.maximum(0, -apart), np.minimum(len(one), len(other) - apart)
             power, power_other = (
                 np.append(0.0, np.cumsum((each**2).sum(axis=1))) for each in (one, other)

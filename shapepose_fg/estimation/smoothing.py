@@ -65,7 +65,8 @@ def motion_information(law: Motion, dt_s: Array, density: Array) -> tuple[Array,
     positions.
     """
     F = law.transition(dt_s)
-    noise = np.linalg.inv(law.noise(dt_s)) / density.T[..., None, None]
+    # Copied, as a kernel takes what follows from it, and names C-contiguous arrays.
+    noise = np.linalg.inv(law.noise(dt_s)) / density.T.copy()[..., None, None]
     own = np.zeros((noise.shape[0], len(dt_s) + 1, *F.shape[1:]))
     own[:, 0] = np.diag([0.0, *np.power(law.start, -2.0)])
     own[:, 1:] += noise

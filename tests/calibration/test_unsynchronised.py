@@ -4,6 +4,7 @@ refused.
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -55,14 +56,17 @@ def test_moments_of_one_clock():
 
 @pytest.mark.slow
 def test_people_who_stand_are_refused(rig, two_people, few_frames):
-    still = np.repeat(moving(two_people[0], 0.0)[None], 80, axis=0)
-    with pytest.raises(Undetermined, match="camera cam0: "):
-        calibrate_unsynchronised(merged(rig, [still] * 4), unposed(rig), FPS, range(80), 1.0)
+    three = replace(rig, cameras=rig.cameras[:3])
+    still = np.repeat(moving(two_people[0], 0.0)[None, :2], 80, axis=0)
+    with pytest.raises(
+        Undetermined, match=r"camera cam0: the motion .* does not determine its off"
+    ):
+        calibrate_unsynchronised(merged(three, [still] * 3), unposed(three), FPS, range(80), 1.0)
 
 
 @pytest.mark.slow
 def test_the_command_finds_poses_and_times_from_people_alone(
-    rig, late, tmp_path, capsys, monkeypatch
+    rig, late, tmp_path, capsys, monkeypatch, few_frames
 ):
     monkeypatch.chdir(tmp_path)
     steps = list[tuple[int, int]]()
@@ -82,7 +86,7 @@ def test_the_command_finds_poses_and_times_from_people_alone(
     base = ["calibrate", "--calibration", "lenses.json", "--detections", "detection", "--fps", "25"]
     for more, code, said in (
         (
-            ["--times", "times.csv", "--most", "8", "--report", "page.html"],
+            ["--times", "times.csv", "--most", "6", "--report", "page.html"],
             0,
             "--timestamps times.csv",
         ),
@@ -122,7 +126,7 @@ def test_the_command_finds_the_start_of_a_camera_with_a_log(
     log = Trajectory("cam2", time_s, np.tile(oTc, (300, 1, 1)))
     write_trajectory(log, Path("log.tum"))
     base = ["calibrate", "--calibration", "lenses.json", "--detections", "detection", "--fps", "25"]
-    base += ["--times", "times.csv", "--most", "8", "--trajectory", "cam2=log.tum"]
+    base += ["--times", "times.csv", "--most", "6", "--trajectory", "cam2=log.tum"]
 
     def run(*more: str) -> tuple[int, str]:
         with pytest.raises(SystemExit) as ended:

@@ -2,6 +2,7 @@
 then --resume.
 """
 
+import io
 import os
 import random
 import signal
@@ -9,12 +10,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from shapepose_fg.cli.main import main
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.simulation.files import write_simulated
+from shapepose_fg.tracking import identities
 
 SETTINGS = """
 batch_frames = 6
@@ -25,7 +28,8 @@ overlap_s = 0.1
 [offsets]
 frames = 6
 """
-PROGRAM = "from shapepose_fg.tracking import identities; identities.BLOCK_S = 0.3\n"
+_BLOCK_S = 0.3
+PROGRAM = f"from shapepose_fg.tracking import identities; identities.BLOCK_S = {_BLOCK_S}\n"
 PROGRAM += "from shapepose_fg.__main__ import main; main()"
 """The command, which decides after blocks so short that a run of a second stops in the middle of
 them, too."""
@@ -98,7 +102,7 @@ class Killing:
                 content[rng.randrange(len(content))] ^= 1 << rng.randrange(8)
                 file.write_bytes(content)
                 flipped = file.name
-        second = "" if done else _ended(_begun([*command, "--resume"]))
+        second = "" if done else _ended_here([*command, "--resume"])
         if second.startswith("error:"):
             if flipped == "nothing":
                 raise AssertionError(f"kill {number}: it did not go on: {second}")
@@ -132,11 +136,30 @@ def _ended(process: subprocess.Popen[str]) -> str:
     AssertionError else.
     """
     _, said = process.communicate(timeout=_LONGEST_S)
+    return _sentence(process.returncode, said)
+
+
+def _ended_here(words: list[str]) -> str:
+    """The same of a command in this process, which has loaded the program."""
+    code, said, before = 0, io.StringIO(), identities.BLOCK_S
+    identities.BLOCK_S = _BLOCK_S
+    try:
+        with redirect_stdout(io.StringIO()), redirect_stderr(said):
+            main(words)
+    except SystemExit as ended:
+        code = ended.code
+    finally:
+        identities.BLOCK_S = before
+    return _sentence(code, said.getvalue())
+
+
+def _sentence(code: object, said: str) -> str:
+    """The error in what a command wrote, and only one that ends it."""
     errors = [line for line in said.splitlines() if line.startswith("error:")]
-    if process.returncode in (0, -signal.SIGKILL) and "Traceback" not in said:
+    if code in (0, -signal.SIGKILL) and "Traceback" not in said:
         return ""
-    if process.returncode != 2 or len(errors) != 1 or "Traceback" in said:
-        raise AssertionError(f"code {process.returncode}: {said}")
+    if code != 2 or len(errors) != 1 or "Traceback" in said:
+        raise AssertionError(f"code {code}: {said}")
     return errors[0]
 
 
