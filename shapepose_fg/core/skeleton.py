@@ -8,9 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from shapepose_fg.core.arrays import Index
-
-LONGEST_NAME = 64
-"""Maximum number of characters of a joint's name."""
+from shapepose_fg.core.scales import LONGEST_NAME
 
 
 def check_joint_names(names: Iterable[str]) -> None:
