@@ -23,7 +23,6 @@ from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Axis
 from shapepose_fg.core.errors import InputError, optional
 from shapepose_fg.core.reconstruction import BODY, Known, Reconstruction, with_body
-from shapepose_fg.core.scales import BATCH, STEP
 from shapepose_fg.core.skeleton import SMPL_24
 from shapepose_fg.io.export.take import opensim_axes
 from shapepose_fg.io.solved_setup import model_of
@@ -78,6 +77,10 @@ one body (coverage of `scripts/measure_angles.py`)."""
 _WEIGHT = 2.0
 """Factor of the information of joints in the angles: with 1 the prior bends knees (errors of
 `scripts/measure_angles.py`)."""
+_STEP = 1e-4
+"""Step of the central differences, rad."""
+_BLOCK = 256
+"""Number of rows that are processed together, to limit memory."""
 
 
 OPENSIM = (
@@ -167,8 +170,8 @@ def joint_angles(
     degrees = np.full((len(people), len(names)), np.nan)
     covariance = np.full((*degrees.shape, len(names)), np.nan)
     model = model.with_keypoints(tuple(people.joint_names.tolist()))
-    for start in range(0, len(there), BATCH):
-        rows = there[start : start + BATCH]
+    for start in range(0, len(there), _BLOCK):
+        rows = there[start : start + _BLOCK]
         part = people.rows(rows)
         posed = BodyParameters(*(getattr(part, name) for name in BODY))
         betas, local, rotations = _rotations(part, model, posed)
@@ -262,11 +265,11 @@ def angles_and_slopes(
         ends = [
             _angles_of(turn @ exp_so3(step * axis), each.sequence)
             for axis in np.eye(3)
-            for step in (STEP, -STEP)
+            for step in (_STEP, -_STEP)
         ]
         apart = [a - b for a, b in zip(ends[::2], ends[1::2], strict=True)]
         change = (np.stack(apart, axis=2) + np.pi) % (2 * np.pi) - np.pi
-        slope = np.degrees(signs[:, None] * change / (2 * STEP))
+        slope = np.degrees(signs[:, None] * change / (2 * _STEP))
         for joint, through in towards.items():
             slopes[:, rows, joint] = slope @ through
     return degrees, slopes.reshape(*degrees.shape, 72)

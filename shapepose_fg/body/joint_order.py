@@ -15,8 +15,9 @@ from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS
 from shapepose_fg.core.arrays import Array, Index
-from shapepose_fg.core.scales import SAMPLES
 
+_POSES = 1500
+"""Number of sampled bodies; means and standard deviations of distances are then known to 3 %."""
 _NOISE_M = 0.015
 """Standard deviation of a joint along each axis, m, as of a good detector."""
 _OUTLIER, _OUTLIER_SIGMA = 0.1, 1.0
@@ -42,19 +43,19 @@ def _distances(dimensions: int) -> _Distances:
     """Statistics of distances in 3D (3), or in images of upright cameras (2)."""
     rng = np.random.default_rng(0)
     betas, pose = (
-        np.clip(rng.normal(size=(SAMPLES, 10)), -2, 2),
-        PosePrior.default().sample(rng, SAMPLES),
+        np.clip(rng.normal(size=(_POSES, 10)), -2, 2),
+        PosePrior.default().sample(rng, _POSES),
     )
     body = BodyModel.default().with_keypoints(BODY_POINTS)
-    nowhere = np.zeros((SAMPLES, 3))
+    nowhere = np.zeros((_POSES, 3))
     points = body.keypoints(BodyParameters(betas, nowhere, pose, nowhere))
     if dimensions == 2:
         azimuth, elevation = (
-            rng.uniform(0, 2 * np.pi, SAMPLES),
-            np.arcsin(rng.uniform(-0.2, 0.85, SAMPLES)),
+            rng.uniform(0, 2 * np.pi, _POSES),
+            np.arcsin(rng.uniform(-0.2, 0.85, _POSES)),
         )
-        ahead = np.stack([np.sin(azimuth), np.zeros(SAMPLES), np.cos(azimuth)], axis=1)
-        right = np.stack([-np.cos(azimuth), np.zeros(SAMPLES), np.sin(azimuth)], axis=1)
+        ahead = np.stack([np.sin(azimuth), np.zeros(_POSES), np.cos(azimuth)], axis=1)
+        right = np.stack([-np.cos(azimuth), np.zeros(_POSES), np.sin(azimuth)], axis=1)
         up = np.sin(elevation)[:, None] * ahead + np.cos(elevation)[:, None] * np.array(
             [0.0, 1.0, 0.0]
         )

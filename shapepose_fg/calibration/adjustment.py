@@ -20,13 +20,14 @@ from shapepose_fg.calibration.people import People
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.decompositions import nearest_rotation
-from shapepose_fg.core.scales import ANYWHERE_M, TINY
-from shapepose_fg.estimation.trajectory_graph import optimised
+from shapepose_fg.estimation.trajectory_graph import ANYWHERE_M, optimised
 from shapepose_fg.setup_check import fit
 
 LENS = [9, 10, 11, 12]
 """Parameters of a camera beside `fit.PARAMETERS`: k1 k2 p1 p2."""
 Q = fit.Q + len(LENS)
+_HELD = 1e-6
+"""Standard deviation of fixed parameters, rad or m."""
 _HELD_PX = 0.1
 """Standard deviation added to those of intrinsics and distortion, pixels; tighter constraints on
 single parameters would slow the convergence of shared ones."""
@@ -125,12 +126,12 @@ def adjust(
         values.insert(C(each), _lens(camera, camera))
         sigmas = freedoms[each].sigmas / weight
         pose = diagonal(
-            np.full(6, TINY) if each == reference else np.maximum(sigmas[:6], TINY), kernel
+            np.full(6, _HELD) if each == reference else np.maximum(sigmas[:6], _HELD), kernel
         )
         priors.addPriorPose3(X(each), gtsam.Pose3(before.wTc), pose)
         noise = gaussian(_lens_covariance(before, sigmas))
         priors.add(gtsam.PriorFactorCal3DS2(C(each), _lens(before, camera), noise))
-    priors.addPriorPose3(B(0), gtsam.Pose3(), diagonal(np.full(6, TINY)))
+    priors.addPriorPose3(B(0), gtsam.Pose3(), diagonal(np.full(6, _HELD)))
     last = [B(0), *(letter(each) for letter in (X, C) for each in range(len(start)))]
     both = gtsam.NonlinearFactorGraph(graph)
     both.push_back(priors)

@@ -17,6 +17,7 @@ from shapepose_fg.calibration.adjustment import Adjusted, Freedom
 from shapepose_fg.calibration.arrangement import Edge, arranged, parts
 from shapepose_fg.calibration.levelling import (
     ADULT_M,
+    CONTRADICTS,
     Measured,
     World,
     apart,
@@ -26,19 +27,17 @@ from shapepose_fg.calibration.levelling import (
     scale_of,
     sigma_of_scale,
 )
-from shapepose_fg.calibration.people import Footage, missed_px
+from shapepose_fg.calibration.people import LEAST_PEOPLE, Footage, missed_px
 from shapepose_fg.calibration.refinement import FILM, Steps, Undetermined, halves, settle
 from shapepose_fg.calibration.relative import Relative, relative
-from shapepose_fg.calibration.synchronisation import LEAST_S
 from shapepose_fg.calibration.tracks import OneClock, Tracks, seen_at
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.decompositions import rigid
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.frame_times import FrameTimes
-from shapepose_fg.core.scales import OUTLIER_SIGMA
 from shapepose_fg.setup_check.fit import FOCAL, MOVE, TURN
-from shapepose_fg.setup_check.matching import MIN_SIGHTINGS, Sightings
+from shapepose_fg.setup_check.matching import Sightings
 
 _BURST_S, _BURSTS = 10.0, 6
 """Duration of the intervals in which people are tracked, s, and their number, spread over the
@@ -46,8 +45,8 @@ recording."""
 _FEW, _ROUGH, _ROUNDS, _HALF_ROUNDS = 30, 6, 6, 2
 """Number of frames in the first rounds, number of these rounds, of rounds with all frames, and of
 rounds with each half of them."""
-_LEAST_SCORE = 0.15
-"""Minimum score of a pair of cameras."""
+_LEAST_SCORE, _LEAST_S = 0.15, 3.0
+"""Minimum score of a pair of cameras, and minimum common person-seconds."""
 _MOST_SIGMA_DEG, _MOST_APART_DEG = 1.0, 2.0
 """Maximum standard deviation of a rotation, and maximum difference between halves of the recording,
 degrees."""
@@ -179,7 +178,7 @@ def calibrate(
     if not measured.distances:
         return found
     notes, tall = measured.better(adjusted, sigma), np.log(world.stature_m / ADULT_M)
-    if abs(tall) >= OUTLIER_SIGMA * sigma_of_scale(world.persons, False):
+    if abs(tall) >= CONTRADICTS * sigma_of_scale(world.persons, False):
         what = f"the median stature of people is {world.stature_m:.2f} m"
         notes += (f"{what}; if they are adults, measure the distance of the cameras again",)
     return replace(found, notes=notes)
@@ -203,7 +202,7 @@ def _pairs(
     for a, b in combinations(range(len(rig)), 2):
         each = relative(tracks[a], tracks[b], fps)
         told()
-        if each is not None and each.score >= _LEAST_SCORE and each.seconds >= LEAST_S:
+        if each is not None and each.score >= _LEAST_SCORE and each.seconds >= _LEAST_S:
             found[a, b] = each
     return found
 
@@ -213,9 +212,9 @@ def own_tracks(sightings: Sightings, rig: Rig, fps: float) -> list[Tracks]:
     few people.
     """
     seen_s = np.bincount(sightings.view, minlength=len(rig)) / fps
-    if len(few := np.flatnonzero(seen_s < LEAST_S)) > 0:
+    if len(few := np.flatnonzero(seen_s < _LEAST_S)) > 0:
         figures = ", ".join(f"{each:.1f}" for each in seen_s[few])
-        least = f"at least {LEAST_S:g} s of a person are needed, but only {figures} s are seen"
+        least = f"at least {_LEAST_S:g} s of a person are needed, but only {figures} s are seen"
         raise Undetermined((f"{_named(rig, few)}: {least}; {FILM}",))
     still = Views(rig.K, np.tile(np.eye(3, 4), (len(rig), 1, 1)))
     return [Tracks.of(sightings, still, view, fps) for view in range(len(rig))]
@@ -255,14 +254,14 @@ def _judged(
         adjusted, world, apart_deg, apart_m, held, counts, counts / np.maximum(seen, 1), missed
     )
     sigma = np.degrees(adjusted.sigma(TURN))
-    few, vague = counts < MIN_SIGHTINGS, sigma > _MOST_SIGMA_DEG
+    few, vague = counts < LEAST_PEOPLE, sigma > _MOST_SIGMA_DEG
     torn = apart_deg > _MOST_APART_DEG
     kinds = (
         (
             few,
             counts,
             (
-                f"only {{}} people are seen by another camera, too, but at least {MIN_SIGHTINGS} "
+                f"only {{}} people are seen by another camera, too, but at least {LEAST_PEOPLE} "
                 "are needed"
             ),
         ),

@@ -12,7 +12,6 @@ from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.decompositions import nearest_rotation
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.scales import OUTLIER_SIGMA
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.floor import Floor, find_floor
 from shapepose_fg.setup_check.diagnosis import build_of
@@ -26,6 +25,8 @@ _TAPE_M = 0.02
 """Standard deviation of a distance between lenses that was measured with a tape, m."""
 _CLEARLY = 1.3
 """Ratio of standard deviations from which another measurement is recommended."""
+CONTRADICTS = 3.0
+"""Number of standard deviations above which measurements contradict each other."""
 _LEAN_RAD = np.radians(3.0)
 """Maximum lean of people's mean trunk for the search of the floor, rad."""
 _ANKLE_M = 0.10
@@ -80,7 +81,7 @@ class Measured:
         weight, said = 1 / sigma**2, np.log(metres / length)
         log = float(np.average(said, weights=weight))
         worst = int(np.abs((said - log) / sigma).argmax())
-        if abs(said[worst] - log) > OUTLIER_SIGMA * sigma[worst]:
+        if abs(said[worst] - log) > CONTRADICTS * sigma[worst]:
             a, b, given = self.distances[worst]
             raise InputError(
                 f"distance of {rig.names[a]} and {rig.names[b]}: people and the other distances "

@@ -15,29 +15,24 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import gammaincinv
 
-from factors.noise import DEFAULT_WIDTH_SIGMA
 from shapepose_fg.body.model.rotation import hat
 from shapepose_fg.calibration.adjustment import Adjusted, Freedom
 from shapepose_fg.calibration.from_people import Undetermined
-from shapepose_fg.calibration.people import Footage, People
+from shapepose_fg.calibration.people import MIN_DEPTH_M, Footage, People
 from shapepose_fg.calibration.refinement import dilution
-from shapepose_fg.calibration.synchronisation import WHOLE_S
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Camera, Rig, Views
 from shapepose_fg.core.decompositions import nearest_rotation, rigid
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.rows import Rows
-from shapepose_fg.core.scales import ANYWHERE_M, MOST_STEPS, STEP, SURE, TINY
 from shapepose_fg.core.trajectory import Trajectory
-from shapepose_fg.estimation.camera_pose_uncertainty import POSES_LAST_S
-from shapepose_fg.estimation.floor import TILT_RAD
-from shapepose_fg.estimation.gated_views import MIN_DEPTH_M
-from shapepose_fg.estimation.trajectory_graph import correlated
+from shapepose_fg.estimation.trajectory_graph import ANYWHERE_M, correlated
 from shapepose_fg.setup_check.fit import POSE, Q, by_parameters, seen_by
-from shapepose_fg.setup_check.matching import MIN_SIGHTINGS, Sightings, follow, median_of
+from shapepose_fg.setup_check.matching import Sightings, follow, median_of
 
-_STEP_S = 0.2
-"""Time between the moments at which people are placed, s."""
+_STEP_S, _LONGEST_S = 0.2, 180.0
+"""Time between the moments at which people are placed, and duration used of a longer recording,
+s."""
 _LEAST_S, _LEAST_WAY_M = 4.0, 0.4
 """Minimum common duration of two tracks, s, and standard deviation of the person's position in it,
 m."""
@@ -50,21 +45,29 @@ _PEAKS, _TRIED = 3, 60
 """Number of offsets for each pair of tracks, and of all registrations, that are tried."""
 _OTHER_S, _OTHER_DEG = 1.0, 10.0
 """Distances above which two starts are different, s and degrees."""
-_LEAST_SHARE, _LEAST_LEAD = 0.7, 1.25
-"""Minimum share of the people in view that agree with the start, and minimum ratio of their number
-to that of any other start."""
+_LEAST_SHARE, _LEAST_LEAD, _LEAST_PEOPLE = 0.7, 1.25, 25
+"""Minimum share of the people in view that agree with the start, minimum ratio of their number to
+that of any other start, and minimum number."""
+_KNOT_S = 3.0
+"""Time between the knots between which an odometry drifts linearly, s."""
 _DRIFTS = np.log(3.0)
 """Standard deviation of the log of the ratio of an odometry's drift to the stated one."""
-_LEVEL_RAD = np.radians(6.0)
-"""Maximum deviation from the vertical of a log's axis that is along gravity, rad."""
-_CONVERGED = 0.01
-"""The change of all parameters below which
+_LEVEL_RAD, _TILT_RAD = np.radians(6.0), np.radians(0.5)
+"""Maximum deviation from the vertical of a log's axis that is along gravity, and the standard
+deviation of that of the world's vertical axis."""
+_STEPS, _CONVERGED = 15, 0.01
+"""Maximum number of steps in each round of adjustment, and the change of all parameters below which
 it has converged, prior standard deviations."""
-_SAMPLES = 30
-"""Number of frames for which the uncertainty of poses is averaged."""
+_SAMPLES, _TINY, _LEAST_VARIANCE = 30, 1e-4, 1e-6
+"""Number of frames for which the uncertainty of poses is averaged; step of numerical derivatives;
+and minimum share of a parameter's variance that is an error of its own."""
+_WIDTH = 2.385
+"""Width of the Cauchy kernel, in standard deviations: 95 % efficient for normal errors."""
 _RIGID, _LONG_M, _FEWEST = 0.1, 0.25, 3
 """Maximum relative variation of the distance of two joints of a bone, its minimum, m, and minimum
 number of bones that give the distance of a person."""
+_SURE = 0.95
+"""Probability with which the errors of the poses are below the reported bounds."""
 _QUARTERS = rigid(
     Rotation.from_euler("z", [[90 * n] for n in range(4)], degrees=True).as_matrix(),
     np.zeros((4, 3)),
@@ -118,7 +121,7 @@ class Placed(Rows):
         frames at `time_s` (T, V), NaN for missing ones.
         """
         first = float(np.sort(np.nanmin(time_s, axis=0))[1])
-        last = min(float(np.sort(np.nanmax(time_s, axis=0))[-2]), first + WHOLE_S)
+        last = min(float(np.sort(np.nanmax(time_s, axis=0))[-2]), first + _LONGEST_S)
         moments = np.arange(first, last, _STEP_S)
         number = np.full(time_s.shape, -1)
         for own, of_moment in zip(time_s.T, number.T, strict=True):
@@ -148,7 +151,7 @@ def _moved_by(people: People, found: Adjusted) -> Array:
     sigma = np.sqrt(np.maximum(np.diag(square), 0.0))
     scale = np.where(sigma > 0, sigma, 1.0)
     values, vectors = np.linalg.eigh(square / scale / scale[:, None])
-    kept = values > TINY
+    kept = values > _LEAST_VARIANCE
     errors = (sigma[:, None] * vectors[:, kept] * np.sqrt(values[kept])).T
     views, points = Views.of(rig), np.nan_to_num(people.points)
     xy, at, by_place = seen_by(points, views)
@@ -226,7 +229,7 @@ class Start:
         return (
             f"camera {name}: its trajectory starts {self.offset_s:+.3f} s after the first camera; "
             f"{self.share:.0%} of the people in its view agree; its poses are known to "
-            f"{self.within()} ({SURE:.0%})"
+            f"{self.within()} ({_SURE:.0%})"
         )
 
     def as_dict(self) -> dict[str, float]:
@@ -247,7 +250,7 @@ class Start:
         if self.within_deg <= most_deg and self.within_m <= most_m:
             return None
         return (
-            f"camera {name}: its poses are known to {self.within()} only ({SURE:.0%}), but "
+            f"camera {name}: its poses are known to {self.within()} only ({_SURE:.0%}), but "
             f"{most_deg:g} degrees and {1e3 * most_m:g} mm are asked (--tolerance); give the "
             "lenses of all cameras, film longer or two people, or accept the cameras as they are"
         )
@@ -309,7 +312,7 @@ class Filmed:
         def refuse(why: str) -> Undetermined:
             return Undetermined((f"camera {self.camera.name}: {why}; {cure}",))
 
-        if min(len(self.own_s), len(placed.time_s)) < MIN_SIGHTINGS:
+        if min(len(self.own_s), len(placed.time_s)) < _LEAST_PEOPLE:
             raise refuse("too few people are seen by it, or by two other cameras")
         tried = sorted(self._registered(placed, most_s), key=lambda each: -each.agreeing)[:_TRIED]
         tried = [self._judged(each, placed, _NEAR_M[0]) for each in tried]
@@ -320,7 +323,7 @@ class Filmed:
             if rival and all(self._differ(each, other) for other in best):
                 best.append(self._refined(each, placed, most_s, lens, sigma_scale))
         best.sort(key=lambda each: -each.agreeing)
-        if not best or best[0].agreeing < MIN_SIGHTINGS or best[0].share < _LEAST_SHARE:
+        if not best or best[0].agreeing < _LEAST_PEOPLE or best[0].share < _LEAST_SHARE:
             raise refuse("no start of its trajectory agrees with the people of the other cameras")
         first = best[0]
         others = [each.agreeing for each in best[1:] if self._differ(each, first)]
@@ -427,15 +430,14 @@ class Filmed:
             lens.centre_px / self.camera.K[0, 0],
         )
         clock = [float(most_s > 0)]
-        sigmas = [TILT_RAD, TILT_RAD, 1.0, *[ANYWHERE_M] * 3, unit, *[centre] * 2, *clock]
+        sigmas = [_TILT_RAD, _TILT_RAD, 1.0, *[ANYWHERE_M] * 3, unit, *[centre] * 2, *clock]
         for near_m in _NEAR_M:
             rows, frame, person, away, _ = self._matched(start, placed, near_m)
             used = away < near_m
-            if used.sum() < MIN_SIGHTINGS:
+            if used.sum() < _LEAST_PEOPLE:
                 break
-            begin, end = self.own_s[[0, -1]]
-            count = np.ceil((end - begin) / POSES_LAST_S) * (near_m == _NEAR_M[-1])
-            knots_s = np.linspace(begin, end, 1 + int(count))
+            count = np.ceil((self.own_s[-1] - self.own_s[0]) / _KNOT_S) * (near_m == _NEAR_M[-1])
+            knots_s = np.linspace(self.own_s[0], self.own_s[-1], 1 + int(count))
             given = replace(start, knots_s=knots_s)
             frame, rays = frame[used], self.rays[frame[used], person[used]]
             prior = np.array([*sigmas, lens.focal, lens.lens])
@@ -525,10 +527,10 @@ class _Fit:
         poses = self.filmed._placed(self.moved(x))
         slopes = np.zeros((len(poses), 6, len(x)))
         for n in range(len(self.sigmas) + self._steps.size):
-            other = self.filmed._placed(self.moved(x + STEP * (np.arange(len(x)) == n)))
+            other = self.filmed._placed(self.moved(x + _TINY * (np.arange(len(x)) == n)))
             turn = poses[:, :3, :3].mT @ other[:, :3, :3]
-            slopes[:, :3, n] = (turn - turn.mT)[:, [2, 0, 1], [1, 2, 0]] / 2 / STEP
-            slopes[:, 3:, n] = (other - poses)[:, :3, 3] / STEP
+            slopes[:, :3, n] = (turn - turn.mT)[:, [2, 0, 1], [1, 2, 0]] / 2 / _TINY
+            slopes[:, 3:, n] = (other - poses)[:, :3, 3] / _TINY
         return poses, slopes
 
     def _away(self, x: Array) -> tuple[Array, Array]:
@@ -560,12 +562,12 @@ class _Fit:
         kinds = np.concatenate([np.full(len(self.sigmas), -1), drift, np.full(modes, -1)])
         x = np.zeros(len(kinds))
         count = dilution(np.unique(self.placed.time_s))
-        for _ in range(MOST_STEPS):
+        for _ in range(_STEPS):
             away, J = self._away(x)
             every = np.abs(away).swapaxes(0, 1).reshape(away.shape[1], -1)
-            sigma = STEP + median_of(every, 1)[:, None] / 0.6745
+            sigma = _TINY + median_of(every, 1)[:, None] / 0.6745
             away, J = np.nan_to_num(away / sigma), np.nan_to_num(J / sigma[..., None])
-            weighted = J / (count * (1 + (away / DEFAULT_WIDTH_SIGMA["cauchy"]) ** 2))[..., None]
+            weighted = J / (count * (1 + (away / _WIDTH) ** 2))[..., None]
             information = np.tensordot(weighted, J, ([0, 1, 2], [0, 1, 2]))
             step = np.linalg.solve(
                 information + np.eye(len(x)), np.einsum("njcp,njc->p", weighted, away) + x
@@ -575,7 +577,7 @@ class _Fit:
                 break
         ratio, covariance = _with_drift(information, x, kinds)
         x = covariance @ (information @ x + x)
-        root = 1 / np.hypot(1, away / DEFAULT_WIDTH_SIGMA["cauchy"])
+        root = 1 / np.hypot(1, away / _WIDTH)
         varied = self._varied(root**2 * away, root[..., None] * J) / count**2
         covariance = covariance + covariance @ (varied - information) @ covariance
         slopes = self._poses(x)[1]
@@ -599,7 +601,7 @@ class _Fit:
         correlated over time, and between the joints of a person as those of `away` (N, J, 2) are.
         """
         alike = np.einsum("njc,nkc->jk", away, away)
-        size = np.sqrt(np.diag(alike)) + STEP
+        size = np.sqrt(np.diag(alike)) + _TINY
         values, vectors = np.linalg.eigh(alike / size / size[:, None])
         J = np.einsum("njcp,jk->nkcp", J, vectors * np.sqrt(np.maximum(values, 0.0)))
         total = np.zeros((J.shape[-1],) * 2)
@@ -613,12 +615,12 @@ class _Fit:
 
 def _root_mean_square(slopes: Array, covariance: Array, more: float) -> tuple[float, float]:
     """Root mean square of the errors `slopes` (F, 3, P) x, for x of a `covariance`, with `more`
-    variance of independent errors, and the bound of it with the probability `SURE`: the squares
+    variance of independent errors, and the bound of it with the probability `_SURE`: the squares
     have about a gamma distribution.
     """
     errors = np.einsum("fpn,fpm->nm", slopes, slopes) @ covariance / len(slopes)
     mean, scale = float(np.trace(errors)), 2 * float((errors * errors.T).sum() / np.trace(errors))
-    bound = scale * float(gammaincinv(mean / scale, SURE))
+    bound = scale * float(gammaincinv(mean / scale, _SURE))
     return (mean + more) ** 0.5, (bound + more) ** 0.5
 
 

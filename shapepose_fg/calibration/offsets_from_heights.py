@@ -15,7 +15,6 @@ import numpy as np
 from scipy.fft import next_fast_len
 
 from shapepose_fg.calibration.relative import relative
-from shapepose_fg.calibration.synchronisation import AROUND_S
 from shapepose_fg.calibration.tracks import FASTEST, Tracks, fast_part
 from shapepose_fg.core.arrays import Array
 
@@ -26,6 +25,8 @@ _BRISK_S = 0.5
 and rises in another's."""
 _LEAST_S = 1.0
 """Minimum common duration of two tracks, s."""
+_AROUND_S = 0.3
+"""Distance below which two offsets are the same, s."""
 _LEAST_ALIKE = 0.1
 """Minimum correlation that is used; that of different people is lower."""
 _PEAKS, _PAIRS = 8, 3
@@ -75,7 +76,7 @@ def offsets_without_poses(
             (worth, one, other, apart)
             for one, other in combinations(range(len(groups)), 2)
             for worth, apart in _peaks(
-                groups[one], groups[other], curves, most, round(AROUND_S * fps / step)
+                groups[one], groups[other], curves, most, round(_AROUND_S * fps / step)
             )
         ]
         best = (-1.0, 0, 1, 0)

@@ -8,10 +8,9 @@ from itertools import combinations
 import numpy as np
 
 from shapepose_fg.calibration.pairwise import Pairwise
-from shapepose_fg.calibration.tracks import FASTEST, Tracks, block_frames, fast_part
+from shapepose_fg.calibration.tracks import FAST_S, FASTEST, Tracks, block_frames, fast_part
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Views
-from shapepose_fg.core.scales import LASTS_S
 from shapepose_fg.setup_check.evidence import triangulate
 from shapepose_fg.setup_check.matching import (
     GATE,
@@ -192,7 +191,7 @@ class InSpace:
         each /= size[rows, view][:, None, None]
         length = np.linalg.norm(each, axis=-1)
         known = (length[0] < GATE / 2) & (length[1:] < FASTEST / self.fps).all(axis=0)
-        width = LASTS_S * self.fps / self.step
+        width = FAST_S * self.fps / self.step
         miss, calm, fast = (fast_part(part, known[..., None], whom, width) for part in each)
         if not known.any():
             return 0.0, np.full(blocks, np.inf)

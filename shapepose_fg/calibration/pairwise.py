@@ -8,14 +8,15 @@ from itertools import combinations
 import numpy as np
 
 from shapepose_fg.body.model.rotation import hat
-from shapepose_fg.calibration.people import MOST_SIGHTINGS
 from shapepose_fg.calibration.relative import Together
-from shapepose_fg.calibration.tracks import Tracks, block_frames, fast_part
+from shapepose_fg.calibration.tracks import FAST_S, Tracks, block_frames, fast_part
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Views
-from shapepose_fg.core.scales import LASTS_S
 from shapepose_fg.setup_check.matching import centres_of
 from shapepose_fg.setup_check.offset_scan import normals
+
+_MOST_SAMPLES = 3000
+"""Maximum number of frames of tracks that are compared for a pair of cameras."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class Pairwise:
         rows = [np.arange(one.first[who], stop[who]) for who, _ in pairs]
         whom = [np.full(len(each), pair[1]) for each, pair in zip(rows, pairs, strict=True)]
         every, tracks = (np.concatenate([np.zeros(0, np.intp), *each]) for each in (rows, whom))
-        thin = max(1, -(-len(every) // MOST_SIGHTINGS))
+        thin = max(1, -(-len(every) // _MOST_SAMPLES))
         return every[::thin], tracks[::thin]
 
     def miss(self, a: int, b: int, rows: Index, track: Index, apart: float) -> tuple[Array, Array]:
@@ -80,7 +81,7 @@ class Pairwise:
                 pace = max(float(np.median(np.diff(self.tracks[a].frame[rows]))), 1.0)
                 who = self.tracks[a].track[rows] * len(self.tracks[b].first) + track
                 miss, change = (
-                    fast_part(each, known, who, LASTS_S * self.fps / pace)
+                    fast_part(each, known, who, FAST_S * self.fps / pace)
                     for each in (np.clip(miss, -width, width), change)
                 )
                 width = 3.8 * np.median(np.abs(miss[known]))

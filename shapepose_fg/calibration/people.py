@@ -12,16 +12,21 @@ from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.estimation.gated_views import MIN_DEPTH_M, ObservationConfig
+from shapepose_fg.estimation.gated_views import ObservationConfig
 from shapepose_fg.estimation.trajectory_graph import WEAKEST_M
-from shapepose_fg.setup_check.evidence import ANCHORS, left_out, observed, triangulate
+from shapepose_fg.setup_check.evidence import left_out, observed, triangulate
 from shapepose_fg.setup_check.matching import GATE, Pairs, Sightings, size_of
 
-LEAST_STEP_S = 0.1
+LEAST_PEOPLE = 10
+"""Minimum number of people, one per frame, from which a camera is adjusted."""
+_LEAST_STEP_S = 0.1
 """Minimum time between used frames, s: errors of nearer ones are correlated (0.8)."""
-MOST_SIGHTINGS = 5_000
+MOST_FRAMES = 100
+_MOST_SIGHTINGS = 5_000
 """Maximum number of sightings; more of them, or of frames, cost time and add little information,
 because errors within a second are correlated."""
+MIN_DEPTH_M = 0.3
+"""Minimum depth of a used joint, m."""
 _NOISE = ObservationConfig()
 
 
@@ -61,13 +66,13 @@ class Footage:
         """Sightings in frames spread over the recording, as many as add information."""
         taken = times.frame_s[frames.start : frames.stop]
         lasts = float(taken[-1] - taken[0])
-        count = max(2, min(ANCHORS, len(taken), 1 + int(lasts / LEAST_STEP_S)))
+        count = max(2, min(MOST_FRAMES, len(taken), 1 + int(lasts / _LEAST_STEP_S)))
         wanted = np.searchsorted(taken, taken[0] + np.linspace(0.0, lasts, count)).clip(
             0, len(taken) - 1
         )
         chosen = frames.start + np.unique(wanted)
         sightings = seen_at(detections, chosen.tolist())
-        thin = -(-len(sightings) // MOST_SIGHTINGS)
+        thin = -(-len(sightings) // _MOST_SIGHTINGS)
         sightings = sightings.rows(np.isin(sightings.frame, chosen[::thin]))
         return cls.taken(sightings, rig, detections.skeleton)
 

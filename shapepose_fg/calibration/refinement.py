@@ -12,21 +12,21 @@ import numpy as np
 from shapepose_fg.body.model.rotation import exp_so3
 from shapepose_fg.calibration.adjustment import LENS, Adjusted, Freedom, adjust, misfit
 from shapepose_fg.calibration.levelling import apart, grown, scaled
-from shapepose_fg.calibration.people import Footage, People, missed_px
+from shapepose_fg.calibration.people import LEAST_PEOPLE, Footage, People, missed_px
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Camera, Rig, Views
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import FrameTimes
-from shapepose_fg.core.scales import SURE
 from shapepose_fg.estimation.trajectory_graph import correlated
 from shapepose_fg.setup_check.diagnosis import build_of, put_right
 from shapepose_fg.setup_check.evidence import gather
-from shapepose_fg.setup_check.findings import Finding, Kind
-from shapepose_fg.setup_check.fit import CENTRE, FOCAL, MOVE, ROUNDS, TURN, Q, difference
-from shapepose_fg.setup_check.matching import MIN_SIGHTINGS
+from shapepose_fg.setup_check.findings import SURE, Finding, Kind
+from shapepose_fg.setup_check.fit import CENTRE, FOCAL, MOVE, TURN, Q, difference
 from shapepose_fg.setup_check.small_errors import Problem
 
+_ROUNDS = 4
+"""Maximum number of rounds, each with people associated by the cameras of the round before."""
 _STILL_DEG = 0.03
 """Rotation per round below which cameras have converged, degrees."""
 FILM = (
@@ -177,11 +177,11 @@ def refine(
     fit = partial(
         settle,
         now=start,
-        rounds=ROUNDS,
+        rounds=_ROUNDS,
         given=start,
         times=times,
         freedom=freedom,
-        told=Steps(progress, 3 * ROUNDS),
+        told=Steps(progress, 3 * _ROUNDS),
         reference=reference,
     )
     found = fit(footage)
@@ -251,11 +251,11 @@ def settle(
     adjusted: Adjusted | None = None
     for step in range(rounds):
         people = footage.people(now)
-        if len(people) < MIN_SIGHTINGS or not people.seen.any():
+        if len(people) < LEAST_PEOPLE or not people.seen.any():
             raise Undetermined(
                 (
                     f"only {len(people)} people are seen by two cameras at once, but at least "
-                    f"{MIN_SIGHTINGS} are needed; {FILM}",
+                    f"{LEAST_PEOPLE} are needed; {FILM}",
                 )
             )
         prior = given if scale is None else given.at_poses(now.wTc)
@@ -308,7 +308,7 @@ def _undetermined(adjusted: Adjusted, freedom: Freedom, counts: Index) -> list[s
     }
     notes = []
     for view, camera in enumerate(adjusted.rig.cameras):
-        if counts[view] < MIN_SIGHTINGS:
+        if counts[view] < LEAST_PEOPLE:
             few = f"shares only {counts[view]} people with other cameras, too few"
             notes.append(f"camera {camera.name}: {few}; it is not changed")
             continue

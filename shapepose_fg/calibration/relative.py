@@ -13,15 +13,17 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from shapepose_fg.body.model.rotation import exp_so3, hat
-from shapepose_fg.calibration.people import LEAST_STEP_S
 from shapepose_fg.calibration.tracks import Tracks
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.compiled import kernel
 from shapepose_fg.core.decompositions import basis_across
-from shapepose_fg.core.scales import MOST_STEPS
-from shapepose_fg.setup_check.evidence import ANCHORS, KERNEL
+from shapepose_fg.setup_check.evidence import KERNEL
 from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS, depths_of_meeting
 
+_LOOK_S = 0.2
+"""Interval between compared frames, s: people's joints move by more than a detector's error."""
+_MOST_LOOKS = 80
+"""Maximum number of frames for scoring hypotheses."""
 _MOST_TRIED = 30
 """Maximum number of pairs of tracks for hypotheses, those with the longest common time."""
 _JOINTS_A_TRY = 240
@@ -34,6 +36,8 @@ _SAMPLES = 60
 in simulated recordings."""
 _FINALISTS = 6
 """Number of hypotheses that are refined."""
+_STEPS = 12
+"""Maximum number of evaluations for a hypothesis."""
 
 
 @dataclass(frozen=True)
@@ -109,9 +113,8 @@ def relative(one: Tracks, other: Tracks, fps: float) -> Relative | None:
     frames = np.intersect1d(one.frame, other.frame)
     if len(frames) == 0:
         return None
-    every = max(1, round(LEAST_STEP_S * fps))
-    looks = np.unique(frames // every * every)
-    looks = looks[np.unique(np.linspace(0, len(looks) - 1, ANCHORS).astype(np.intp))]
+    looks = np.unique((frames // max(1, round(_LOOK_S * fps))) * max(1, round(_LOOK_S * fps)))
+    looks = looks[np.unique(np.linspace(0, len(looks) - 1, _MOST_LOOKS).astype(np.intp))]
     seen = Together(one, other, looks)
     guesses = _guesses(one, other, seen)
     if len(guesses) == 0:
@@ -181,7 +184,7 @@ def _settled(E: Array, seen: Together, fps: float, looks: Index) -> Relative | N
         share = (
             float(ahead[np.isfinite(points[..., 0])].mean()) if np.isfinite(points).any() else 0.0
         )
-        step = float(np.median(np.diff(looks))) / fps if len(looks) > 1 else LEAST_STEP_S
+        step = float(np.median(np.diff(looks))) / fps if len(looks) > 1 else _LOOK_S
         best = Relative(R, t, score * max(0.0, 2 * share - 1), len(a) * step, points)
         kept = new
     return best
@@ -226,7 +229,7 @@ def refined_pose(R: Array, t: Array, a: Array, b: Array, size: Array) -> tuple[A
         return (b * Ea).sum(axis=1) / scale
 
     usual = max(KERNEL / 2, float(np.median(np.abs(residuals(np.zeros(5))))))
-    found = least_squares(residuals, np.zeros(5), loss="cauchy", f_scale=usual, max_nfev=MOST_STEPS)
+    found = least_squares(residuals, np.zeros(5), loss="cauchy", f_scale=usual, max_nfev=_STEPS)
     return moved(found.x)
 
 

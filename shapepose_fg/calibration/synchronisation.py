@@ -14,19 +14,22 @@ import numpy as np
 
 from shapepose_fg.calibration.offsets_in_space import InSpace
 from shapepose_fg.calibration.pairwise import Pairwise
-from shapepose_fg.calibration.people import LEAST_STEP_S
 from shapepose_fg.calibration.tracks import Tracks, at_regular_times
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.setup_check.matching import MIN_SIGHTINGS, Sightings
+from shapepose_fg.setup_check.matching import Sightings
 from shapepose_fg.setup_check.offset_scan import LEAST_MISS, scan
 
-LEAST_S = 3.0
+_STEP_S = 0.1
+"""Step of the first scan of offsets, s: people's joints move by 10 cm."""
+_LEAST_S = 3.0
 """Minimum common duration of two cameras, s; a third of the recording if that is less."""
-AROUND_S = 0.6
+_AROUND_S = 0.6
 """Distance below which two offsets are the same, s."""
+_LEAST_SEEN = 50
+"""Minimum number of people, one per frame, that a camera must see in tracks."""
 _SURE = 1.5
 """Minimum prominence of the best offset over all others, in their standard deviations: wrong ones
 were below 0.5, correct ones on Shelf above 1.9."""
@@ -55,6 +58,8 @@ class Synchronised:
     drift: Array
     """(V,) drift, seconds per second that the camera falls behind; 0 in recordings of under four
     minutes."""
+    drift_sigma: Array
+    """(V,) standard deviation of the drift."""
     middle_s: float
     """Time for which the offset is stated, on the camera's own clock, s."""
 
@@ -114,11 +119,13 @@ def synchronise(
     offset, sigma, sure = offsets(seen, rig, fps, first, most_s, np.zeros(len(rig)), progress)
     middle, none = (first.start + first.stop) / 2 / fps, np.zeros(len(rig))
     if len(first) == len(frames):
-        return Synchronised(offset, sigma, sure, none, middle)
+        return Synchronised(offset, sigma, sure, none, none, middle)
     seen = at_regular_times(Sightings.of(detections, frames[-end:]), time_s, fps)
-    later, *_ = offsets(seen, rig, fps, frames[-end:], _DRIFT_S, offset, progress)
+    later, later_sigma, _ = offsets(seen, rig, fps, frames[-end:], _DRIFT_S, offset, progress)
     lasts = (frames.stop - end / 2) / fps - middle
-    return Synchronised(offset, sigma, sure, (later - offset) / lasts, middle)
+    return Synchronised(
+        offset, sigma, sure, (later - offset) / lasts, np.hypot(sigma, later_sigma) / lasts, middle
+    )
 
 
 def offsets(
@@ -139,21 +146,21 @@ def offsets(
     sightings = replace(sightings, frame=sightings.frame - start[sightings.view])
     for view, name in enumerate(rig.names):
         tracks.append(Tracks.of(sightings, views, view, fps))
-        if len(tracks[view].frame) < MIN_SIGHTINGS:
+        if len(tracks[view].frame) < _LEAST_SEEN:
             raise InputError(
                 f"camera {name}: too few people are seen, or in single frames only, to estimate "
                 "the times of its frames; film people for a minute who walk about"
             )
     pairs = list(combinations(range(len(rig)), 2))
-    step = max(1, round(LEAST_STEP_S * fps))
-    common = min(LEAST_S * fps, len(frames) / 3)
+    step = max(1, round(_STEP_S * fps))
+    common = min(_LEAST_S * fps, len(frames) / 3)
     most = min(round(most_s * fps), int(len(frames) - common)) // step * step
     lags = np.arange(-most, most + 1, step)
     curves = {}
     for number, (a, b) in enumerate(pairs):
         curves[a, b] = scan(sightings, views, a, b, lags, common)
         progress(number + 1, len(pairs))
-    coarse, sure = chosen(curves, lags, len(rig), round(AROUND_S * fps))
+    coarse, sure = chosen(curves, lags, len(rig), round(_AROUND_S * fps))
     fine = Pairwise(tracks, views, coarse.astype(float), fps)
     shift, covariance = fine.solved()
     if len(rig) > 2:

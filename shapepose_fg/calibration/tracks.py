@@ -9,7 +9,6 @@ from scipy.ndimage import correlate1d, gaussian_filter1d
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.detections import DetectionSequence
-from shapepose_fg.core.scales import LASTS_S, SPEED_S
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.setup_check.matching import MIN_JOINTS, Sightings, follow, median_of, rays_of
 
@@ -18,6 +17,11 @@ _SAME = 0.08
 size."""
 _SHORTEST_S = 0.4
 """Minimum duration of a track, s."""
+_SMOOTH_S = 0.05
+"""Standard deviation of the smoothing kernel of tracks, s."""
+FAST_S = 1.0
+"""Time scale above which changes are removed from residuals, s, and duration within which errors
+count as one: errors of detectors and cameras are correlated."""
 FASTEST = 2.0
 """Maximum speed of a joint, statures per second; faster ones are identity switches."""
 _SAME_TIME = 1e-3
@@ -74,7 +78,7 @@ class Tracks:
             np.arange(int(seen.frame[rows[0]]), int(seen.frame[rows[-1]]) + 1) for rows in parts
         ]
         joints = seen.xy.shape[1]
-        every = [_smoothed(rays[rows], seen.frame[rows], SPEED_S * fps) for rows in parts]
+        every = [_smoothed(rays[rows], seen.frame[rows], _SMOOTH_S * fps) for rows in parts]
         sizes = [
             np.interp(f, seen.frame[rows], size[rows])
             for f, rows in zip(frames, parts, strict=True)
@@ -224,7 +228,7 @@ def block_frames(fps: float, lasts: float) -> float:
     """Number of frames that count as one correlated error; fewer in short recordings of `lasts`
     frames.
     """
-    return max(1.0, min(LASTS_S * fps, lasts / 12))
+    return max(1.0, min(FAST_S * fps, lasts / 12))
 
 
 def fast_part(values: Array, known: Mask, track: Index, width: float) -> Array:

@@ -23,9 +23,11 @@ from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.frame_times import FrameTimes
-from shapepose_fg.core.scales import SAME_TIME_S
-from shapepose_fg.setup_check.fit import ROUNDS
 from shapepose_fg.setup_check.matching import Sightings
+
+_ROUNDS = 4
+_STILL_S = 0.001
+"""Change per round below which offsets have converged, s."""
 
 
 def calibrate_unsynchronised(
@@ -50,11 +52,11 @@ def calibrate_unsynchronised(
     V = len(rig)
     frames = frames[: round(WHOLE_S * fps)]
     sightings = at_regular_times(Sightings.of(detections, frames), time_s, fps)
-    total = V - 1 + 100 * ROUNDS
+    total = V - 1 + 100 * _ROUNDS
     tracks = own_tracks(sightings, rig, fps)
     shift = offsets_without_poses(tracks, fps, most_s, Steps(progress, total))
     following, found, problems = next_of(sightings), None, tuple[str, ...]()
-    for turn in range(ROUNDS):
+    for turn in range(_ROUNDS):
         seen = on_one_clock(sightings, following, shift, detections.skeleton)
         times = FrameTimes.from_fps(fps, seen.frames.stop)
         begin = V - 1 + 100 * turn
@@ -76,12 +78,12 @@ def calibrate_unsynchronised(
             sightings, found.rig, fps, frames, most_s, np.zeros(V), lambda *_: None
         )
         before, shift = shift, -offset * fps
-        if np.abs(shift - before).max() < SAME_TIME_S * fps:
+        if np.abs(shift - before).max() < _STILL_S * fps:
             break
     assert found is not None
     progress(total, total)
-    middle = (frames.start + frames.stop) / 2 / fps
-    clocks = Synchronised(offset, sigma, sure, np.zeros(V), middle)
+    none, middle = np.zeros(V), (frames.start + frames.stop) / 2 / fps
+    clocks = Synchronised(offset, sigma, sure, none, none, middle)
     if problems := (*problems, *clocks.undetermined(rig)):
         raise Undetermined(problems, found)
     return found, clocks

@@ -12,9 +12,11 @@ from shapepose_fg.core.arrays import Array, Index, Real
 from shapepose_fg.core.bounds import Axis as Axis
 from shapepose_fg.core.decompositions import is_rotation, nearest_rotation, rigid
 from shapepose_fg.core.lens import COEFFICIENTS, Lens, distorted, padded_distortion, undistorted
-from shapepose_fg.core.scales import LARGEST, LONGEST_NAME
-from shapepose_fg.core.trajectory import Carried, Trajectory
+from shapepose_fg.core.trajectory import MOST_METRES, Carried, Trajectory
 
+_MOST_PIXELS, _MOST_DISTORTION, _LONGEST_NAME = 1_000_000, 1e6, 200
+"""Upper bounds of the size of a picture, pixels, of distortion coefficients, and of the length of a
+name. Real values are smaller; larger ones would cause overflows."""
 LONGEST_READOUT_S = 0.1
 """Longest readout time that is accepted, s: rolling shutters take 5 to 30 ms."""
 
@@ -52,8 +54,10 @@ class Camera:
         if self.lens not in COEFFICIENTS:
             raise refuse(f"lens must be perspective or fisheye, got {self.lens!r}")
         lengths = [(count,) for count in COEFFICIENTS[self.lens]]
-        arrays = {"K": ([(3, 3)], LARGEST)} | dict.fromkeys(("wTc", "bTc"), ([(4, 4)], LARGEST))
-        for name, (shapes, most) in (arrays | {"distortion": (lengths, LARGEST)}).items():
+        arrays = {"K": ([(3, 3)], _MOST_PIXELS)} | dict.fromkeys(
+            ("wTc", "bTc"), ([(4, 4)], MOST_METRES)
+        )
+        for name, (shapes, most) in (arrays | {"distortion": (lengths, _MOST_DISTORTION)}).items():
             value = np.asarray(getattr(self, name), dtype=np.float64)
             if value.shape not in shapes:
                 raise refuse(f"{name} must be {' or '.join(map(str, shapes))}, got {value.shape}")
@@ -68,17 +72,18 @@ class Camera:
             if not is_rotation(R):
                 raise refuse(f"the rotation of {name} must be orthonormal with determinant 1")
         width, height = self.image_size
-        if not 0 < min(width, height) <= max(width, height) <= LARGEST:
+        if not 0 < min(width, height) <= max(width, height) <= _MOST_PIXELS:
             raise refuse(
-                f"image_size must be positive and at most {LARGEST:g}, got {self.image_size}"
+                f"image_size must be positive and at most {_MOST_PIXELS}, got {self.image_size}"
             )
         if not 0 <= self.readout_s <= LONGEST_READOUT_S:
             raise refuse(
                 f"readout_s must be 0 to {LONGEST_READOUT_S:g} seconds, got {self.readout_s}"
             )
-        if not self.name or len(self.name) > LONGEST_NAME or not self.name.isprintable():
+        if not self.name or len(self.name) > _LONGEST_NAME or not self.name.isprintable():
             raise ValueError(
-                f"camera {self.name[:40]!r}: names must be 1 to {LONGEST_NAME} letters, in one line"
+                f"camera {self.name[:40]!r}: names must be 1 to {_LONGEST_NAME} letters, in one "
+                "line"
             )
         way = PurePath(self.name)
         if way.is_absolute() or len(way.parts) == 0 or ".." in way.parts:

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 
 from shapepose_fg.core.arrays import Array
-from shapepose_fg.core.scales import LARGEST
 
-LEAST_FPS, MOST_FPS = 1e-3, LARGEST
+LEAST_FPS, MOST_FPS = 1e-3, 1e6
 """Lowest and highest accepted frame rate, Hz."""
 ASSUMED_FPS = 30.0
 """Frame rate that is assumed if none is given, Hz."""

@@ -3,8 +3,7 @@
 import re
 from collections.abc import Sequence
 
-from shapepose_fg.core.scales import LONGEST_NAME
-from shapepose_fg.core.skeleton import SKELETONS, Skeleton, body_skeleton
+from shapepose_fg.core.skeleton import LONGEST_NAME, SKELETONS, Skeleton, body_skeleton
 
 _ALIASES = {
     "BODY_25": "body25 openpose openposebody25",

@@ -3,8 +3,7 @@
 Numba caches compiled functions next to their source file, and discards them if this file changes.
 Here each module with kernels has a cache folder with a copy of its source, next to which Numba
 caches. The folder is named by a digest of the sources of the module and of everything that its
-kernels call, and of their numbers. The cache is therefore never stale, and is shared by all
-installations of a user.
+kernels call. The cache is therefore never stale, and is shared by all installations of a user.
 """
 
 import atexit
@@ -153,20 +152,14 @@ def _digest(module: str) -> str:
         features,
     )
     state = hashlib.sha256(repr(host).encode())
-    for each in sorted(_modules(module)):
-        state.update(Path(sys.modules[each].__file__ or "").read_bytes())
-        state.update(repr(_numbers(vars(sys.modules[each]))).encode())
+    for content in sorted(Path(each).read_bytes() for each in _sources(module)):
+        state.update(content)
     return state.hexdigest()[:16]
 
 
 @cache
-def _modules(module: str) -> frozenset[str]:
-    """A module and all modules from which its kernels call kernels or parts."""
+def _sources(module: str) -> frozenset[str]:
+    """Source files of a module and of all modules from which its kernels call kernels or parts."""
     inside = (getattr(each, "py_func", None) for each in vars(sys.modules[module]).values())
     others = {each.__module__ for each in inside if each is not None} - {module}
-    return frozenset({module}).union(*map(_modules, others))
-
-
-def _numbers(names: dict[str, Any]) -> list[tuple[str, float]]:
-    """The numbers of a module, imported ones included: Numba compiles them into its kernels."""
-    return sorted((name, each) for name, each in names.items() if isinstance(each, int | float))
+    return frozenset({str(sys.modules[module].__file__)}).union(*map(_sources, others))

@@ -8,8 +8,11 @@ import numpy as np
 
 from shapepose_fg.core.arrays import Mask
 from shapepose_fg.core.detections import DerivedFrames, Detections
-from shapepose_fg.core.scales import LEAST_JOINTS
 from shapepose_fg.core.trust import Trust, trust_in
+
+_LEAST = 4
+"""Minimum number of equal detections of two pictures: a few may be of something that does not
+move."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +66,7 @@ def repeated_views(before: Detections, now: Detections, views: int) -> Mask:
     ones.
     """
     there, was = (np.bincount(each.view, minlength=views) for each in (now, before))
-    alike = (there == was) & (there >= LEAST_JOINTS)
+    alike = (there == was) & (there >= _LEAST)
     sums = (np.bincount(each.view, each.confidence, views) for each in (now, before))
     alike &= np.equal(*sums)  # equal pictures have equal sums, different ones hardly ever
     if not alike.any():

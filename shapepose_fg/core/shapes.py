@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.errors import InputError, naming
-from shapepose_fg.core.scales import HUGE, TINY
 from shapepose_fg.core.storage.files import write_atomically
 from shapepose_fg.core.storage.npz import read_npz, write_npz
 from shapepose_fg.core.storage.schema import Column, Table
 
 _COLUMNS = ("names", "betas", "information", "body")
-_LEAST, _MOST = TINY, HUGE**2
+_LEAST, _MOST = 1e-6, 1e12
 """Smallest and largest eigenvalue of the information about a shape; the prior over adults has 1."""
 _CURE = "give a file that `--shapes` has written"
 

@@ -8,7 +8,9 @@ from functools import cached_property
 import numpy as np
 
 from shapepose_fg.core.arrays import Index
-from shapepose_fg.core.scales import LONGEST_NAME
+
+LONGEST_NAME = 64
+"""Maximum number of characters of a joint's name."""
 
 
 def check_joint_names(names: Iterable[str]) -> None:

@@ -9,12 +9,16 @@ import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.decompositions import is_rotation, rigid
-from shapepose_fg.core.scales import LARGEST, UNSEEN_S
 
 DRIFT = 0.01
 """Default drift of an odometry, per metre: wheel and visual odometry drift by about 1 % of the
 distance."""
+LONGEST_GAP_S = 0.5
+"""Longest gap between poses that is interpolated, s: the carrier moves up to 0.7 m at walking
+speed, or turns up to 45 degrees."""
 _MOST_DRIFT = 1.0
+MOST_METRES = 1e6
+"""Maximum coordinate of a position, m; farther away, double precision is too coarse for joints."""
 UNIT_LENGTH = 0.01
 """Largest deviation of the length of a quaternion from 1: files have two or more digits."""
 _START_M, _START_RAD = 0.05, 0.02
@@ -63,8 +67,8 @@ class Trajectory:
             )
         if not (np.isfinite(time_s).all() and np.isfinite(wTb).all()):
             raise refuse("times and poses must be finite")
-        if (most := float(np.abs(wTb[:, :3, 3]).max())) > LARGEST:
-            raise refuse(f"poses must be at most {LARGEST:g} m away, got {most:.3g}")
+        if (most := float(np.abs(wTb[:, :3, 3]).max())) > MOST_METRES:
+            raise refuse(f"poses must be at most {MOST_METRES:g} m away, got {most:.3g}")
         if (np.diff(time_s) <= 0).any():
             raise refuse(
                 "times must increase, but do not at pose "
@@ -105,9 +109,9 @@ class Trajectory:
         return replace(self, time_s=self.time_s - self.time_s[0] + first)
 
     def covers(self, time_s: Array) -> Mask:
-        """(...,) mask of the times between two poses that are at most `UNSEEN_S` apart."""
+        """(...,) mask of the times between two poses that are at most `LONGEST_GAP_S` apart."""
         after = np.clip(np.searchsorted(self.time_s, time_s), 1, len(self) - 1)
-        near = (np.diff(self.time_s)[after - 1] <= UNSEEN_S) | (self.time_s[after] == time_s)
+        near = (np.diff(self.time_s)[after - 1] <= LONGEST_GAP_S) | (self.time_s[after] == time_s)
         return np.asarray((time_s >= self.time_s[0]) & (time_s <= self.time_s[-1]) & near)
 
     def at(self, time_s: Array) -> Array:

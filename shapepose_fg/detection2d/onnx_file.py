@@ -8,11 +8,15 @@ onnx.proto, before the bytes are passed to a library.
 from pathlib import Path
 
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.scales import MOST_ITEMS
-from shapepose_fg.core.storage.files import MOST_DEPTH, read_bytes
+from shapepose_fg.core.storage.files import read_bytes
 
 MOST_BYTES = 2**29
 """Largest file, bytes; networks of people's joints have 2 to 400 MB."""
+_MOST_DEPTH = 100
+"""Maximum depth of nested messages; protobuf's own limit."""
+_MOST_FIELDS = 2**20
+"""Maximum number of fields of the visited messages; networks have ten thousand to a hundred
+thousand."""
 _FIXED_BYTES = {1: 8, 5: 4}
 """Lengths, bytes, of protobuf's wire types with a fixed length."""
 
@@ -68,13 +72,13 @@ def _is_whole(content: memoryview) -> bool:
     waiting, fields = [("model", 0, len(content), 0)], 0
     while len(waiting) > 0:
         message, at, end, depth = waiting.pop()
-        if depth > MOST_DEPTH:
-            raise _Broken(f"its graphs are over {MOST_DEPTH} messages deep")
+        if depth > _MOST_DEPTH:
+            raise _Broken(f"its graphs are over {_MOST_DEPTH} messages deep")
         inner = _MESSAGES[message]
         while at < end:
             fields += 1
-            if fields > MOST_ITEMS:
-                raise _Broken(f"it has over {MOST_ITEMS} fields")
+            if fields > _MOST_FIELDS:
+                raise _Broken(f"it has over {_MOST_FIELDS} fields")
             start, (tag, at) = at, _varint(content, at, end)
             field, kind = tag >> 3, tag & 7
             if field == 0 or tag >= 2**32 or at - start > max(1, -(-tag.bit_length() // 7)):

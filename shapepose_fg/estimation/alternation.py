@@ -8,16 +8,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from shapepose_fg.body.fitting.evidence import LEAST_JOINTS
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, FitStatus, JointTargets
 from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.notes import Problem
 from shapepose_fg.core.observations import Observations, window_rows
 from shapepose_fg.core.reconstruction import Known
-from shapepose_fg.core.scales import BODY_M, DETECTOR_M, LEAST_JOINTS
 from shapepose_fg.estimation.alternation_covariances import state_covariances
 from shapepose_fg.estimation.camera_pose_uncertainty import carried_covariance
-from shapepose_fg.estimation.draft import first_places
+from shapepose_fg.estimation.draft import MODEL_SIGMA_M, first_places
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.frame_graph import WindowGraph
 from shapepose_fg.estimation.gated_views import (
@@ -36,6 +36,9 @@ from shapepose_fg.estimation.window_solution import (
     strong_detections,
     tied,
 )
+
+JOINT_SIGMA_M = 0.03
+"""Standard deviation of all joints to which a body is fitted, metres."""
 
 
 def alternate(
@@ -79,7 +82,7 @@ def alternate(
 def _targets(X: Array, enough: Mask) -> JointTargets:
     """Targets of the bodies at X (N, J, 3), for rows with `enough` (N,) joints."""
     known = np.isfinite(X).all(axis=-1) & enough[:, None]
-    return JointTargets(np.nan_to_num(X), known[..., None, None] * np.eye(3) / DETECTOR_M**2)
+    return JointTargets(np.nan_to_num(X), known[..., None, None] * np.eye(3) / JOINT_SIGMA_M**2)
 
 
 def body_constraints(fit: BodyFit, pulled: Mask, sigma_m: float) -> JointTargets:
@@ -88,7 +91,7 @@ def body_constraints(fit: BodyFit, pulled: Mask, sigma_m: float) -> JointTargets
     """
     pulled = pulled & fit.ok[:, None]
     information = np.zeros_like(fit.covariance)
-    own = fit.covariance[pulled] + BODY_M**2 * np.eye(3)
+    own = fit.covariance[pulled] + MODEL_SIGMA_M**2 * np.eye(3)
     information[pulled] = np.eye(3) / sigma_m**2 if sigma_m > 0 else np.linalg.inv(own)
     return JointTargets(np.where(pulled[..., None], fit.joints, np.nan), information)
 

@@ -6,14 +6,16 @@ import gtsam
 import numpy as np
 
 from shapepose_fg.core.arrays import Array
-from shapepose_fg.core.scales import ANYWHERE_M
 from shapepose_fg.estimation.frame_graph import WindowGraph
+
+UNDETERMINED_M = 10.0
+"""Standard deviation, metres, above which a joint is undetermined, in its worst direction."""
 
 
 def state_covariances(graphs: Sequence[WindowGraph]) -> list[Array]:
     """For each solved graph, covariances (1, J, 3, 3) of positions, m².
 
-    NaN for joints not in the problem, and for undetermined ones (`ANYWHERE_M`): singular
+    NaN for joints not in the problem, and for undetermined ones (`UNDETERMINED_M`): singular
     systems raise no error.
     """
     known = dict[int, gtsam.Marginals]()
@@ -54,10 +56,10 @@ def _damped(graph: WindowGraph) -> gtsam.NonlinearFactorGraph:
 
 
 def determined(covariance: Array) -> Array:
-    """Return covariances (..., 3, 3), with NaN for those above `ANYWHERE_M` in some
+    """Return covariances (..., 3, 3), with NaN for those above `UNDETERMINED_M` in some
     direction.
     """
     largest = np.trace(covariance, axis1=-2, axis2=-1)  # upper bound
-    doubtful = np.isfinite(largest) & (largest >= ANYWHERE_M**2)
+    doubtful = np.isfinite(largest) & (largest >= UNDETERMINED_M**2)
     largest[doubtful] = np.linalg.eigvalsh(covariance[doubtful])[..., -1]
-    return np.where((largest < ANYWHERE_M**2)[..., None, None], covariance, np.nan)
+    return np.where((largest < UNDETERMINED_M**2)[..., None, None], covariance, np.nan)

@@ -7,9 +7,9 @@ import numpy as np
 from shapepose_fg.body.kernels.solving import solved
 from shapepose_fg.body.model.rotation import exp_so3
 from shapepose_fg.core.arrays import Array, Index, Mask
-from shapepose_fg.core.scales import TINY
 from shapepose_fg.estimation.body_window import (
     DAMPING,
+    HELD,
     SETTLED_M,
     STEPS,
     Around,
@@ -95,7 +95,7 @@ class BodyFrames(BodyWindow):
     def covariances(self, state: BodyState) -> Marginals:
         """Marginal covariances of every row's variables, around the last solution."""
         H, _ = frame_systems(self, state)
-        H[:, range(H.shape[1]), range(H.shape[1])] += np.repeat([1.0, TINY], [10, H.shape[1] - 10])
+        H[:, range(H.shape[1]), range(H.shape[1])] += np.repeat([1.0, HELD], [10, H.shape[1] - 10])
         whole = np.asarray(np.linalg.inv(H), dtype=np.float64)
         poses, across = whole[:, 10:, 10:], whole[:, 10:, :10]
         return Marginals(self, state, poses, np.zeros_like(poses), whole[:, :10, :10], across)

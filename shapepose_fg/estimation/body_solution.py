@@ -9,14 +9,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.motion import CONSTANT_VELOCITY
+from shapepose_fg.body.fitting.evidence import LEAST_JOINTS
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, FitStatus, JointTargets
 from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.notes import Problem
 from shapepose_fg.core.observations import Observations, window_rows
 from shapepose_fg.core.reconstruction import Known
-from shapepose_fg.core.scales import LEAST_JOINTS, RECENT_S
 from shapepose_fg.estimation.body_frames import BodyFrames
 from shapepose_fg.estimation.body_window import BodyWindow, Marginals
 from shapepose_fg.estimation.camera_pose_uncertainty import carried_covariance
@@ -36,6 +35,7 @@ from shapepose_fg.estimation.gated_views import (
 from shapepose_fg.estimation.in_time import near_in_time, velocities, waited_s
 from shapepose_fg.estimation.mirrored_sides import mirrored_spread
 from shapepose_fg.estimation.missed_detections import (
+    SPEED_M_S,
     elsewhere_variance,
     limbs_that_hide,
 )
@@ -53,6 +53,8 @@ from shapepose_fg.estimation.window_solution import (
 GATE_M = 0.1
 """rho_2D of Eq. 2 in windows, as a length at the joint's depth, at the initial estimate and in
 every round; more for detectors with larger errors."""
+RECENT_S = 0.25
+"""Time since a view last detected a joint, s, within which its motion determines it."""
 
 
 def solve_bodies(
@@ -131,7 +133,7 @@ def solve_bodies(
     elsewhere = elsewhere_variance(found.joints, observations.frame, strong, views, limbs)
     for person, of_bodies in zip(people, spread, strict=True):
         seen = np.asarray(strong[person.rows].any(axis=-1))
-        moved = np.square(CONSTANT_VELOCITY.start[0] * waited_s(seen, person.times_s))
+        moved = np.square(SPEED_M_S * waited_s(seen, person.times_s))
         moved = np.minimum(elsewhere[person.rows], moved)
         person.window.widen_unseen(of_bodies, moved / person.widen)  # a length, whatever the graph
         found.covariance[person.rows] = person.widen * person.window.of_joints(of_bodies)

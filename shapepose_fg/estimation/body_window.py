@@ -26,7 +26,6 @@ from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.rows import Rows
-from shapepose_fg.core.scales import LASTS_S, TINY, WELL_SEEN_M
 from shapepose_fg.estimation.asynchronous_views import carried_to_frames, leads, velocities_of
 from shapepose_fg.estimation.contact import (
     FREE_M2_S,
@@ -44,6 +43,11 @@ from shapepose_fg.estimation.motion_densities import MotionModel
 
 DEVIATION_M = 0.007
 """Standard deviation of a detector's joint from the body's, metres per axis."""
+POSE_LASTS_S = 1.0
+"""A pose is as good as independent of the one before after so long, seconds: the pose prior counts
+once in it."""
+_PLACED_M = 0.05
+"""Standard deviation by the views, m, up to which a foot is held in place where it stands."""
 _AVERAGED = 0.15
 """Ratio of the covariance of a seen foot's velocity to that from the views of its two frames alone,
 because a window averages over frames and joints: 0.11 to 0.25 in the median of each person in
@@ -55,6 +59,8 @@ errors of poses that nothing shows are larger than their Gaussian when they are 
 STEPS, SETTLED_M = 8, 2e-3
 """Most steps of the solver; it ends when joints move by less on average, metres. GTSAM's last step
 then moves them by a tenth of that."""
+HELD = 1e-6
+"""Information on every unknown, so that what nothing determines stays where it is."""
 DAMPING = 1e-3
 
 
@@ -137,7 +143,7 @@ class BodyWindow:
         )
         self.times_s = observations.time_s.mean(axis=1)
         steps = np.diff(self.times_s) if self.over_time else np.empty(0)
-        share = min(1.0, float(np.median(steps)) / LASTS_S) if len(steps) > 0 else 1.0
+        share = min(1.0, float(np.median(steps)) / POSE_LASTS_S) if len(steps) > 0 else 1.0
         self.energy = BodyEnergy(model, PosePrior.default().widened(share**-0.5))
         self.variance = np.full(self.sigmas_px.shape[:2], self.deviation_m**2)
         self.origin = np.zeros(3)
@@ -204,8 +210,8 @@ class BodyWindow:
         (`take`).
         """
         velocity = velocities(self.joints(state), self.times_s)[:, feet]
-        seen = np.asarray(self.last.evidence.sigma_m[:, feet] < WELL_SEEN_M)
-        of_views = inverses(self.last.evidence.information[:, feet] + TINY * np.eye(3))
+        seen = np.asarray(self.last.evidence.sigma_m[:, feet] < _PLACED_M)
+        of_views = inverses(self.last.evidence.information[:, feet] + HELD * np.eye(3))
         first, last, lasts = moments(self.times_s)
         covariance = _AVERAGED * (of_views[first] + of_views[last])
         covariance = covariance / lasts[:, None, None, None] ** 2
@@ -400,7 +406,7 @@ class BodyWindow:
             )
         M = (beyond.shape[-1] + 1) * N + 11
         kept, front = np.zeros((T, M, -(-N // 16) * 16)), np.zeros((M, M))
-        eliminated(here.system, root, diagonal + TINY, beyond, here.pull, damping, kept, front)
+        eliminated(here.system, root, diagonal + HELD, beyond, here.pull, damping, kept, front)
         return kept, front
 
     def _step(self, state: BodyState, here: Around, damping: float) -> tuple[Array, Array]:
@@ -504,7 +510,7 @@ class Marginals:
         flat = slope.reshape(T, 3 * J, -1)
         own = (flat @ self.poses).reshape(slope.shape) @ slope.mT
         both = (flat[1:] @ self.steps[:-1]).reshape(slope[1:].shape) @ slope[:-1].mT
-        goes = both @ inverses(own[:-1] + TINY * np.eye(3))
+        goes = both @ inverses(own[:-1] + HELD * np.eye(3))
         first, last, lasts = moments(self.window.times_s)
         across = own[first]
         for k in range(int((last - first).max(initial=0))):

@@ -11,8 +11,7 @@ import numpy as np
 
 from factors import body_keys, shape_key
 from shapepose_fg.core.arrays import Array, Mask
-from shapepose_fg.core.scales import TINY
-from shapepose_fg.estimation.body_window import BodyState, BodyWindow
+from shapepose_fg.estimation.body_window import HELD, BodyState, BodyWindow
 
 
 def gtsam_step(window: BodyWindow, state: BodyState) -> tuple[Array, Array]:
@@ -27,7 +26,7 @@ def gtsam_step(window: BodyWindow, state: BodyState) -> tuple[Array, Array]:
     H, pull = frame_systems(window, state)
     pull[:, 10:] -= window.last.pull
     at = np.arange(10, 10 + N)
-    H[:, at, at] += TINY
+    H[:, at, at] += HELD
     motion = list[gtsam.HessianFactor]()
     if window.links is not None:
         H[:, at, at] += window.links.diagonal[:T]

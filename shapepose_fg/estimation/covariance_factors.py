@@ -10,7 +10,6 @@ from functools import cache
 import numpy as np
 
 from shapepose_fg.core.arrays import Array
-from shapepose_fg.core.scales import LASTS_S
 from shapepose_fg.estimation.body_window import Marginals
 from shapepose_fg.estimation.noise_law import shipped_covariances
 
@@ -18,9 +17,9 @@ USUAL_M = 0.01
 """Standard deviation of people whom all views see, metres."""
 REJECTED = 0.1
 """Share of rejected evidence that means as much as a doubled variance."""
-_LASTS, _PRIOR_COUNT = 0.4, 20.0
-"""Usual share of errors that last (residuals `LASTS_S` apart are compared), and its weight as a
-number of squared standard deviations."""
+_LASTS_S, _LASTS, _PRIOR_COUNT = 1.0, 0.4, 20.0
+"""Time apart, s, at which residuals are compared for lasting errors; the usual share of these, and
+its weight as a number of squared standard deviations."""
 _LOOKS = 8
 """Number of frames, evenly over the window, from which it is taken how much it averages."""
 _ANYWHERE = 1e-3
@@ -132,12 +131,12 @@ def signs_of_lasting(marginals: Marginals) -> tuple[float, float]:
 
 def _share_lasting(marginals: Marginals) -> float:
     """Share of the detections' variance that lasts: the correlation of residuals that are
-    `LASTS_S` apart.
+    `_LASTS_S` apart.
     """
     window, evidence = marginals.window, marginals.window.last.evidence
     sigma = np.where(evidence.inlier, window.sigmas_px, np.inf)[..., None]
     ratio = np.nan_to_num(evidence.residual_px) / sigma
-    later = np.searchsorted(window.times_s, window.times_s + LASTS_S - 1e-3)
+    later = np.searchsorted(window.times_s, window.times_s + _LASTS_S - 1e-3)
     now = np.flatnonzero(later < len(window))
     first, second = ratio[now], ratio[later[now]]
     both = (first != 0) & (second != 0)

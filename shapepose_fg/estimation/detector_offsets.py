@@ -10,7 +10,6 @@ from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.core.bounds import Settings
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.observations import Observations
-from shapepose_fg.core.scales import DETECTOR_M, LEAST_VIEWS
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.gated_views import (
     ObservationConfig,
@@ -19,8 +18,12 @@ from shapepose_fg.estimation.gated_views import (
     triangulate,
 )
 
+_MIN_VIEWS = 3
+"""Minimum number of views that agree on a joint; two that agree may both be wrong."""
 _MIN_CONFIDENCE = 0.4
 """Minimum confidence of a detection from which an offset is estimated."""
+_MAX_SIGMA_M = 0.03
+"""Maximum standard deviation of a used joint in its worst direction, m."""
 
 
 @dataclass(frozen=True)
@@ -68,8 +71,8 @@ def confident_targets(
     evidence = linearise(observations, sigmas, evidence.target, views, config)
     sure = (evidence.inlier & (observations.confidence >= _MIN_CONFIDENCE)).sum(
         axis=-1
-    ) >= LEAST_VIEWS
-    sure &= evidence.sigma_m <= DETECTOR_M
+    ) >= _MIN_VIEWS
+    sure &= evidence.sigma_m <= _MAX_SIGMA_M
     return JointTargets(
         np.nan_to_num(evidence.target), np.where(sure[..., None, None], evidence.information, 0.0)
     )

@@ -4,11 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from shapepose_fg.body.fitting.evidence import LEAST_JOINTS
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, FitStatus, JointTargets
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
-from shapepose_fg.core.scales import BODY_M, LEAST_JOINTS
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.gated_views import (
     ViewEvidence,
@@ -18,6 +18,8 @@ from shapepose_fg.estimation.gated_views import (
     triangulate,
 )
 
+MODEL_SIGMA_M = 0.02
+"""Standard deviation of a detector's joints from the body's, metres."""
 DISAGREE = 6.0
 """Disagreement of a joint's views with the body, in standard deviations, at which they are wrong.
 With 4 more correct than wrong joints were rejected in simulated crowds."""
@@ -28,7 +30,7 @@ On `tune`, frame by frame, MPJPE is 35 mm, and 44 if the body is fitted once, to
 `rho_2d_m` of the triangulated joints. With priors that are stiff while the kernel is wide F1 rose
 by 1.5 points there, but raised arms sank on real footage."""
 
-MOVED_M = BODY_M
+MOVED_M = 0.02
 """Motion of a target, m, above which the body of an initial estimate is fitted again, similar to a
 detector's deviation from the body; or a changed weight. On Shelf a quarter of all fits remain."""
 
@@ -158,7 +160,9 @@ def drafted(evidence: ViewEvidence, body: BodyFit) -> tuple[Array, Array]:
     from the body are ignored, as its robust kernel did.
     """
     known = (body.ok[:, None] & np.isfinite(body.covariance).all(axis=(2, 3)))[..., None]
-    covariance = np.where(known[..., None], body.covariance + BODY_M**2 * np.eye(3), np.eye(3))
+    covariance = np.where(
+        known[..., None], body.covariance + MODEL_SIGMA_M**2 * np.eye(3), np.eye(3)
+    )
     of_body = np.where(known[..., None], inverses(covariance), 0.0)
     views, target = evidence.information, np.nan_to_num(evidence.target)
     at = np.where(known, body.joints, target)

@@ -5,7 +5,16 @@ smoothing.
 import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index, Mask
-from shapepose_fg.core.scales import KNOWN_M, LOOK_S, SPEED_S
+
+SPEED_S = 0.05
+"""Time before and after a frame for estimating a velocity, s; at least one frame."""
+_AROUND_S = 0.3
+"""Time before and after a step over which motion is a median, s; errors for a quarter of it have no
+effect."""
+_HOP_S = 0.045
+"""Minimum duration of a displacement for a speed, s; over less, noise dominates."""
+_KNOWN_M = 0.1
+"""Maximum standard deviation along an axis of a point used for motion, m."""
 
 
 def motion_of(points: Array, variance: Array, times_s: Array) -> tuple[Array, Array]:
@@ -15,31 +24,31 @@ def motion_of(points: Array, variance: Array, times_s: Array) -> tuple[Array, Ar
     The speed is the path length per second, so that a limb swinging back and forth is fast. The
     density is computed from second differences, minus the contribution of noise with `variance` (T,
     J) along an axis, m². Both are temporal medians, robust to a few wrong points, over points known
-    to `KNOWN_M`; 0 without any.
+    to `_KNOWN_M`; 0 without any.
     """
     at, joint = np.arange(len(times_s))[:, None], np.arange(points.shape[1])
-    known = np.asarray(np.isfinite(points).all(axis=2) & (variance < KNOWN_M**2))
+    known = np.asarray(np.isfinite(points).all(axis=2) & (variance < _KNOWN_M**2))
     velocity, hops, noise = [], [], [variance]
     for end in _hop_ends(known, times_s):
         hop = np.where(known & (end != at), times_s[end] - times_s[:, None], np.nan)
-        hops.append(np.where((np.abs(hop) < LOOK_S) | (np.abs(end - at) == 1), hop, np.nan))
+        hops.append(np.where((np.abs(hop) < _AROUND_S) | (np.abs(end - at) == 1), hop, np.nan))
         velocity.append((points[end, joint] - points) / hops[-1][..., None])
         noise.append(variance[end, joint] / hops[-1] ** 2)
     noise[0] = variance * (1 / hops[1] - 1 / hops[0]) ** 2
     turned = np.square(velocity[1] - velocity[0]).sum(axis=2) - 3 * np.sum(noise, axis=0)
-    first = np.searchsorted(times_s, times_s[:-1] - LOOK_S - 1e-6)
-    until = np.searchsorted(times_s, times_s[1:] + LOOK_S + 1e-6)
+    first = np.searchsorted(times_s, times_s[:-1] - _AROUND_S - 1e-6)
+    until = np.searchsorted(times_s, times_s[1:] + _AROUND_S + 1e-6)
     speed = np.linalg.norm(velocity, axis=3)
     return _median(speed, first, until), _median(turned[None] / (hops[1] - hops[0]), first, until)
 
 
 def _hop_ends(known: Mask, times_s: Array) -> tuple[Index, Index]:
-    """(T, J) for each frame, the nearest earlier and later frames, at least `SPEED_S` away, in
-    which a joint is `known` (T, J); the frame itself if none.
+    """(T, J) for each frame, the nearest earlier and later frames, at least `_HOP_S` away, in which
+    a joint is `known` (T, J); the frame itself if none.
     """
     T, at = len(times_s), np.arange(len(times_s))[:, None]
-    before = np.searchsorted(times_s, times_s - SPEED_S + 1e-9, side="right") - 1
-    after = np.searchsorted(times_s, times_s + SPEED_S - 1e-9)
+    before = np.searchsorted(times_s, times_s - _HOP_S, side="right") - 1
+    after = np.searchsorted(times_s, times_s + _HOP_S)
     earlier = np.maximum.accumulate(np.where(known, at, -1))[np.minimum(before, at[:, 0] - 1)]
     later = np.minimum.accumulate(np.where(known, at, T)[::-1])[::-1][
         np.clip(after, at[:, 0] + 1, T) % T

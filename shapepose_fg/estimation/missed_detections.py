@@ -6,8 +6,10 @@ import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.core.camera import Views, beside_segment
-from shapepose_fg.core.scales import LEAST_VIEWS
 
+LEAST_VIEWS = 3
+"""Minimum number of views with the joint in plain view but no detection; fewer often miss it by
+chance."""
 MISSED = 0.2
 """Share of joints in plain view with a missing or weak detection, in simulated crowds. One, two,
 three, four views miss 0.18, 0.046, 0.010 and 0.003 of them simultaneously, as if independent."""
@@ -18,6 +20,8 @@ ELSEWHERE_M = 0.25
 """Standard deviation per axis of such a joint, metres: within reach of its neighbour. Also an
 assumption: in simulated crowds with three and four cameras and a detector that knows every pose,
 the log score gives this no weight; the evidence is a stretched arm on real footage."""
+SPEED_M_S = 2.0
+"""Speed of a joint since a view last detected it, m/s: `factors.CONSTANT_VELOCITY.start`."""
 _BEHIND_M = 0.05
 """Minimum depth behind a limb for occlusion, m."""
 ARMS_AND_LEGS = {

@@ -20,7 +20,6 @@ from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.observations import Observations
-from shapepose_fg.core.scales import KNOWN_M, MOST_STEPS, OUTLIER_SIGMA
 from shapepose_fg.core.storage.files import read_json
 from shapepose_fg.estimation.gated_views import (
     ObservationConfig,
@@ -35,10 +34,17 @@ EDGES = (0.1, 0.3, 0.5, 0.7, 0.8, 0.9)
 each."""
 GROSS_M = 0.2
 """Standard deviation of a gross error along an axis, m. It lies on another joint or person."""
+_MIDDLES = (0.05, 0.2, 0.4, 0.6, 0.75, 0.85, 0.95)
 _GOOD_SCORE = 0.5
 """Minimum score of a detection in another view to be used for triangulation."""
+_GOOD_M = 0.1
+"""Maximum standard deviation of the triangulated position, m."""
+_AGREE_SIGMA = 3.5
+"""Maximum residual of each triangulated detection, standard deviations. Above it, they disagree."""
 _PRIOR_COUNT = 30.0
 """Weight of the shipped law in each range of scores, as a number of detections."""
+_ROUNDS = 40
+"""Number of iterations of expectation maximisation."""
 
 
 @cache
@@ -108,13 +114,12 @@ class NoiseLaw:
         """The law as JSON values, with the score and sigma of each range for readers of
         run.json.
         """
-        middles = np.convolve((0.0, *EDGES, 1.0), (0.5, 0.5), "valid").round(3).tolist()
         sigma_m = [
             times * float(core_sigma_m(score))
-            for times, score in zip(self.times, middles, strict=True)
+            for times, score in zip(self.times, _MIDDLES, strict=True)
         ]
         return {
-            "score": middles,
+            "score": list(_MIDDLES),
             "sigma_mm": [round(1e3 * each, 1) for each in sigma_m],
             **{name: list(getattr(self, name)) for name in self.COLUMNS},
         }
@@ -182,8 +187,8 @@ class Residuals:
             off = np.nan_to_num(np.linalg.norm(evidence.residual_px, axis=-1)) / np.where(
                 good, sigmas, 1.0
             )
-            there = (evidence.inlier == good).all(axis=-1) & (off < OUTLIER_SIGMA).all(axis=-1)
-            there &= every.seen[..., view] & (evidence.sigma_m < KNOWN_M)
+            there = (evidence.inlier == good).all(axis=-1) & (off < _AGREE_SIGMA).all(axis=-1)
+            there &= every.seen[..., view] & (evidence.sigma_m < _GOOD_M)
             row, joint = np.nonzero(there)
             xy, depth, slope = views.rows(row).project(evidence.target[there][:, None])
             focal = np.broadcast_to(views.focal_px, (len(chosen), len(views)))[row, view]
@@ -221,7 +226,7 @@ class Residuals:
 
         count, expected = total(np.ones(len(score))), np.square(prior.times)
         squared_times, gross = expected, np.array(prior.gross)
-        for _ in range(MOST_STEPS):
+        for _ in range(_ROUNDS):
             theirs = np.where(seen, squared_times[of_others], 0.0).sum(axis=1) / np.maximum(
                 seen.sum(axis=1), 1
             )

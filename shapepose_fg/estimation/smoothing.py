@@ -6,14 +6,20 @@ import numpy as np
 
 from factors import Motion
 from shapepose_fg.core.arrays import Array, Whole
-from shapepose_fg.core.scales import DETECTOR_M, HUGE, ROUNDS, WALK_M_S
 from shapepose_fg.estimation.in_time import motion_of
 from shapepose_fg.estimation.kernels import solve_chains
 from shapepose_fg.estimation.motion_densities import MotionModel
 
+SPEED_M_S = 1.5
+"""Minimum speed of a joint for the density of its accelerations: that of a walker, m/s."""
+LEAST_SIGMA_M = 0.03
+"""Added standard deviation, m, besides a factor of two, since errors of initial estimates are
+correlated over time."""
 KERNEL = 6.0
 """Squared distance from the smoothed joint, in variances, at which an initial estimate has half its
 weight."""
+_ROUNDS = 3
+_UNKNOWN = 1e6
 
 
 def smoothed(
@@ -31,16 +37,18 @@ def smoothed(
     T, J, C = len(times), joints.shape[1], len(people) * joints.shape[1]
     place, variance = np.full((len(people), J, T, 3), np.nan), np.full((len(people), J, T), np.nan)
     place[who, :, at] = joints
-    variance[who, :, at] = 4 * np.trace(covariance, axis1=-2, axis2=-1) / 3 + DETECTOR_M**2
+    variance[who, :, at] = 4 * np.trace(covariance, axis1=-2, axis2=-1) / 3 + LEAST_SIGMA_M**2
     by_time = np.moveaxis(place, 2, 0).reshape(T, C, 3), np.moveaxis(variance, 2, 0).reshape(T, C)
     speed, turning = (each.reshape(T - 1, len(people), J) for each in motion_of(*by_time, times))
     known = np.asarray(np.isfinite(variance) & np.isfinite(place).all(axis=-1))
     place = np.where(known[..., None], place, 0.0).reshape(C, T, 3)
-    information = np.where(known, 1.0 / np.where(known, variance, 1.0), 1.0 / HUGE).reshape(C, T)
-    density = motion.density(np.maximum(speed, WALK_M_S), turning=turning).reshape(T - 1, C)
+    information = np.where(known, 1.0 / np.where(known, variance, 1.0), 1.0 / _UNKNOWN).reshape(
+        C, T
+    )
+    density = motion.density(np.maximum(speed, SPEED_M_S), turning=turning).reshape(T - 1, C)
     moving, below = motion_information(motion.law, np.diff(times), density)
     n, weight, mean, of_mean = motion.law.order, information, place, 1.0 / information
-    for _ in range(ROUNDS):
+    for _ in range(_ROUNDS):
         diagonal, right = moving.copy(), np.zeros((3, C, T, n))
         diagonal[..., 0, 0] += weight
         right[..., 0] = np.moveaxis(place * weight[..., None], -1, 0)

@@ -31,7 +31,6 @@ from factors import (
 from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.observations import Observations
-from shapepose_fg.core.scales import ANYWHERE_M, LASTS_S
 from shapepose_fg.estimation.camera_pose_uncertainty import POSES_LAST_S
 from shapepose_fg.estimation.gated_views import (
     ObservationConfig,
@@ -53,6 +52,12 @@ _SAME_PERSON = 2.5
 _ERRORS = ((0.45, 3.5), (0.25, 0.25), (0.30, 1e-9))
 """Shares of a detector's errors, and their time constants, s: measured on simulated recordings,
 whose detector has Shelf's statistics (0.8 after a frame, 0.35 after a second, 0.1 after four)."""
+_AVERAGED_S = 1.0
+"""Time, s, over which an odometry of 1 % is more accurate than people's constraints on a pose;
+errors average out over it."""
+ANYWHERE_M = 10.0
+"""Standard deviation of a weak prior on joints, m; one behind its cameras would make the system
+singular."""
 _GAUGE = np.diag([1e-5**2] * 3 + [1e-4**2] * 3)
 """Without a static camera, the world is the first carrier's initial frame; this is its prior
 covariance."""
@@ -60,7 +65,7 @@ _LEAST = np.diag([1e-6**2] * 3 + [1e-5**2] * 3)
 """Minimum covariance of an odometry step, for carriers at rest; rad² and m²."""
 
 
-def dilution(step_s: float, over_s: float = LASTS_S) -> float:
+def dilution(step_s: float, over_s: float = _AVERAGED_S) -> float:
     """Number of correlated detection errors that count as one independent error.
 
     Errors are correlated between joints, and between frames, which are `step_s` apart. `over_s` is

@@ -18,7 +18,6 @@ from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.decompositions import principal_axes, symmetric_root
 from shapepose_fg.core.errors import NotDetermined
 from shapepose_fg.core.reconstruction import BODY, Reconstruction
-from shapepose_fg.core.scales import SURFACE_M
 from shapepose_fg.estimation.camera_pose_uncertainty import POSES_LAST_S, reported_with_poses
 from shapepose_fg.estimation.gated_views import ObservationConfig
 from shapepose_fg.estimation.in_time import moments
@@ -42,6 +41,9 @@ _LIMBS = {
 """Correlation of the errors of two joints of a person in one frame, in standard deviations, along a
 limb; for other pairs the product along the path between them. Measured as above. Between two people
 it is -0.02, approximated by 0."""
+SURFACE_M = 0.015
+"""Additional standard deviation of a point on a body's surface relative to the surrounding joints,
+metres."""
 _REACH_M = 0.15
 """Scale of the distance of joints that determine a surface point, m."""
 _NODES, _WIDE = 24, 6.0

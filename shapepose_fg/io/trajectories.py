@@ -9,8 +9,7 @@ from shapepose_fg.core.decompositions import is_rotation, nearest_rotation, rigi
 from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.frame_times import MOST_FPS
 from shapepose_fg.core.rig_file import COVARIANCE, POSE
-from shapepose_fg.core.scales import LARGEST
-from shapepose_fg.core.trajectory import UNIT_LENGTH, Trajectory
+from shapepose_fg.core.trajectory import MOST_METRES, UNIT_LENGTH, Trajectory
 from shapepose_fg.core.validation import is_number
 from shapepose_fg.io.number_table import read_number_table
 
@@ -58,10 +57,10 @@ def read_trajectory(path: str | Path, name: str = "") -> Trajectory:
     names, numbers, lines, bTc = _of_phone(path, names, numbers, lines)
     columns = {each: numbers[:, place] for place, each in enumerate(names)}
     pose = np.column_stack([columns[each] for each in POSE])
-    far = np.abs(pose[:, 1:4]).max(axis=1) > LARGEST
+    far = np.abs(pose[:, 1:4]).max(axis=1) > MOST_METRES
     if far.any():
         raise InputError(
-            f"{path}: line {lines[far][0]} is more than {LARGEST:g} m away; write metres"
+            f"{path}: line {lines[far][0]} is more than {MOST_METRES:g} m away; write metres"
         )
     length = np.linalg.norm(pose[:, 4:], axis=1)
     wrong = ~(np.abs(length - 1) < UNIT_LENGTH)

@@ -11,9 +11,11 @@ from shapepose_fg.core.arrays import Array, Mask, Whole
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.repeated_pictures import repeated_views
-from shapepose_fg.core.scales import FARTHEST_M, LASTS_S, UNSEEN_S
-from shapepose_fg.tracking.measuring import MIN_IN_A_VIEW
 
+_OVER_S = 1.0
+"""Time over which a camera's distances are averaged, s: a crowd hides people for less."""
+SILENT_S = 0.5
+"""Time without detections after which a camera is silent, and is not waited for, s."""
 _NEAREST = 0.25
 """Quantile of the distances between people's joints and detections that measures a camera: other
 people may be hidden from it, and it may see further ones."""
@@ -22,6 +24,11 @@ _OFF_M, _TIMES = 0.06, 2.5
 this multiple of the median camera's distance."""
 _BACK_M = 0.04
 """Distance below which a camera is used again, m."""
+_CAP_M = 0.5
+"""Maximum of a distance in the average, m."""
+_LEAST = 12
+"""Minimum number of joints in a picture, and of detections, from which distances are computed: half
+a person."""
 
 
 class CameraState(IntEnum):
@@ -76,7 +83,7 @@ class CameraWatch:
             else np.zeros(views, dtype=bool)
         )
         heard_s = np.where(there, time_s, np.where(np.isinf(self.heard_s), time_s, self.heard_s))
-        silent = time_s - heard_s > UNSEEN_S
+        silent = time_s - heard_s > SILENT_S
         state = self._judged()
         state = np.where(silent, CameraState.SILENT, state)
         state = np.where(frozen, CameraState.FROZEN, state)
@@ -101,14 +108,14 @@ class CameraWatch:
         inside = (depth > 0) & (uv >= 0).all(axis=-1) & (uv < sizes).all(axis=-1)
         px_m = np.where(depth > 0, depth, np.nan) / rig.focal_px[:, None, None]
         away = np.linalg.norm(uv[given.view, :, given.joint] - given.xy[:, None], axis=-1)
-        away = np.nan_to_num(away * px_m[given.view, :, given.joint], nan=FARTHEST_M)
-        nearest = np.full((len(rig), places.shape[1], len(places)), FARTHEST_M)
+        away = np.nan_to_num(away * px_m[given.view, :, given.joint], nan=_CAP_M)
+        nearest = np.full((len(rig), places.shape[1], len(places)), _CAP_M)
         np.fmin.at(nearest, (given.view, given.joint), away)
-        metres, of_detections = nearest.swapaxes(1, 2), np.minimum(away.min(axis=1), FARTHEST_M)
-        apart_m, fresh = self.apart_m.copy(), min(lasts_s / LASTS_S, 1.0)
+        metres, of_detections = nearest.swapaxes(1, 2), np.minimum(away.min(axis=1), _CAP_M)
+        apart_m, fresh = self.apart_m.copy(), min(lasts_s / _OVER_S, 1.0)
         counts = np.bincount(given.view, minlength=len(rig))
         for view in np.flatnonzero(
-            (inside.sum(axis=(1, 2)) >= MIN_IN_A_VIEW) & (counts >= MIN_IN_A_VIEW)
+            (inside.sum(axis=(1, 2)) >= _LEAST) & (counts >= _LEAST)
         ).tolist():
             if self.state[view] != CameraState.FROZEN:
                 both = metres[view][inside[view]], of_detections[given.view == view]

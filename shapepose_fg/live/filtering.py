@@ -15,8 +15,8 @@ from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.core.detections import Input
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.rows import Rows
-from shapepose_fg.core.scales import LOST_M
 from shapepose_fg.proposal.nearby import FrameArrays
+from shapepose_fg.tracking.global_hypotheses import PLACED_M
 from shapepose_fg.tracking.identities import observed
 from shapepose_fg.tracking.sides import correct_swaps_now
 from shapepose_fg.tracking.stitching import LEAST_ROWS, Ends, StitchingConfig, Trace, stitch
@@ -138,7 +138,7 @@ class Filter:
     def placed(self, now: FilterState) -> Array:
         """(A, J, 3) joints, metres; NaN where their uncertainty is too large."""
         joints = now.tracks.joints
-        return np.where((joints.sigma_m < LOST_M)[..., None], joints.position, np.nan)
+        return np.where((joints.sigma_m < PLACED_M)[..., None], joints.position, np.nan)
 
     def observations(self, now: FilterState, candidate: Index, given: Input) -> Observations:
         """The rows of a frame for stage II: its tracks and their detections."""

@@ -13,13 +13,14 @@ from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import BODY, Known, Reconstruction, Status
-from shapepose_fg.core.scales import BODY_M, LOST_M
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.camera_pose_uncertainty import carried_covariance
+from shapepose_fg.estimation.draft import MODEL_SIGMA_M
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.gated_views import linearise, observation_sigmas
 from shapepose_fg.estimation.motion_densities import MotionModel
 from shapepose_fg.live.filtering import FilterState
+from shapepose_fg.tracking.global_hypotheses import PLACED_M
 from shapepose_fg.tracking.motion_filter import JointStates
 from shapepose_fg.tracking.tracker import Tracker
 
@@ -93,18 +94,18 @@ class Newest:
         follows from motion and the prior. Tracks without a known joint are left out.
         """
         named = np.flatnonzero(
-            self.state.named & (self.state.tracks.joints.sigma_m < LOST_M).any(axis=1)
+            self.state.named & (self.state.tracks.joints.sigma_m < PLACED_M).any(axis=1)
         )
         order = named[np.argsort(self.state.identity[named], kind="stable")]
         now = self.state.rows(order)
-        joints, known = now.tracks.joints, now.tracks.joints.sigma_m < LOST_M
+        joints, known = now.tracks.joints, now.tracks.joints.sigma_m < PLACED_M
         covariance = joints.covariance[..., :3, :3].copy()
         information = np.zeros_like(covariance)
         information[known] = np.linalg.inv(covariance[known])
         fit = self.fitter.fit(
             JointTargets(np.where(known[..., None], joints.position, 0.0), information)
         )
-        of_body = fit.covariance + BODY_M**2 * np.eye(3) + _FORGOTTEN * covariance
+        of_body = fit.covariance + MODEL_SIGMA_M**2 * np.eye(3) + _FORGOTTEN * covariance
         surer = np.trace(of_body, axis1=2, axis2=3) < np.trace(
             covariance, axis1=2, axis2=3
         )  # false for NaN

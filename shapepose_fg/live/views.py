@@ -7,8 +7,8 @@ import numpy as np
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections
-from shapepose_fg.core.scales import UNSEEN_S
 from shapepose_fg.core.trajectory import Trajectory
+from shapepose_fg.live.cameras import SILENT_S
 from shapepose_fg.live.clock import JUMP_S
 
 SHORTEST_S = 1 / 250
@@ -63,7 +63,7 @@ class ViewsInStep:
         self.heard_s[view] = time_s
         self.waiting[view] = detections, time_s
         # The first frame waits for every camera, until one comes again.
-        awaited = (time_s - self.heard_s <= UNSEEN_S) | np.isinf(self.done_s)
+        awaited = (time_s - self.heard_s <= SILENT_S) | np.isinf(self.done_s)
         alive = np.flatnonzero(awaited).tolist()
         return found + (self.rest() if all(each in self.waiting for each in alive) else [])
 

@@ -16,7 +16,6 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.joint_names import mirrored
 from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.reconstruction import Known, Reconstruction, sigma_m
-from shapepose_fg.core.scales import FARTHEST_M, OUTLIER_SIGMA
 from shapepose_fg.core.validation import validated
 from shapepose_fg.estimation.factor_shares import FactorEvidence, factor_evidence
 from shapepose_fg.estimation.gated_views import inverses, observation_sigmas
@@ -33,6 +32,11 @@ from shapepose_fg.pipeline.explanation import (
 )
 from shapepose_fg.pipeline.solve_again import Solver, solved_around
 
+OFF_SIGMA = 3.0
+"""Distance of a detection from the prediction by all else, in standard deviations, above which it
+is reported: one in 90 exceeds it by chance."""
+_NEAR_M = 0.5
+"""Distance from a joint, m, within which an unassigned detection is reported."""
 _APART = 0.5
 """Ratio of the distances from another person's joint and this one's below which a detection is the
 other's."""
@@ -258,7 +262,7 @@ def _view_reasons(
             spread = sigma[v] ** 2 * np.eye(2) + slope[v] @ without @ slope[v].T
             off_px = float(np.linalg.norm(away))
             off_sigma = float(np.sqrt(away @ np.linalg.solve(spread, away)))
-            if off_sigma > OUTLIER_SIGMA:
+            if off_sigma > OFF_SIGMA:
                 like = _looks_like(
                     all_of_it, row, joint, v, table.xy[row, joint, v], float(sigma[v]), off_px
                 )
@@ -313,7 +317,7 @@ def _looks_like(
     n, j = np.unravel_index(squared.argmin(), squared.shape)
     return (
         f"person {people.person[here[n]]}'s {names[alike[j]]}"
-        if squared[n, j] < OUTLIER_SIGMA**2
+        if squared[n, j] < OFF_SIGMA**2
         else ""
     )
 
@@ -351,7 +355,7 @@ def _refused(
                 f"{off:.0f} px off. It was not used."
             )
             joined.append(Finding(cause, (name,), f"Camera {name} {words}"))
-        elif not whose and off * depth[view] < FARTHEST_M * views.focal[0, view]:
+        elif not whose and off * depth[view] < _NEAR_M * views.focal[0, view]:
             words = f"Camera {name} has an unassigned detection {off:.0f} px off."
             beside.append((off, Finding(cause, (name,), words)))
     return joined + [each for _, each in sorted(beside, key=lambda one: one[0])]
@@ -391,9 +395,7 @@ def _findings(
     suspects = [view for view in suspects if view.camera not in named]
     found += [each for each in told if each.cause == Cause.CONTRADICTION]
     against = [view for view in suspects if view.gate == GATES[Gate.CONTRADICTS_BODY]]
-    doubted = [
-        view for view in suspects if view in used and (view.off_sigma or 0.0) > OUTLIER_SIGMA
-    ]
+    doubted = [view for view in suspects if view in used and (view.off_sigma or 0.0) > OFF_SIGMA]
     agree = [view for view in used if view not in doubted]
     if (
         len(against) + len(doubted) == 1 and len(agree) > 0

@@ -17,6 +17,10 @@ from shapepose_fg.core.observation_table import Gate
 from shapepose_fg.core.reconstruction import BODY, Known, Reconstruction, Status
 from shapepose_fg.estimation.motion_densities import MotionModel
 
+STRAY_M = 0.03
+"""Deviation of a joint from the cubic between keyframes, m, above which a frame between becomes a
+keyframe."""
+
 
 def spaced(time_s: Array, apart_s: float) -> Mask:
     """(T,) mask for ascending times: first, last, and as few between as leave no gap longer than

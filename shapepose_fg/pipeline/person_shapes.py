@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from shapepose_fg.body.fitting.energy import BodyEnergy, EnergyTargets, Held, nothing
+from shapepose_fg.body.fitting.energy import SETTLED, BodyEnergy, EnergyTargets, Held, nothing
 from shapepose_fg.body.fitting.evidence import weigh
 from shapepose_fg.body.fitting.fitter import BodyConfig, JointTargets
 from shapepose_fg.body.fitting.priors import PosePrior
@@ -22,8 +22,14 @@ from shapepose_fg.body.shapes import SubjectShapes, recognise
 from shapepose_fg.core.arrays import Array, Index, Whole
 from shapepose_fg.core.reconstruction import BODY, Reconstruction
 from shapepose_fg.core.rows import Rows
-from shapepose_fg.core.scales import BATCH, HUGE, ROUNDS
 from shapepose_fg.estimation.floor import LOOK_S, Floor
+
+_BATCH = 64
+"""Rows per batch: their Hessians fit into the cache."""
+_NOT_ROBUST = 1e9
+"""Width of the robust kernel, standard deviations, at which it has no effect."""
+_STEPS = 2
+"""Gauss-Newton steps from a window's body to one with another shape."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +105,7 @@ def evidence(
         xyz = energy.model.keypoints(energy.complete(free))
         targets = EnergyTargets(xyz, weigh(known, sigma_m).information)
         held = Held(np.zeros((count, 10)), np.ones(count), free[:, 13:-3])
-        body = energy.evaluate(free, targets, HUGE, held, nothing(count))
+        body = energy.evaluate(free, targets, _NOT_ROBUST, held, nothing(count))
         said = np.linalg.inv(body.covariances()[1]) - np.eye(10)
         pull = (said @ free[:, :10, None])[..., 0]
         looks = (mine.time_s // LOOK_S).astype(np.int64).tolist()
@@ -155,10 +161,10 @@ def with_shape(
         xyz = energy.model.keypoints(energy.complete(free))
         alike = np.broadcast_to(np.eye(3) / sigma_m**2, (*xyz.shape, 3))
         targets = EnergyTargets(xyz, alike)
-        held = Held(betas[some], np.full(len(some), HUGE), free[:, 13:-3])
+        held = Held(betas[some], np.full(len(some), SETTLED), free[:, 13:-3])
         free[:, :10] = betas[some]
-        for _ in range(ROUNDS):
-            body = energy.evaluate(free, targets, HUGE, held, nothing(len(some)))
+        for _ in range(_STEPS):
+            body = energy.evaluate(free, targets, _NOT_ROBUST, held, nothing(len(some)))
             free = energy.retract(free, body.step)
         made = replace(energy.complete(free), betas=betas[some])
         bodies = made.betas, made.global_orient, made.body_pose, made.transl + rows.transl[some]
@@ -174,8 +180,8 @@ def _batches(rows: WindowBodies, energy: BodyEnergy) -> Iterator[tuple[Index, Wi
     bodies relative to their translations.
     """
     ok = np.flatnonzero(np.isfinite(rows.betas).all(axis=1))
-    for at in range(0, len(ok), BATCH):
-        mine = rows.rows(some := ok[at : at + BATCH])
+    for at in range(0, len(ok), _BATCH):
+        mine = rows.rows(some := ok[at : at + _BATCH])
         yield some, mine, energy.parameters(mine.body, mine.transl)
 
 

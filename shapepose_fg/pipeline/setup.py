@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.body.fitting.evidence import LEAST_JOINTS
 from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.body.fitting.priors import longest_bones
 from shapepose_fg.core.camera import Rig, Views
@@ -14,7 +15,6 @@ from shapepose_fg.core.detections import Detections, Input
 from shapepose_fg.core.notes import Notebook, Notes
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Reconstruction, Status
-from shapepose_fg.core.scales import LEAST_JOINTS, LOOK_S
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.motion_densities import MotionModel
@@ -32,6 +32,8 @@ from shapepose_fg.tracking.tracker import BodyScale, Tracker
 FAST_M_S = 3.0
 """Speed of the fastest joints covered by the tracker's predictions, m/s: a hand that is thrown up
 or strikes."""
+UNSEEN_S = 0.3
+"""Longest gap without detections over which predictions cover such joints, s."""
 _ON_TRIAL = 0.5
 """Factor on the required probability in single frames before a body is fitted."""
 _FALSE_POSITIVE = "hardly any detections of their own, or at the position of another person"
@@ -160,7 +162,7 @@ class Setup:
         law = self.estimator.law
         motion = MotionModel.load(skeleton.joints, config.motion, law)
         scale = BodyScale(
-            longest_bones(skeleton), motion.density(np.full(len(skeleton), FAST_M_S), LOOK_S), law
+            longest_bones(skeleton), motion.density(np.full(len(skeleton), FAST_M_S), UNSEEN_S), law
         )
         find = (sure, hips) if config.temporal else (sure,)
         told = {"fitter": self.fitter, "drop": book.drop_in, "search": book.search}

@@ -15,11 +15,10 @@ from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Input
 from shapepose_fg.core.observations import Observations, window_rows
 from shapepose_fg.core.reconstruction import Reconstruction
-from shapepose_fg.core.scales import DETECTOR_M
 from shapepose_fg.estimation.window_solution import WindowSolution
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.config import WindowConfig as WindowConfig
-from shapepose_fg.pipeline.keyframes import strays_m
+from shapepose_fg.pipeline.keyframes import STRAY_M, strays_m
 from shapepose_fg.proposal.thinning import thinned
 from shapepose_fg.tracking.identities import Decided, FollowState, alone, finish, follow
 from shapepose_fg.tracking.tracker import Tracker
@@ -148,7 +147,7 @@ def halved(
     key, new = np.array([each.key for each in given]), np.zeros(len(given), dtype=bool)
     for mine in window_rows(rows):
         at = np.searchsorted(number, rows.frame[mine])
-        far = strays_m(solved.joints[mine], solved.velocity[mine], time_s[at]) > DETECTOR_M
+        far = strays_m(solved.joints[mine], solved.velocity[mine], time_s[at]) > STRAY_M
         far &= (np.diff(np.cumsum(key)[at]) == 1) & (np.diff(at) > 1)
         new[(at[1:] + at[:-1])[far] // 2] = True
     new[: span.start] = new[span.stop :] = False

@@ -11,7 +11,6 @@ from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.observations import Observations
-from shapepose_fg.core.scales import ROUNDS
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.proposal.candidates import Candidates
 from shapepose_fg.proposal.nearby import LEAST_AFFINITY, FrameArrays, nearby
@@ -25,6 +24,8 @@ _FAR_M = 0.25
 _REACH_M = 0.6
 """A joint whose place is not known yet is sought this far around its neighbours on the skeleton: no
 limb from a joint to the next is longer, the trunk aside."""
+_PASSES = 2
+"""Number of further passes, each with the neighbours that the last one assigned."""
 
 
 def associate(
@@ -44,14 +45,14 @@ def associate(
     """
     own, places = by_support(proposals, candidates, detections, len(rig)), proposals.places
     real = np.ones(len(proposals), dtype=bool)
-    rounds = 1 + ROUNDS
+    rounds = 1 + _PASSES
     while rounds > 0:
         own = _claimed(places, own, detections, rig, skeleton)
         keep = seen_twice(own >= 0, skeleton).mean(axis=1) >= config.min_observed_parts
         real[np.flatnonzero(real)[~keep]] = False
         places, own = places[keep], own[keep]
         # Detections of dropped proposals are reassigned.
-        rounds = rounds - 1 if keep.all() else ROUNDS
+        rounds = rounds - 1 if keep.all() else _PASSES
     return Observations.of(own, detections, places), int((~real).sum())
 
 

@@ -19,12 +19,6 @@ from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.kernel_geometry import project
 from shapepose_fg.core.skeleton import Skeleton
 
-NEAR_M = 0.06
-"""Standard deviation of the nearness score around a joint, as a length at its depth, m."""
-SURE_AFFINITY = 0.5
-"""Mean affinity to the person's other detections at which a detection gets its full weight."""
-ALONE = 0.5
-"""Weight of a detection that no other detection of the person supports."""
 LEAST_AFFINITY = 0.3
 """Affinity assumed if no neighbour is detected, and half of the minimum score: unrelated pairs are
 mostly 0, true ones above 0.4."""

@@ -5,8 +5,9 @@ import numpy as np
 from shapepose_fg.core.arrays import Index
 from shapepose_fg.core.compiled import kernel
 from shapepose_fg.core.detections import Detections
-from shapepose_fg.core.scales import LEAST_JOINTS
 
+LEAST_JOINTS = 4
+"""Minimum number of joints that a 2D person must share with a 3D person to match it."""
 _MOST_OF = 0.6
 """Minimum share of the 3D person's detections in the view that belong to this 2D person."""
 

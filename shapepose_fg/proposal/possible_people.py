@@ -11,12 +11,20 @@ from shapepose_fg.core.compiled import kernel, part
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.kernel_geometry import solved
 from shapepose_fg.core.rows import Rows
-from shapepose_fg.core.scales import DETECTOR_M, ROUNDS
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.proposal.nearby import NEAR_M, SURE_AFFINITY, FrameArrays, nearby
+from shapepose_fg.proposal.nearby import FrameArrays, nearby
 
+_NEAR_M = 0.06
+"""Standard deviation of the nearness score, as a length at the joint's depth, m; as in `assign`."""
 _FAR_M = 0.15
 """Maximum distance of a joint from the ray of its detection, m."""
+_SURE_AFFINITY = 0.5
+"""Minimum mean affinity of a detection for a joint without a position."""
+DETECTOR_M = 0.03
+"""Measured error of a detector, m: the scale of the Cauchy kernel for triangulation, of the
+distances of rays from joints, and of the errors of bone lengths."""
+_ROUNDS = 2
+"""Number of reweighted triangulations of a joint."""
 _STRETCH = (1.0, 0.9, 0.8)
 """Maximum distance over one, two and three bones, as a share of their summed maximum lengths."""
 
@@ -131,9 +139,9 @@ def _claimed(places: Array, own: Index, frame: Frame, *, exclusive: bool) -> Ind
     unplaced = np.isnan(places[..., 0])
     if unplaced.any():
         near = near.with_tied(own, unplaced, frame.arrays)
-    nearness = np.exp(-0.5 * near.distance_m**2 / NEAR_M**2)
+    nearness = np.exp(-0.5 * near.distance_m**2 / _NEAR_M**2)
     lost = np.isinf(near.distance_m)
-    chosen, claims = near.claimed(nearness, lost, SURE_AFFINITY, own, world, frame.arrays)
+    chosen, claims = near.claimed(nearness, lost, _SURE_AFFINITY, own, world, frame.arrays)
     if exclusive:
         near.share(claims.tied, chosen)
     return chosen
@@ -164,7 +172,7 @@ def _triangulate(chosen, rays, confidence, centres, weight, places, gap_m):
             for v in range(views):
                 weight[v] = confidence[chosen[h, j, v]] if chosen[h, j, v] >= 0 else 0.0
                 seen += chosen[h, j, v] >= 0
-            for _ in range(ROUNDS if seen >= 2 else 0):
+            for _ in range(_ROUNDS if seen >= 2 else 0):
                 _nearest(chosen[h, j], rays, weight, centres, places[h, j])
                 for v in range(views):
                     d = chosen[h, j, v]

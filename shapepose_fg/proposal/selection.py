@@ -8,11 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index, Mask
-from shapepose_fg.core.scales import DETECTOR_M
 from shapepose_fg.proposal.candidates import PairPoints
-from shapepose_fg.proposal.nearby import ALONE, LEAST_AFFINITY, own_affinity
+from shapepose_fg.proposal.nearby import LEAST_AFFINITY, own_affinity
 from shapepose_fg.proposal.pairs_of_people import pooled
-from shapepose_fg.proposal.possible_people import Frame, PossiblePeople, settled
+from shapepose_fg.proposal.possible_people import DETECTOR_M, Frame, PossiblePeople, settled
 
 _SHARED = 0.2
 """Maximum share of its joints that a missing part may have in common with the person it
@@ -26,8 +25,12 @@ PRIOR_WITH_BODY = -0.3
 """Log-odds of a hypothesis without evidence, after a body fit and reassociation of detections."""
 _SINGLE = 0.1
 """Weight of a detection of a joint that no other view sees, since its depth is unknown."""
+_BESIDE = 0.5
+"""Weight of a detection of a joint whose other detections belong to others."""
 _MISSED = 0.2
 """Cost of an expected but missing joint, in a view that sees other joints of the person."""
+_HIDDEN = 0.07
+"""Cost of a missing joint in a view that does not see the person at all, who may be occluded."""
 _TAKEN = 0.07
 """Cost of a detection that another person explains better."""
 _BROKEN = 0.5
@@ -85,11 +88,11 @@ class Evidence:
         has = self.chosen >= 0
         own = has & ~taken[self.chosen] if len(taken) > 0 else has
         views, owned_views = has.sum(axis=2, keepdims=True), own.sum(axis=2, keepdims=True)
-        counts = np.where(views < 2, _SINGLE, np.where(owned_views < 2, ALONE, 1.0))
+        counts = np.where(views < 2, _SINGLE, np.where(owned_views < 2, _BESIDE, 1.0))
         evidence = (self.worth * own * counts).sum(axis=(1, 2))
         seen = (own & self.expected).sum(axis=1) / np.maximum(self.expected.sum(axis=1), 1)
         missed = (self.expected & ~own).sum(axis=1)
-        price = (missed * (_MISSED * seen + _TAKEN * (1 - seen))).sum(axis=1)
+        price = (missed * (_MISSED * seen + _HIDDEN * (1 - seen))).sum(axis=1)
         price += _TAKEN * (has & ~own).sum(axis=(1, 2))
         return np.asarray(evidence + self.bones - price, dtype=np.float64)
 

@@ -13,7 +13,6 @@ import numpy as np
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Axis, Rig
 from shapepose_fg.core.detections import DetectionSequence
-from shapepose_fg.core.scales import SURE
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.core.trust import BELIEVED, Trust
 from shapepose_fg.io.footage.footage import glance, open_footage
@@ -22,7 +21,7 @@ from shapepose_fg.io.footage.places import VIDEOS, find_footage
 from shapepose_fg.setup_check.biases import without_biases
 from shapepose_fg.setup_check.evidence import Evidence, Look, gather
 from shapepose_fg.setup_check.exclusion import trust_of
-from shapepose_fg.setup_check.findings import Finding, Kind, one_of
+from shapepose_fg.setup_check.findings import SURE, Finding, Kind, one_of
 from shapepose_fg.setup_check.fit import difference
 from shapepose_fg.setup_check.hypotheses import GOOD_PAIR, mistake_of_cameras
 from shapepose_fg.setup_check.joint_order import order_of_joints

@@ -3,11 +3,8 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from itertools import permutations
 
 from shapepose_fg.core.camera import Rig
-from shapepose_fg.core.scales import SURE
-from shapepose_fg.io.calibration.written import METRES
 
 
 class Kind(StrEnum):
@@ -68,6 +65,10 @@ class Finding:
     """What two cameras have in common, if not both: "pose" or "detections"."""
     instead: "tuple[Finding, ...]" = ()
     """Alternative findings, most probable first; their `sure` are their probabilities."""
+
+
+SURE = 0.95
+"""Findings above this probability are reported without it, and without alternatives."""
 
 
 def one_of(found: Sequence[Finding]) -> Finding:
@@ -190,12 +191,21 @@ def _duplicate(finding: Finding) -> str:
 
 ADULT_M = 1.7
 """Mean stature of adults, metres, in the body model and in the world's population."""
+_UNITS = (
+    (1e-3, "m", "mm"),
+    (1e3, "mm", "m"),
+    (1e-2, "m", "cm"),
+    (1e2, "cm", "m"),
+    (0.1, "cm", "mm"),
+    (10, "mm", "cm"),
+)
+"""Apparent scale of lengths, with the true unit and the unit assumed when reading."""
 
 
 def _unit(finding: Finding) -> str:
     factor = finding.amount / ADULT_M
-    for truth, taken in permutations(METRES, 2):
-        if 0.55 < factor * METRES[truth] / METRES[taken] < 1.45:
+    for times, truth, taken in _UNITS:
+        if 0.55 < factor / times < 1.45:
             unit = (
                 f"the calibration is probably in {truth}, but was read as {taken}; give its unit "
                 "with --unit"

@@ -37,8 +37,10 @@ Q = len(PARAMETERS)
 TURN, MOVE, CENTRE, FOCAL, POSE = [0, 1, 2], [3, 4, 5], [6, 7], [8], [0, 1, 2, 3, 4, 5]
 _MOST_ZOOM = 5.0
 """Maximum step of the focal length's logarithm; larger ones are implausible and would overflow."""
-ROUNDS = 4
-"""Number of rounds of matching and fitting, and of steps between matchings."""
+_ROUNDS = 4
+"""Number of rounds of matching and fitting."""
+_STEPS = 4
+"""Number of steps between matchings."""
 CORNER = np.array([-0.5, -0.5])
 """Coordinates of a picture's corner, px; the origin is the centre of the first pixel."""
 
@@ -232,7 +234,7 @@ def refined(others: Others, seen: Sightings, camera: Pinhole, columns: list[int]
     """The camera with some of its parameters (`PARAMETERS`) fitted to the people that
     it matches.
     """
-    for _ in range(ROUNDS):
+    for _ in range(_ROUNDS):
         found = match(others, seen, camera)
         if len(found.person) == 0:
             return camera
@@ -276,7 +278,7 @@ def _solved(
         slopes,  # type: ignore[arg-type]
         loss="cauchy",
         x_scale="jac",
-        max_nfev=ROUNDS,
+        max_nfev=_STEPS,
     )
     views = moved(found.x)
     return Pinhole(views.K[0], views.cTw[0])

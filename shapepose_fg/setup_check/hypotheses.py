@@ -8,10 +8,9 @@ from itertools import combinations
 import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index
-from shapepose_fg.core.scales import SURE
 from shapepose_fg.setup_check import fit
 from shapepose_fg.setup_check.evidence import Look
-from shapepose_fg.setup_check.findings import Finding, Kind, one_of
+from shapepose_fg.setup_check.findings import SURE, Finding, Kind, one_of
 from shapepose_fg.setup_check.fit import (
     ERROR,
     FOCAL,
@@ -60,6 +59,8 @@ GAIN, _LIKELY = 0.12, 10.0
 """Minimum gain of a change in a camera's score, and in log-likelihood."""
 _FEW_FRAMES = 40
 """Number of frames that are sufficient for mistakes of all cameras."""
+_EXPLAINED = 0.65
+"""Total score above which no other explanation than detector errors is searched for."""
 _PRICE = 0.02
 """Minimum gain in score per fitted parameter: half a centimetre of a person's joints is 0.02."""
 
@@ -107,7 +108,7 @@ def mistake_of_cameras(look: Look, rng: np.random.Generator) -> Change | None:
     found = [(judged(look, change), change) for change in tried]
     best = max((gain for gain, _ in found), default=0.0) + look.total
     poor = [view for view in weak if look.beside_biases(view) < GOOD]
-    if len(poor) > look.view_count / 2 and best < GOOD_PAIR:
+    if len(poor) > look.view_count / 2 and best < _EXPLAINED:
         few = replace(look, evidence=look.evidence.thinned(_FEW_FRAMES))
         found += [
             (

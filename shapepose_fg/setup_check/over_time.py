@@ -12,7 +12,6 @@ import numpy as np
 
 from shapepose_fg.body.model.rotation import exp_so3, log_so3
 from shapepose_fg.core.arrays import Array, Index
-from shapepose_fg.core.scales import LIKELY, ROUNDS
 from shapepose_fg.setup_check import fit
 from shapepose_fg.setup_check.evidence import Look
 from shapepose_fg.setup_check.findings import Finding, Kind
@@ -24,6 +23,10 @@ _RESTLESS = 0.1
 _LEAST_DEG = 1.2
 """Minimum step or drift, degrees; smaller ones may be detector errors that depend on people's
 orientation."""
+_SURE = 6.0
+"""Minimum gain in log-likelihood over the best constant rotation."""
+_ROUNDS = 2
+"""Number of rounds in which a rotation and its matches are fitted alternately."""
 _PARTED, _POOR = 0.3, 0.5
 """Criteria for two cameras, with rays that only need to intersect, to stop agreeing: the drop of
 the score, and the maximum score after it."""
@@ -145,7 +148,7 @@ def motions(look: Look, view: int, rng: np.random.Generator) -> Iterator[tuple[F
         after = match(others, warped(seen, camera, share(seen.frame)[:, None] * turn), camera).score
         gain = likelihood(after, worth, freedom) - before
         amount = float(np.rad2deg(np.linalg.norm(turn)))
-        if gain > LIKELY and amount > _LEAST_DEG:
+        if gain > _SURE and amount > _LEAST_DEG:
             yield replace(finding, amount=amount), _as_if_still(look, view, share, turn), freedom
 
 
@@ -171,7 +174,7 @@ def _turn(
     shares = share(far.frame)
     sole = fit.best_of(near, far, camera, list(fit.tries(near, far, rng)), fit.turned_to)
     turn = np.zeros(3) if sole is None else _turn_between(camera, sole) / shares.mean()
-    for _ in range(ROUNDS):
+    for _ in range(_ROUNDS):
         still = warped(far, camera, shares[:, None] * turn)
         turn = turn + _turn_between(camera, fit.refined(near, still, camera, TURN)) / shares.mean()
     return turn

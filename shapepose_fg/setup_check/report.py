@@ -20,7 +20,7 @@ from shapepose_fg.core.reconstruction import Reconstruction, Status
 from shapepose_fg.core.run_summary import has_identities
 from shapepose_fg.core.trust import BELIEVED, Spell, Trust, trust_in
 from shapepose_fg.setup_check.diagnosis import Build, Diagnosis, diagnose
-from shapepose_fg.setup_check.evidence import ANCHORS, Look, left_out
+from shapepose_fg.setup_check.evidence import Look, left_out
 from shapepose_fg.setup_check.findings import ADULT_M, Finding, Kind, sentence
 from shapepose_fg.setup_check.fit import match
 from shapepose_fg.setup_check.matching import GATE, miss_px, size_of
@@ -235,6 +235,9 @@ def rounded(value: Any) -> Any:
     return float(f"{value:.4g}") if isinstance(value, float) else value
 
 
+_LOOKED_AT = 200
+"""Number of frames in which unused detections are counted, and of rows whose distances from the
+other cameras are measured, spread over the recording."""
 _REASONS = {
     Gate.TOO_FAR: "are too far from the joint",
     Gate.CONTRADICTS_BODY: "contradict the body",
@@ -383,7 +386,7 @@ def _left_out(table: ObservationTable, rig: Rig) -> tuple[Array, Array]:
     """(R, J, V) distances of detections from joints triangulated by two or more others, px and mm;
     R sampled rows.
     """
-    rows = np.unique(np.linspace(0, len(table) - 1, min(len(table), ANCHORS)).astype(np.intp))
+    rows = np.unique(np.linspace(0, len(table) - 1, min(len(table), _LOOKED_AT)).astype(np.intp))
     xy, gate = table.xy[rows].astype(np.float64), table.gate[rows]
     weight, size = table.confidence[rows].astype(np.float64), size_of(np.moveaxis(xy, 2, 1))
     px, depth = left_out(xy, weight, size, Views.of(rig), gate == Gate.USED)
@@ -495,7 +498,7 @@ def unseen(
     duration of the recording, None for isolated frames.
     """
     core = list(detections.skeleton.core)
-    looked_at = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), ANCHORS)).astype(int))
+    looked_at = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), _LOOKED_AT)).astype(int))
     seen = np.zeros((len(looked_at), len(names)))
     for row, frame in enumerate(looked_at.tolist()):
         found = detections[frames[frame]]

@@ -18,7 +18,6 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from shapepose_fg.core.detections import Input
-from shapepose_fg.core.scales import BODY_M, LOOK_S, LOST_M, ROUNDS
 from shapepose_fg.proposal.nearby import FrameArrays
 from shapepose_fg.tracking.motion_filter import JointStates
 from shapepose_fg.tracking.track_selection import EvidenceTable, SelectedTracks, weighed
@@ -26,17 +25,28 @@ from shapepose_fg.tracking.tracker import Tracker, Tracks
 
 Array = NDArray[np.float64]
 
+_SEARCH_S = 0.3
+"""Interval between searches for new people in each world, s; half that between searches among all
+detections. In a world that lacks a person, the others take that person's detections, so every world
+is searched: in crowds before three cameras this finds two to six more people of a hundred."""
 _TWINS_S = 0.1
 """Interval between checks for duplicate worlds, s."""
 _RESTART_S = 1.3
 """Interval between the frames from which the selected people are tracked again, s."""
+_ROUNDS = 2
+"""Maximum number of rounds of tracking again."""
 _ALIKE = 0.95
 """Agreement of detections above which two selections count as one. The best selection is tracked
 again, and the best different one: on ten simulated recordings, most before three cameras, IDF1 is
 95.0 (92.8 without; 95.2 with two others, at twice the time)."""
-_PLAIN = 0.25
-"""Minimum evidence per second, over any window of `LOOK_S` s, of a person to whom no
+PLACED_M = 0.2
+"""Standard deviation below which a track's joint has a known position, m."""
+_PLAIN, _PLAIN_S = 0.25, 0.3
+"""Minimum evidence per second, over any window of `_PLAIN_S` s, of a person to whom no
 alternatives are sought; in simulated crowds, they are found only for people with less."""
+_SAME_M = 0.02
+"""Maximum distance between joints of two worlds with the same detections for these to
+be merged, m."""
 _GAIN = 0.01
 """Minimum relative gain of evidence for another round."""
 
@@ -130,7 +140,7 @@ def explained(
         [found, follow_worlds(tracker, rest, _seeds(tracker, rest.frames), keep)]
     )
     before = 0.0
-    for _ in range(ROUNDS):
+    for _ in range(_ROUNDS):
         best, *others = found.account.ways(found.world, on_trial=True)
         if best.evidence_s.sum() <= (1 + _GAIN) * before:
             break
@@ -147,7 +157,7 @@ def _plain(found: Hypotheses, times: Array) -> NDArray[np.bool_]:
     if len(times) == 1:
         return np.ones(len(found), dtype=bool)
     evidence = found.weight.sum(axis=(2, 3)) - found.price
-    frames = min(len(times), max(1, round(LOOK_S / float(np.median(np.diff(times))))))
+    frames = min(len(times), max(1, round(_PLAIN_S / float(np.median(np.diff(times))))))
     high = sliding_window_view(evidence, frames, axis=1).mean(axis=-1) >= _PLAIN
     return np.asarray(found.there.all(axis=1) & high.all(axis=1))
 
@@ -209,7 +219,7 @@ def _seeds(tracker: Tracker, frames: Sequence[Input]) -> list[Seed]:
     none = np.zeros((0, len(tracker.skeleton), len(frames[0].rig)), dtype=np.intp)
     back = Seed(len(frames) - 1, nobody, none, forwards=False)
     parts = np.array_split(
-        np.arange(len(frames)), max(1, round((times[-1] - times[0]) / (2 * LOOK_S)))
+        np.arange(len(frames)), max(1, round((times[-1] - times[0]) / (2 * _SEARCH_S)))
     )
     keys = [int(part[len(part) // 2]) for part in parts if len(part) > 0]
     found = [(key, *_newcomers(tracker, nobody, none, frames[key])) for key in keys]
@@ -341,7 +351,7 @@ def _follow(
             }
             rest = np.setdiff1d(np.arange(len(tracks)), gone)
             tracks, candidate = tracks.rows(rest), candidate[rest]
-        if abs(time_s - sought_s) < LOOK_S:
+        if abs(time_s - sought_s) < _SEARCH_S:
             continue
         sought_s = time_s
         for world in [
@@ -374,14 +384,14 @@ def _twins(
     Duplicate worlds have the same detections (A, J, V) and the same positions of placed joints.
     """
     gone, same = np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp)
-    known, kept = tracks.joints.sigma_m < LOST_M, dict[tuple[bytes, ...], NDArray[np.intp]]()
+    known, kept = tracks.joints.sigma_m < PLACED_M, dict[tuple[bytes, ...], NDArray[np.intp]]()
     for world in np.unique(tracks.world).tolist():
         who = np.flatnonzero(tracks.world == world)
         names = [candidate[row].tobytes() for row in who.tolist()]
         who = who[sorted(range(len(names)), key=names.__getitem__)]
         other = kept.setdefault(tuple(sorted(names)), who)
         apart = np.linalg.norm(tracks.joints.position[who] - tracks.joints.position[other], axis=-1)
-        if other is not who and (apart[known[who] & known[other]] < BODY_M).all():
+        if other is not who and (apart[known[who] & known[other]] < _SAME_M).all():
             gone, same = np.append(gone, who), np.append(same, other)
     return gone, same
 
@@ -414,7 +424,7 @@ class _Log:
             return
         frame, joints, A = self.frames[t], tracks.joints, len(tracks)
         candidate = self.rest.index[t][candidate]
-        places = np.where((joints.sigma_m < LOST_M)[..., None], joints.position, np.nan)
+        places = np.where((joints.sigma_m < PLACED_M)[..., None], joints.position, np.nan)
         arrays = FrameArrays.of(frame.detections, frame.rig, self.tracker.skeleton)
         # The people who are tracked already occlude those of every world.
         others = self.rest.places[:, t]

@@ -11,7 +11,6 @@ from shapepose_fg.core.assignment import least_cost_pairs
 from shapepose_fg.core.bounds import Seconds, Settings
 from shapepose_fg.core.detections import Input
 from shapepose_fg.core.observations import Observations
-from shapepose_fg.core.scales import ROUNDS, SAME_PERSON_M
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.tracking.global_hypotheses import Hypotheses, explained, times_of
 from shapepose_fg.tracking.motion_filter import JointStates
@@ -23,6 +22,11 @@ BLOCK_S = 3.0
 """Length of a block, s; long enough that each person is well visible in some of its frames."""
 MOST_FRAMES = 256
 """Maximum number of frames in a block at any frame rate; bounds memory."""
+_SAME_M = 0.35
+"""Mean distance of core joints, m, below which two hypotheses in a frame are the same person."""
+_ROUNDS = 3
+"""Maximum number of searches for people in an isolated frame, repeated while sides are
+exchanged."""
 
 
 @dataclass(frozen=True)
@@ -136,7 +140,7 @@ def alone(tracker: Tracker, given: Input, next_id: int) -> Decided:
         tracker.nobody(),
         np.zeros((0, len(tracker.skeleton), len(given.rig)), dtype=np.intp),
     )
-    for _ in range(ROUNDS):
+    for _ in range(_ROUNDS):
         places, candidate = tracker.newcomers(nobody, none, given.detections, given.rig)
         there = np.arange(len(places))
         found = tracker.at(places, there, 0 * there, float(given.time_s.mean()))
@@ -186,8 +190,8 @@ def _identities(
     apart = core_distance(
         found.places[chosen.hypothesis[early], 0], found.places[carried, 0], skeleton
     )
-    for row, column in zip(*least_cost_pairs(np.minimum(apart, 2 * SAME_PERSON_M)), strict=True):
-        if apart[row, column] < SAME_PERSON_M:
+    for row, column in zip(*least_cost_pairs(np.minimum(apart, 2 * _SAME_M)), strict=True):
+        if apart[row, column] < _SAME_M:
             identity[early[row]] = found.carried[carried[column]]
     new = np.argsort(chosen.start, kind="stable")
     new = new[(chosen.start[new] < own) & (identity[new] < 0)]

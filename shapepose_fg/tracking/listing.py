@@ -9,7 +9,6 @@ from shapepose_fg.body.shapes import statures_m
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.frame_times import ASSUMED_FPS
 from shapepose_fg.core.reconstruction import Known, OpenedReconstruction, Reconstruction
-from shapepose_fg.core.storage.files import MOST_ROWS
 
 _STEP_S = 0.5
 """Walked distance is measured between mean positions over this time, s; this averages out joint
@@ -42,12 +41,16 @@ class TrackSummary:
     """Walked distance, m, summed over half seconds; steps under 5 cm are ignored."""
 
 
+_TOGETHER = 40_000
+"""Maximum number of rows of a saved result in memory at once, plus those of one person."""
+
+
 def list_saved_tracks(
     opened: OpenedReconstruction, body: SmplArrays | None = None
 ) -> list[TrackSummary]:
     """`list_tracks` of a saved result, loading a few people at a time."""
     numbers, counts = np.unique(opened.person, return_counts=True)
-    group = (np.cumsum(counts) - counts) // MOST_ROWS
+    group = (np.cumsum(counts) - counts) // _TOGETHER
     return [
         track
         for n in np.unique(group)

@@ -10,15 +10,17 @@ from factors import DEFAULT_WIDTH_SIGMA
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.compiled import kernel, part
 from shapepose_fg.core.kernel_geometry import ROBUST, project, triangulated
-from shapepose_fg.core.scales import FARTHEST_M, KNOWN_M, LEAST_JOINTS
 from shapepose_fg.estimation.gated_views import MIN_DEPTH_M, ObservationConfig
 from shapepose_fg.estimation.kernels import add_detection
 from shapepose_fg.proposal.nearby import FrameArrays
-from shapepose_fg.tracking.motion_filter import Bones, JointStates, sigma
+from shapepose_fg.tracking.motion_filter import TRUSTED_M, Bones, JointStates, sigma
 from shapepose_fg.tracking.plausibility import tear
+from shapepose_fg.tracking.view_assignment import FARTHEST_M
 
 _ITERATIONS = 3
 """Number of linearisations (and gatings) per frame."""
+MIN_SEEN_TWICE = 4
+"""Core joints that two views must see for a frame to count as evidence of the person."""
 MIN_IN_A_VIEW = 9
 """Core joints that a single view must see for the same purpose: over half a body is no
 coincidence."""
@@ -122,7 +124,7 @@ def _measure(mean, covariance, lost, candidate, confident, arrays, trust, bones,
                     depth = fixed_m if fixed_m > 0 else depth
                     px = focal[v] * np.sqrt(trust.floor_rad**2 + (trust.sigma_m / depth) ** 2)
                     sigma_px[v], seen = px * scatter[j] / np.sqrt(confident[d]), seen + 1
-            swings = near == 0 and arrays.swings[j] and trunk >= LEAST_JOINTS
+            swings = near == 0 and arrays.swings[j] and trunk >= MIN_SEEN_TWICE
             if seen >= 2 and (lost[a, j] or swings):
                 for v in range(views):
                     d = candidate[a, j, v]
@@ -141,7 +143,7 @@ def _measure(mean, covariance, lost, candidate, confident, arrays, trust, bones,
                     )
                     _move(mean[a, j], covariance[a, j], at, L, g, M, gain)
                 _update(mean[a, j], covariance[a, j], L, M, gain)
-            trusted[j], seen_by[j] = sigma(covariance[a, j]) < KNOWN_M, inlier[j].sum()
+            trusted[j], seen_by[j] = sigma(covariance[a, j]) < TRUSTED_M, inlier[j].sum()
         tear(
             mean[a],
             trusted,
@@ -167,7 +169,7 @@ def _measure(mean, covariance, lost, candidate, confident, arrays, trust, bones,
                 twice += 1
         for v in range(views):
             most = max(most, (core & (candidate[a, :, v] >= 0)).sum())
-        evident[a] = twice >= LEAST_JOINTS or most >= MIN_IN_A_VIEW
+        evident[a] = twice >= MIN_SEEN_TWICE or most >= MIN_IN_A_VIEW
 
 
 @part

@@ -11,8 +11,19 @@ from factors import Motion
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.compiled import kernel, part
 from shapepose_fg.core.rows import Rows
-from shapepose_fg.core.scales import KNOWN_M, LOST_M, RECENT_S, WELL_SEEN_M
 from shapepose_fg.core.skeleton import Skeleton
+
+LOST_M = 0.2
+"""Predicted standard deviation, m, above which a joint is lost, and searched for around its parent.
+A joint seen by one view is not lost, however uncertain its depth."""
+TRUSTED_M = 0.1
+"""Standard deviation, m, below which a joint's bone lengths are checked, and below which it is not
+lost in the next frame however long the interval: at 10 frames per second the unknown velocity of a
+new person's joints alone adds 20 cm."""
+_FOLLOW_S = 0.25
+"""Time constant with which the velocity of an unseen joint approaches that of the person, s."""
+_FOLLOW_SIGMA_M = 0.05
+"""Standard deviation, m, above which a joint counts as unseen here."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +105,7 @@ def predicted(
     mean, covariance = np.empty_like(joints.mean), np.empty_like(joints.covariance)
     lost, room = np.empty(mean.shape[:2], dtype=bool), np.empty((2, mean.shape[2]))
     F, noise = _step(motion, step_s)
-    decay = float(np.exp(-abs(step_s) / RECENT_S))
+    decay = float(np.exp(-abs(step_s) / _FOLLOW_S))
     _predict(
         joints.mean,
         joints.covariance,
@@ -145,7 +156,7 @@ def _predict(
     right, left, velocity = bones.hips[0], bones.hips[1], np.empty(3)
     for a in range(people):
         # Without information the velocity is 0; else the joint would drift along a ray.
-        certain = 1 / KNOWN_M**2
+        certain = 1 / TRUSTED_M**2
         velocity[0] = velocity[1] = velocity[2] = 0.0
         for j in range(joints):
             if core[j]:
@@ -155,7 +166,7 @@ def _predict(
                     velocity[x] += certainty * mean[a, j, 3 + x]
         any_placed = False
         for j in range(joints):
-            unseen, was_m = sigma(covariance[a, j]) > WELL_SEEN_M, _across(covariance[a, j])
+            unseen, was_m = sigma(covariance[a, j]) > _FOLLOW_SIGMA_M, _across(covariance[a, j])
             for k in range(size):
                 moving[k] = mean[a, j, k]
             if unseen:
@@ -182,7 +193,7 @@ def _predict(
                     covariance_after[a, j, row, column] = covariance_after[a, j, column, row] = (
                         total
                     )
-            lost[a, j] = _across(covariance_after[a, j]) > LOST_M and was_m > KNOWN_M
+            lost[a, j] = _across(covariance_after[a, j]) > LOST_M and was_m > TRUSTED_M
             any_placed = any_placed or (core[j] and not lost[a, j])
         for j in order:
             lost[a, j] = lost[a, j] and any_placed  # else no parent is placed

@@ -20,12 +20,11 @@ from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.rows import Rows
-from shapepose_fg.core.scales import DETECTOR_M, LOST_M, SAME_PERSON_M
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.gated_views import ObservationConfig
 from shapepose_fg.proposal.nearby import FrameArrays
 from shapepose_fg.tracking.measuring import Trust, measured
-from shapepose_fg.tracking.motion_filter import Bones, JointStates, predicted
+from shapepose_fg.tracking.motion_filter import LOST_M, Bones, JointStates, predicted
 from shapepose_fg.tracking.view_assignment import Predicted, assign
 
 FindPeople = Callable[[Detections, Rig], Observations]
@@ -34,9 +33,13 @@ NoteDropped = Callable[[str, list[int]], None]
 """Records a reason, and the frames in which a person was dropped for it."""
 
 
+_APART_M = 0.25
+"""Minimum mean distance of a new person's joints from any track's, m; nearer is the same person."""
 _MOST_PEOPLE = 64
 """Maximum number of new people; no further search where stage I reaches it
 (`ProposalConfig.most_people`)."""
+_BIRTH_SIGMA_M = 0.04
+"""Standard deviation of a new person's joints from stage I, m."""
 
 
 @dataclass(frozen=True)
@@ -164,7 +167,7 @@ class Tracker:
         known = np.asarray(np.isfinite(places).all(axis=-1))
         count = np.maximum(known.sum(axis=1), 1)[:, None]
         centre = (np.where(known[..., None], places, 0.0).sum(axis=1) / count)[:, None]
-        sigma = np.where(known, DETECTOR_M, 2 * LOST_M)
+        sigma = np.where(known, _BIRTH_SIGMA_M, 2 * LOST_M)
         joints = JointStates.at(
             np.where(known[..., None], places, centre), sigma, self.scale.motion.start
         )
@@ -191,7 +194,7 @@ class Tracker:
             people = find(detections.only(free), rig)
             own = np.where(people.candidate >= 0, np.append(rest, -1)[people.candidate], -1)
             twice = (own >= 0).sum(axis=2)[:, core] >= 2
-            apart = (mean_distance(people.initial, there) > SAME_PERSON_M).all(axis=1)
+            apart = (mean_distance(people.initial, there) > _APART_M).all(axis=1)
             new = apart & (twice.sum(axis=1) >= self.config.min_new_joints)
             found.append(people.initial[new])
             theirs.append(own[new])

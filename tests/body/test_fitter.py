@@ -163,7 +163,7 @@ def test_no_rows_is_no_people(fitter):
 
 
 def test_unfinished_rows_say_so(joints, monkeypatch):
-    monkeypatch.setattr(optimisers, "MOST_STEPS", 1)
+    monkeypatch.setattr(optimisers, "MAX_ITERATIONS", 1)
     fit = SmplFitter().fit(make_targets(joints, 0.001))
     stuck = fit.status == FitStatus.NOT_CONVERGED
     assert stuck.mean() > 0.8

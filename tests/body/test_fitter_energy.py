@@ -216,5 +216,5 @@ def test_joints_on_a_line_do_not_determine_a_pose(monkeypatch):
     xyz[2, 1] = 100.0  # is not looked at
     off = 0.1 * np.sqrt(4 / 5)  # root mean square distance from the line of the second
     for least, expected in ((off - 1e-6, [False, True, False, False]), (off + 1e-6, [False] * 4)):
-        monkeypatch.setattr(evidence, "DETECTOR_M", least)
+        monkeypatch.setattr(evidence, "MIN_SPREAD_M", least)
         assert determine_pose(xyz, used).tolist() == expected

@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
-from shapepose_fg.body.fitting.energy import BodyEnergy, EnergyTargets, Held
+from shapepose_fg.body.fitting.energy import SETTLED, BodyEnergy, EnergyTargets, Held
 from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.kernels.solving import LIMB_M
 from shapepose_fg.body.model.body_model import BodyModel
-from shapepose_fg.core.scales import HUGE
 
 ROWS = 3
 SCALE = 6.0
@@ -72,7 +71,7 @@ def test_where_it_is_held_it_is_not_pulled(energy, free):
 
 def test_settled_shapes_stay_and_poses_go_on(energy, targets, free, held):
     betas = draw(ROWS, 10, seed=5)
-    settled = Held(betas, np.full(ROWS, HUGE), held.angles)
+    settled = Held(betas, np.full(ROWS, SETTLED), held.angles)
     start = np.concatenate((betas, free[:, 10:]), 1)
     here = energy.linearise(start, targets, SCALE, settled)
     step = -np.linalg.solve(here.hessian, here.gradient[..., None])[..., 0]

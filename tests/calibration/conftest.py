@@ -60,9 +60,9 @@ def off_by(rig: Rig, truth: Rig) -> tuple[np.ndarray, np.ndarray]:
 @pytest.fixture(scope="module")
 def few_frames():
     """Thirty frames say as much of these cameras as bounds ask, in half the time."""
-    before, calibration_people.ANCHORS = calibration_people.ANCHORS, 30
+    before, calibration_people.MOST_FRAMES = calibration_people.MOST_FRAMES, 30
     yield
-    calibration_people.ANCHORS = before
+    calibration_people.MOST_FRAMES = before
 
 
 @pytest.fixture(scope="session")

@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.frame_times import FrameTimes
-from shapepose_fg.core.scales import UNSEEN_S
-from shapepose_fg.core.trajectory import Trajectory
+from shapepose_fg.core.trajectory import LONGEST_GAP_S, Trajectory
 from shapepose_fg.core.trust import without_poses
 
 
@@ -108,7 +107,7 @@ def test_a_camera_names_a_trajectory_that_there_is(with_robot):
 
 def test_pictures_before_behind_and_in_gaps_of_a_trajectory_have_no_pose(with_robot):
     poses = np.stack([turned(0, x) for x in range(4)])
-    gap = replace(ROBOT, time_s=np.array([0.1, 0.2, 0.3 + UNSEEN_S, 1.0]), wTb=poses)
+    gap = replace(ROBOT, time_s=np.array([0.1, 0.2, 0.3 + LONGEST_GAP_S, 1.0]), wTb=poses)
     times = FrameTimes(np.arange(12) / 10)
     spells = without_poses(replace(with_robot, trajectories=(gap,)), times)
     assert spells == tuple((view, *span) for view in (3, 4) for span in ((0, 1), (3, 8), (11, 12)))

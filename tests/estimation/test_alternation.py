@@ -15,7 +15,7 @@ from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.reconstruction import Status
-from shapepose_fg.core.scales import BODY_M
+from shapepose_fg.estimation.draft import MODEL_SIGMA_M
 from shapepose_fg.estimation.estimator_config import (
     EstimatorConfig,
     RefineConfig,
@@ -180,7 +180,7 @@ def test_a_joint_never_seen_comes_from_the_body(five_cameras, two_people):
     np.testing.assert_allclose(result.joints[unknown], prior[unknown], atol=1e-9)
     solved = np.stack([person.covariance[0] for person in result.people])
     np.testing.assert_allclose(
-        solved[unknown], np.tile((0.07**2 + BODY_M**2) * np.eye(3), (2, 1, 1))
+        solved[unknown], np.tile((0.07**2 + MODEL_SIGMA_M**2) * np.eye(3), (2, 1, 1))
     )
     assert (result.confidence[unknown] == 0).all() and not result.inlier[unknown].any()
     assert np.isfinite(result.joints).all()

@@ -267,7 +267,7 @@ def test_a_fitter_without_offsets_goes_without(scene, odd_recording, tmp_path):
 
 
 def test_a_detector_s_own_skeleton_moves_the_candidates_and_not_the_people(scene, odd_scene):
-    exactly = DetectorConfig(*[0.0] * 8, offsets=ODD)
+    exactly = replace(DetectorConfig.perfect(), offsets=ODD)
     seen = simulate(scene, exactly, frames=[0])[0]
     true_xy, _ = scene.rig.project(odd_scene.truth_at(0))
     hip = BODY_25.index("LHip")

@@ -27,7 +27,7 @@ def test_it_is_the_least_squares_solution_over_all_frames(monkeypatch):
     covariance = np.broadcast_to((sigma**2)[:, None, None, None] * np.eye(3), (T, J, 3, 3))
     mean, found = smoothing.smoothed(joints, covariance, np.zeros(T, dtype=int), times, motion)
     q = motion.density(np.zeros(J))[WRIST]
-    weight = 1 / (4 * sigma**2 + smoothing.DETECTOR_M**2)
+    weight = 1 / (4 * sigma**2 + smoothing.LEAST_SIGMA_M**2)
     H, b = np.zeros((2 * T, 2 * T)), np.zeros((2 * T, 3))
     H[::2, ::2], b[::2] = np.diag(weight), weight[:, None] * joints[:, WRIST]
     H[1, 1] += 1 / MOTION.law.start[0] ** 2

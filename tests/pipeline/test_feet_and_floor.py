@@ -65,7 +65,7 @@ def test_bodies_stay_above_the_floor(dance):
     people = dance.people
     floor = people.run["floor"]
     assert floor["found"] and floor["share"] > 0.9
-    # The scene's floor is at 0; SINK_M.
+    # The scene's floor is at 0; SOLE_M.
     assert abs(floor["height_m"]) < 0.015 and floor["normal"][2] > 0.9999
     ok = people.status == "ok"
     model = BodyModel.default()

@@ -13,8 +13,8 @@ from shapepose_fg.core.camera import Views
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.observations import Observations
-from shapepose_fg.core.scales import DETECTOR_M
 from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.estimation.alternation import JOINT_SIGMA_M
 from shapepose_fg.estimation.gated_views import linearise, observation_sigmas
 from shapepose_fg.io.config import read_config
 from shapepose_fg.pipeline.pipeline import PipelineConfig, find_people
@@ -123,7 +123,7 @@ def test_the_body_is_fitted_to_x(five_cameras, two_people):
     known = np.isfinite(observations.initial).all(axis=-1)
     np.testing.assert_array_equal(targets.xyz[known], observations.initial[known])
     np.testing.assert_array_equal(
-        targets.information[known], np.broadcast_to(np.eye(3) / DETECTOR_M**2, (49, 3, 3))
+        targets.information[known], np.broadcast_to(np.eye(3) / JOINT_SIGMA_M**2, (49, 3, 3))
     )
     assert not targets.information[1, KNEE].any()
 

@@ -13,7 +13,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 
 LEVELS = (
-    "factors core.arrays core.errors core.rows core.scales",
+    "factors core.arrays core.errors core.rows",
     "core.storage.files core.decompositions core.validation",
     "core.kept_kernels core.bounds",
     "core.compiling",

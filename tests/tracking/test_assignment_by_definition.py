@@ -52,7 +52,7 @@ DEFAULTS = {
     "least_affinity": 0.3,
     "reach_m": 0.8,
     "overlap_m": 0.025,
-    "rounds": 2,
+    "passes": 2,
     "trunk_joints": 2,
 }
 """What is documented, so that another default is noticed."""
@@ -98,7 +98,7 @@ def assigned(predicted: Predicted, crowded, rig, config: SimpleNamespace) -> np.
     ]
     owned: list[set[int]] = [set() for _ in places]
     chosen = np.full((*lost.shape, len(rig)), -1)
-    for _ in range(1 + config.rounds):
+    for _ in range(1 + config.passes):
         offers, shared, before = [], [], chosen.copy()
         for person in range(len(places)):
             for row in range(len(crowded)):
@@ -149,7 +149,7 @@ def assigned(predicted: Predicted, crowded, rig, config: SimpleNamespace) -> np.
 
 
 @pytest.mark.parametrize(
-    "settings", [{}, {"rounds": 1, "overlap_m": 0.3, "reach_m": 0.4}, {"least_affinity": 0.1}]
+    "settings", [{}, {"passes": 1, "overlap_m": 0.3, "reach_m": 0.4}, {"least_affinity": 0.1}]
 )
 def test_detections_are_taken_best_first_by_nearness_and_affinity(
     settings, predicted, crowded, five_cameras, settle
@@ -177,7 +177,7 @@ def test_a_detection_that_serves_two_is_theirs_with_a_probability_of_one_at_most
     monkeypatch.setattr(
         view_assignment, "probabilities", lambda scored, _: np.full(len(scored.score), 0.6)
     )
-    settle(rounds=1, overlap_m=0.6, farthest_m=0.6)
+    settle(passes=1, overlap_m=0.6, farthest_m=0.6)
     arrays = FrameArrays.of(crowded, five_cameras, BODY_25)
     chosen, probability = view_assignment.assign_with_probability(predicted, arrays)
     owners = np.bincount(chosen[chosen >= 0], minlength=len(crowded))

@@ -135,11 +135,11 @@ def test_a_new_person_stands_apart_from_all_tracks(two_people, beside_m, apart):
     assert mean_distance(new, two_people[:0]).shape == (1, 0)
 
 
-def test_new_joints_are_known_to_3_cm_and_unplaced_ones_are_lost(tracker, two_people):
+def test_new_joints_are_known_to_4_cm_and_unplaced_ones_are_lost(tracker, two_people):
     places = two_people[:1].copy()
     places[0, WRIST] = np.nan
     new = tracker.at(places, np.array([7]), np.array([3]), 10.0)
-    np.testing.assert_allclose(new.joints.sigma_m[0], np.where(np.arange(25) == WRIST, 0.4, 0.03))
+    np.testing.assert_allclose(new.joints.sigma_m[0], np.where(np.arange(25) == WRIST, 0.4, 0.04))
     np.testing.assert_allclose(new.joints.position[0, WRIST], np.nanmean(places[0], axis=0))
     np.testing.assert_allclose(
         np.diagonal(new.joints.covariance[0], axis1=1, axis2=2)[:, 3:], 2.0**2

@@ -23,12 +23,12 @@ from shapepose_fg.body.model.skinned_points import NUM_COLUMNS, SkinnedPoints
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.compiled import kernel
-from shapepose_fg.core.scales import BODY_M
 
 _TANGENT = np.append(np.arange(10 + 3 * NUM_ROTATIONS), np.arange(10 + 72, 10 + 75))
 """Columns of the body's Jacobian that are inputs of the network: all but the hands'."""
-_TURN_RAD = 0.3
-"""Standard deviation of an unobserved angle, rad; it only scales gradients, as `BODY_M` does."""
+_SEEN_M, _TURN_RAD = 0.02, 0.3
+"""Standard deviations of a well observed joint, m, and of an unobserved angle, rad; they only scale
+gradients."""
 STEP = 0.1
 """Scale of the network's output: an output of 1 is 0.1 in entries of rotations and metres, and 1 in
 betas."""
@@ -161,6 +161,6 @@ def gradient_scale(points: SkinnedPoints, slots: tuple[int, ...]) -> Array:
     """
     eye = np.tile(np.eye(3), (1, 24, 1, 1))
     _, jacobian = points.positions_with_jacobian(eye, np.zeros((1, 10)), np.zeros((1, 3)))
-    slope = np.square(jacobian[0, list(slots)]).sum((0, 1))[_TANGENT] / BODY_M**2
+    slope = np.square(jacobian[0, list(slots)]).sum((0, 1))[_TANGENT] / _SEEN_M**2
     prior = np.concatenate((np.ones(10), np.full(3 * NUM_ROTATIONS, _TURN_RAD**-2), np.zeros(3)))
     return np.asarray(1 / (slope + prior))

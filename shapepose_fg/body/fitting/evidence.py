@@ -10,10 +10,15 @@ from shapepose_fg.body.fitting.fitter import STATUS_TYPE, FitStatus, JointTarget
 from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.core.compiled import kernel, part
 from shapepose_fg.core.rows import Rows
-from shapepose_fg.core.scales import DETECTOR_M, LEAST_JOINTS
 
+LEAST_JOINTS = 4
+"""Minimum number of joints with full information: three determine a pose, one more
+allows a check."""
 _SEEN_SIGMA_M = 0.3
 """A joint has full information if its standard deviation along every axis is below this, m."""
+MIN_SPREAD_M = 0.03
+"""Minimum root mean square distance of the joints with full information from a common line, m; else
+the rotation about it is undetermined."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +126,7 @@ def determine_pose(xyz: Array, used: Mask) -> Mask:
     scatter = points.swapaxes(-1, -2) @ points / np.maximum(count, 1)[..., None, None]
     # The mean squared distance from the best line is the trace less the largest eigenvalue.
     off = np.maximum(np.linalg.eigvalsh(scatter)[..., :2].sum(axis=-1), 0.0)
-    return (count >= LEAST_JOINTS) & (off >= DETECTOR_M**2)
+    return (count >= LEAST_JOINTS) & (off >= MIN_SPREAD_M**2)
 
 
 def _refuse_nonsense(targets: JointTargets) -> tuple[Array, Array, Mask]:

@@ -21,8 +21,13 @@ from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.rows import Rows
-from shapepose_fg.core.scales import BATCH, OUTLIER_SIGMA
 
+_CHUNK = 64
+"""Number of rows per batch of fits; their Hessians fit into the cache, and memory is bounded."""
+_CONVERGED = 9.0
+"""Without a network: maximum decrease of the energy that a Newton step predicts for a converged row
+(3 sigma of the posterior). With a network, `BodyConfig.unfinished` is used after the plain
+optimiser."""
 _SPREAD = {"RWrist": 2.0, "LWrist": 2.0}
 """Factors on the variance of joints without a target. Elbows bend farther from their mean
 than a Gaussian predicts: without them, 85 % of the wrists of the validation subjects
@@ -75,7 +80,7 @@ class SmplFitter(BodyFitter):
         plain = LevenbergMarquardt(self.energy, self.prior, config.kernel_scale)
         names = self.model.keypoint_names
         if weights is None:
-            self.optimiser, self._fallback, self._unfinished = plain, None, OUTLIER_SIGMA**2
+            self.optimiser, self._fallback, self._unfinished = plain, None, _CONVERGED
             self._spread = np.array([_SPREAD.get(name, 1.0) for name in names])
         else:
             weights.check(self.model)
@@ -142,7 +147,7 @@ class SmplFitter(BodyFitter):
             free, held = self.optimiser.arrive(
                 targets, variance, None if start is None else start[some]
             )
-            for near in _parts(len(free), BATCH):
+            for near in _parts(len(free), _CHUNK):
                 given = targets.rows(near)
                 part = JointPosterior.of(
                     self.optimiser.evaluated(free[near], given, held.rows(near))

@@ -15,6 +15,7 @@ from shapepose_fg.body.fitting.energy import (
     nothing,
     robust_weight,
 )
+from shapepose_fg.body.fitting.evidence import LEAST_JOINTS
 from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.fitting.weights import FitterWeights
@@ -23,12 +24,15 @@ from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model.rotation import log_so3
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, slots
 from shapepose_fg.core.arrays import Array, Mask
-from shapepose_fg.core.scales import LEAST_JOINTS, MOST_STEPS, WELL_SEEN_M
 
 STALE = 0.3
 """Change of a joint's robust weight in a step above which the row is linearised again."""
+WELL_SEEN_M = 0.05
+"""Standard deviation of a joint, metres, above which it is not an input of the network."""
 ANNEAL_STEPS = 2
 """Cold starts begin with a kernel 2^ANNEAL_STEPS times as wide, halved in every iteration."""
+MAX_ITERATIONS = 40
+"""Maximum number of Levenberg-Marquardt steps, rejected ones included."""
 TOLERANCE = 1e-2
 """Convergence: decrease of a row's energy in a step, in squared standard deviations."""
 _DAMPING_START, _DAMPING_MIN, _DAMPING_MAX = 1e-3, 1e-7, 1e7
@@ -151,7 +155,7 @@ class LevenbergMarquardt:
         here = energy.linearise(
             free, targets, self._scale * 2.0**widening, held, nothing(len(free))
         )
-        for _ in range(MOST_STEPS):
+        for _ in range(MAX_ITERATIONS):
             step, promised = np.empty(free.shape), np.empty(len(free))
             solved(here.system.copy(), damping, step, promised)
             promised += damping * (np.diagonal(here.system, axis1=1, axis2=2) * step**2).sum(axis=1)

@@ -11,7 +11,6 @@ import numpy as np
 from shapepose_fg.body.model.smpl_file import DATA
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS
 from shapepose_fg.core.arrays import Array, Index
-from shapepose_fg.core.scales import SAMPLES
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.core.storage.npz import read_npz
 
@@ -21,6 +20,7 @@ NUM_MOVING = 3 + NUM_ANGLES + 3
 """Number of moving parameters: rotation of the root, the other 69 angles, position of the root."""
 
 _CURE = "install the package again"
+_SAMPLES = 2000
 _MARGIN, _NOISE_M = 1.25, 0.05
 """Margin for people outside the body model, and for the errors of two joints (3 cm each, 1.5
 sigma)."""
@@ -167,10 +167,10 @@ def longest_bones(skeleton: Skeleton) -> Array:
     known = [j for j, name in enumerate(skeleton.joints) if name in BODY_POINTS]
     model = BodyModel.default().with_keypoints(tuple(skeleton.joints[j] for j in known))
     rng = np.random.default_rng(0)
-    pose = PosePrior.default().sample(rng, SAMPLES)
-    betas = rng.standard_normal((SAMPLES, 10)).clip(-3, 3)
-    still = np.zeros((SAMPLES, 3))
-    xyz = np.full((SAMPLES, len(skeleton), 3), np.nan)
+    pose = PosePrior.default().sample(rng, _SAMPLES)
+    betas = rng.standard_normal((_SAMPLES, 10)).clip(-3, 3)
+    still = np.zeros((_SAMPLES, 3))
+    xyz = np.full((_SAMPLES, len(skeleton), 3), np.nan)
     xyz[:, known] = model.keypoints(BodyParameters(betas, still, pose, still))
     parents = np.array(skeleton.parents)
     length = np.quantile(np.linalg.norm(xyz - xyz[:, parents], axis=-1), 0.999, axis=0)

@@ -10,10 +10,11 @@ import math
 
 from shapepose_fg.body.kernels.rows import Limbs, Linear, Own, Priors, Rows, Work
 from shapepose_fg.core.compiled import kernel, part
-from shapepose_fg.core.scales import DETECTOR_M
 
 REACH_M = 0.1
 """Standard deviation of the current body, m, against which the network weights targets."""
+TRUST_M = 0.03
+"""Standard deviation of a target that has weight one half, m."""
 FAR_M = 0.5
 """Distance, m, above which residuals are compressed for the network."""
 STEEP = 3.0
@@ -391,7 +392,7 @@ def seen(limbs, own, betas, local, place, target, information, kernel_scale, ste
                 M = information[b, t]
                 a0, a1, a2 = w.xyz[3 * k], w.xyz[3 * k + 1], w.xyz[3 * k + 2]
                 a0, a1, a2 = target[b, t, 0] - a0, target[b, t, 1] - a1, target[b, t, 2] - a2
-                _share(M, DETECTOR_M, S)
+                _share(M, TRUST_M, S)
                 row[at + 6] = (S[0, 0] + S[1, 1] + S[2, 2]) / 3
                 _share(M, REACH_M, S)
                 s0 = S[0, 0] * a0 + S[0, 1] * a1 + S[0, 2] * a2

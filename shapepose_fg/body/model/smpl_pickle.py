@@ -20,8 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.core.arrays import Array
-from shapepose_fg.core.scales import MOST_ITEMS
 from shapepose_fg.core.storage.files import read_bytes
+
+_MOST_STEPS = 200_000
+"""Maximum number of steps; SMPL's files take a few thousand."""
 
 
 class RefusedPickle(Exception):
@@ -81,9 +83,9 @@ _INSTRUCTIONS = (
 def _counted(step: Callable[[Any], None]) -> Callable[[Any], None]:
     def run(reader: Any) -> None:
         reader.steps += 1
-        if reader.steps > MOST_ITEMS:
+        if reader.steps > _MOST_STEPS:
             raise RefusedPickle(
-                f"it has over {MOST_ITEMS} instructions, but a body model has a few thousand"
+                f"it has over {_MOST_STEPS} instructions, but a body model has a few thousand"
             )
         step(reader)
 

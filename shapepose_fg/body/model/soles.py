@@ -7,7 +7,6 @@ import numpy as np
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.body.model.rotation import exp_so3, log_so3
 from shapepose_fg.core.arrays import Array, Index
-from shapepose_fg.core.scales import BATCH
 from shapepose_fg.core.skeleton import SMPL_24
 
 _BONES = tuple(
@@ -18,6 +17,8 @@ _ANKLES, _KNEES = (
 )
 SINK_M = 0.01
 """Depth below the floor that is tolerated, m: flesh and soles are soft."""
+_ROWS = 8
+"""Number of bodies per batch of vertices."""
 
 Bodies = tuple[Array, Array, Array, Array]
 """`betas` (B, 10), `global_orient` (B, 3), `body_pose` (B, 23, 3) and `transl` (B, 3) as in
@@ -86,7 +87,7 @@ def _lowest(model: BodyModel, bodies: Bodies, normal: Array) -> Array:
 def _vertices(model: BodyModel, bodies: Bodies, only: Index) -> Array:
     """(B, M, 3) positions of the vertices `only`, metres."""
     parts = [
-        model.vertices(BodyParameters(*(column[at : at + BATCH] for column in bodies)), only)
-        for at in range(0, len(bodies[0]), BATCH)
+        model.vertices(BodyParameters(*(column[at : at + _ROWS] for column in bodies)), only)
+        for at in range(0, len(bodies[0]), _ROWS)
     ]
     return np.concatenate(parts) if parts else np.zeros((0, len(only), 3))

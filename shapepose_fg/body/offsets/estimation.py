@@ -31,9 +31,10 @@ from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.keypoint_offsets import LARGEST_M, RIDES_ON, KeypointOffsets
 from shapepose_fg.core.arrays import Array, Real
 from shapepose_fg.core.bounds import Metres, Repeats, Settings
-from shapepose_fg.core.scales import BATCH
 from shapepose_fg.core.skeleton import BODY_25
 
+_CHUNK = 128
+"""Number of rows per batch of linearisations."""
 _POSE_WIDENING = 3.0
 """Factor on the standard deviations of the pose prior for this estimation. No prior has the exact
 distribution of poses, and its error would look like an offset, the same in hundreds of rows."""
@@ -108,8 +109,8 @@ def _solved(
         np.zeros(size),
         np.zeros((size - 75, size - 75)),
     )
-    for start in range(0, len(rows), BATCH):
-        part = rows[start : start + BATCH]
+    for start in range(0, len(rows), _CHUNK):
+        part = rows[start : start + _CHUNK]
         centred = evidence.xyz[part] - evidence.centre[part, None]
         seen = EnergyTargets(centred, evidence.information[part])
         here = _eliminate(

@@ -26,7 +26,7 @@ from shapepose_fg.core.provenance import ReadInputs, checksums, program_digest, 
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.result_files import CLOCKS, MOMENTS, PEOPLE, set_aside
 from shapepose_fg.core.run_summary import plain
-from shapepose_fg.core.storage.files import MOST_ROWS, inside, read_text, write_content
+from shapepose_fg.core.storage.files import inside, read_text, write_content
 from shapepose_fg.core.storage.kept_arrays import ANEW, InFolder
 from shapepose_fg.core.storage.output_folder import only_run_in, prepare_output
 from shapepose_fg.core.trust import Trusted, trust_in, without_poses
@@ -43,7 +43,7 @@ from shapepose_fg.pipeline.runs import manifest
 from shapepose_fg.pipeline.runs.assembly import Assembly
 from shapepose_fg.pipeline.trajectories import kept_rig
 from shapepose_fg.setup_check.report import SetupReport, result_check
-from shapepose_fg.viz.report.writing import REPORT, th, write_report
+from shapepose_fg.viz.report.writing import MOST_ROWS, REPORT, th, write_report
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,6 @@ from shapepose_fg.core.compiling import compiled_for_s
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import rate_words
 from shapepose_fg.core.reconstruction import Reconstruction
-from shapepose_fg.core.scales import SURE
 from shapepose_fg.io.footage.placement import FOOTAGE
 from shapepose_fg.pipeline.pipeline import Task
 from shapepose_fg.pipeline.runs.assembly import Assembly
@@ -20,6 +19,8 @@ from shapepose_fg.setup_check.diagnosis import detected_sizes, other_sizes
 from shapepose_fg.setup_check.report import ResultCheck, SetupReport, unseen
 from shapepose_fg.setup_check.report import check_setup as check_detections
 
+_SURE = 0.9
+"""People with a probability below this are listed."""
 _KNOWN_WORDS = {
     "seen": "seen by two views",
     "weak": "seen by one view or weakly",
@@ -130,20 +131,20 @@ def summary_table(
 
 
 def _doubtful(run: dict[str, Any]) -> str:
-    """People with a probability below `SURE`; without identities, their number of rows; empty if
+    """People with a probability below `_SURE`; without identities, their number of rows; empty if
     there are none.
     """
     said = run.get("probability", [])
     if isinstance(said, dict):
-        count = sum(rows for tenth, rows in said.items() if float(tenth) < SURE)
-        return f"{count} have a probability below {SURE}" if count > 0 else ""
+        count = sum(rows for tenth, rows in said.items() if float(tenth) < _SURE)
+        return f"{count} have a probability below {_SURE}" if count > 0 else ""
     few = [
         f"{each['person']} ({each['probability']:.2f})"
         for each in said
-        if each["probability"] < SURE
+        if each["probability"] < _SURE
     ]
     return (
-        f"probability below {SURE}: person {', '.join(few[:8])}{' ...' * (len(few) > 8)}"
+        f"probability below {_SURE}: person {', '.join(few[:8])}{' ...' * (len(few) > 8)}"
         if few
         else ""
     )

@@ -25,8 +25,6 @@ BLOCK_FRAMES = 128
 """Number of frames that are read and stored together."""
 ROWS_AT_ONCE = 4096
 """Number of rows of a table, or lines of a file, that are processed at once."""
-MOST_ROWS = 40_000
-"""Maximum number of rows of a saved result in memory at once, about 400 MB."""
 MOST_DEPTH = 64
 """Maximum depth of nested lists and objects: no format needs a fifth of it, and libyaml's loader is
 recursive."""

@@ -11,7 +11,6 @@ import numpy as np
 
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.errors import InputError, optional
-from shapepose_fg.core.scales import LONGEST_NAME
 from shapepose_fg.core.storage.files import BIG, SMALL, open_regular
 from shapepose_fg.core.storage.npz import MOST_PACKED, read_npy_header
 from shapepose_fg.io.camera_names import MOST_FRAME
@@ -25,7 +24,7 @@ _FREEMOCAP, _SLEAP, _DEEPLABCUT = (
     "DeepLabCut's HDF5",
 )
 _RERUN = "write the detections again, in pixels"
-_MOST_NAMES = 1000
+_MOST_NAMES, _LONGEST_NAME = 1000, 1000
 _TABLE = "df_with_missing/table"
 """Path of the table in files of DeepLabCut and AniPose."""
 _RECORD = np.dtype([("length", "<u4"), ("heap", "<u8"), ("index", "<u4")])
@@ -281,7 +280,7 @@ def _names(path: Path, names: Any) -> tuple[str, ...]:
     """The texts of a dataset (N,). Texts of variable length are read by this module, because
     libhdf5 does not check damaged lengths.
     """
-    if names.dtype.kind == "S" and names.dtype.itemsize <= LONGEST_NAME:
+    if names.dtype.kind == "S" and names.dtype.itemsize <= _LONGEST_NAME:
         return tuple(each.decode("utf-8") for each in names[:])
     begin = names.id.get_offset() if names.dtype.kind == "O" and names.chunks is None else None
     if begin is None:
@@ -299,7 +298,7 @@ def _from_heap(stream: BinaryIO, length: int, address: int, index: int) -> bytes
     stream.seek(address)
     head = stream.read(16)
     size = int.from_bytes(head[8:], "little")
-    if head[:4] != b"GCOL" or not 16 <= size <= SMALL or length > LONGEST_NAME:
+    if head[:4] != b"GCOL" or not 16 <= size <= SMALL or length > _LONGEST_NAME:
         raise ValueError("the position of a text is invalid")
     heap, at = stream.read(size - 16), 0
     while at + 16 <= len(heap):

@@ -17,10 +17,9 @@ from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.errors import InputError, naming, optional
 from shapepose_fg.core.reconstruction import Reconstruction
-from shapepose_fg.core.scales import MOST_ITEMS, UNSEEN_S
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.core.storage.files import MIDDLE, open_regular
-from shapepose_fg.core.trajectory import Trajectory
+from shapepose_fg.core.storage.files import open_regular
+from shapepose_fg.core.trajectory import LONGEST_GAP_S, Trajectory
 from shapepose_fg.io.camera_names import listing
 from shapepose_fg.io.detections.lines import view_of
 from shapepose_fg.io.ros.definitions import check_definition, definition, type_name
@@ -29,8 +28,11 @@ from shapepose_fg.io.ros.poses import KINDS, Frames, frame_of, stamp_ns
 from shapepose_fg.io.ros.topics import PeopleTopics
 
 _DETECTIONS = "shapepose_msgs/Detections"
-_WINDOW = 2**27
-"""Maximum window size of zstd, bytes (the default of its command-line program)."""
+_CHUNK = 2**26
+"""Maximum size of a decompressed chunk, bytes; ROS 2 writes chunks of one million bytes."""
+_WINDOW, _MOST_RECORDS = 2**27, 2**19
+"""Maximum window size of zstd, bytes (the default of its command-line program); and maximum number
+of records of a chunk, which are all in memory."""
 _CURE = f"give MCAP with ROS 2 messages {type_name(_DETECTIONS)}"
 _CURE_POSES = "give MCAP with ROS 2 messages of /tf, odometry or poses"
 View = tuple[str, Detections, float, Array | None, Array | None]
@@ -116,7 +118,7 @@ def read_views(
             with naming(file, _CURE_POSES):
                 (pose,), (covariances,), (there,) = frames.at(frame, np.array([time_s]))
             stands = not (carrier[camera] or frames.moves(frame))
-            if now_s < (begun_s if stands else time_s) + UNSEEN_S and not there:
+            if now_s < (begun_s if stands else time_s) + LONGEST_GAP_S and not there:
                 return
             waiting.popleft()
             if there or stands:
@@ -160,7 +162,7 @@ def read_views(
                 tidied_s = logged_s
     yield from placed(math.inf)
     for (camera, frame), count in unplaced.items():
-        what = f"frame {frame} has no pose within {UNSEEN_S:g} s"
+        what = f"frame {frame} has no pose within {LONGEST_GAP_S:g} s"
         note(f"{file}: {count} pictures of {camera} are left out: {what}")
     if number == 0:
         raise InputError(f"{file}: there are no detections in it; {_CURE}")
@@ -230,7 +232,7 @@ def _decoded(
 
 def _messages(stream: IO[bytes]) -> Iterator[tuple[Any, Any, Any]]:
     """Schema, channel and record of each message, chunk by chunk (one is in memory at a time),
-    sorted by log time within a chunk. ValueError for a chunk of more than `MIDDLE` bytes, which is
+    sorted by log time within a chunk. ValueError for a chunk of more than `_CHUNK` bytes, which is
     not decompressed further.
     """
     reading = optional("mcap.stream_reader", "ros")
@@ -255,8 +257,8 @@ def _messages(stream: IO[bytes]) -> Iterator[tuple[Any, Any, Any]]:
 
 
 def _unpacked(chunk: Any) -> bytes:
-    """The records of a chunk. ValueError for more than `MIDDLE` bytes (not decompressed further),
-    for more than `MOST_ITEMS` records, and for records that extend beyond the chunk.
+    """The records of a chunk. ValueError for more than `_CHUNK` bytes (not decompressed further),
+    for more than `_MOST_RECORDS` records, and for records that extend beyond the chunk.
     """
     lz4, zstd = optional("lz4.frame", "ros"), optional("zstandard", "ros")
     claims = {
@@ -264,25 +266,25 @@ def _unpacked(chunk: Any) -> bytes:
         "lz4": lambda packed: lz4.get_frame_info(packed)["content_size"],
     }
     claim = max(claims.get(chunk.compression, len)(chunk.data), chunk.uncompressed_size)
-    if claim > MIDDLE:
-        raise ValueError(f"a chunk claims {claim} bytes, over {MIDDLE}")
+    if claim > _CHUNK:
+        raise ValueError(f"a chunk claims {claim} bytes, over {_CHUNK}")
     # The sizes stated in the compressed data and in the chunk's header may be wrong or missing.
     if chunk.compression == "lz4":
-        data = lz4.LZ4FrameDecompressor().decompress(chunk.data, max_length=MIDDLE + 1)
+        data = lz4.LZ4FrameDecompressor().decompress(chunk.data, max_length=_CHUNK + 1)
     elif chunk.compression == "zstd":
         data = (
             zstd.ZstdDecompressor(max_window_size=_WINDOW)
             .stream_reader(chunk.data)
-            .read(MIDDLE + 1)
+            .read(_CHUNK + 1)
         )
     else:
         data = chunk.data
-    if len(data) > MIDDLE:
-        raise ValueError(f"a chunk has over {MIDDLE} bytes")
+    if len(data) > _CHUNK:
+        raise ValueError(f"a chunk has over {_CHUNK} bytes")
     at = count = 0
     while at < len(data):
         at, count = at + 9 + int.from_bytes(data[at + 1 : at + 9], "little"), count + 1
-        if at > len(data) or count > MOST_ITEMS:
+        if at > len(data) or count > _MOST_RECORDS:
             raise ValueError(
                 "a record ends beyond its chunk"
                 if at > len(data)

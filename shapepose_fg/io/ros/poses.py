@@ -9,8 +9,7 @@ import numpy as np
 from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.core.decompositions import rigid
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.scales import LARGEST
-from shapepose_fg.core.trajectory import MOST_VARIANCE, UNIT_LENGTH, Trajectory
+from shapepose_fg.core.trajectory import MOST_METRES, MOST_VARIANCE, UNIT_LENGTH, Trajectory
 from shapepose_fg.io.ros.definitions import type_name
 from shapepose_fg.io.ros.messages import NS, WORLD, ros_name
 
@@ -176,8 +175,8 @@ def _matrix(pose: Array, place: str) -> Array:
         raise InputError(
             f"{place}: a pose must be finite, with a quaternion of length 1; leave it out"
         )
-    if np.abs(pose[:3]).max() > LARGEST:
-        raise InputError(f"{place}: a pose is more than {LARGEST:g} m away; write metres")
+    if np.abs(pose[:3]).max() > MOST_METRES:
+        raise InputError(f"{place}: a pose is more than {MOST_METRES:g} m away; write metres")
     return rigid(Rotation.from_quat(pose[3:]).as_matrix(), pose[:3])
 
 

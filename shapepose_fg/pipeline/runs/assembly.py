@@ -25,10 +25,14 @@ from shapepose_fg.core.result_files import write_result
 from shapepose_fg.core.shapes import SubjectShapes
 from shapepose_fg.core.storage.npz import Pieces
 from shapepose_fg.core.storage.schema import Table
-from shapepose_fg.estimation.contact import SPEEDS_M_S, feet_of
+from shapepose_fg.estimation.contact import feet_of
 from shapepose_fg.estimation.floor import LOOK_S, Floor, find_floor
 from shapepose_fg.pipeline.person_shapes import WindowBodies
 from shapepose_fg.pipeline.runs.parts import OBSERVED, Parts
+
+_STANDS_M_S = 0.1
+"""Maximum speed of a standing foot, m/s, and of its standard deviation per axis, for a visible heel
+or toe."""
 
 
 @dataclass(frozen=True)
@@ -177,8 +181,8 @@ class Assembly:
         for n in range(len(parts)):
             speed, spread = parts.column(n, "velocity"), parts.column(n, "velocity_covariance")
             with np.errstate(invalid="ignore"):
-                still = np.linalg.norm(speed, axis=2) < SPEEDS_M_S[1]
-                still &= np.trace(spread, axis1=2, axis2=3) < 3 * SPEEDS_M_S[1] ** 2
+                still = np.linalg.norm(speed, axis=2) < _STANDS_M_S
+                still &= np.trace(spread, axis1=2, axis2=3) < 3 * _STANDS_M_S**2
             still &= parts.column(n, "known") == Known.SEEN
             stands = np.stack([still[:, side].any(axis=1) for side in sides], axis=1)
             stands &= (parts.column(n, "frame") % every == 0)[:, None]

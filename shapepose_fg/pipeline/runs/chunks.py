@@ -13,7 +13,6 @@ from shapepose_fg.core.assignment import least_cost_pairs
 from shapepose_fg.core.detections import Input
 from shapepose_fg.core.frame_times import segments
 from shapepose_fg.core.observations import Observations
-from shapepose_fg.core.scales import SAME_PERSON_M
 from shapepose_fg.core.storage.schema import Column, Table
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.windows import Engine, Span
@@ -25,6 +24,9 @@ occlusions are rare. Tracking takes a tenth of the total time."""
 _SAME = 0.5
 """Minimum share of the smaller track's detections that both tracks use for them to be
 one person."""
+_NEAR_M = 0.3
+"""Mean distance between joints of two tracks without detections, m, below which they are one
+person."""
 
 
 @dataclass(frozen=True)
@@ -150,7 +152,7 @@ def _alike(a: Border, b: Border) -> float:
         return 1.0 + share if share >= _SAME else 0.0
     apart = np.linalg.norm(a.place[first] - b.place[second], axis=-1)
     apart = apart[np.isfinite(apart)]
-    return max(0.0, 1.0 - float(apart.mean()) / SAME_PERSON_M) if len(apart) > 0 else 0.0
+    return 1.0 - float(apart.mean()) / _NEAR_M if len(apart) > 0 and apart.mean() < _NEAR_M else 0.0
 
 
 class Identities:

@@ -9,13 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.core.arrays import Array, Index
-from shapepose_fg.core.bounds import MOST_NUMBER
 from shapepose_fg.core.detections import Input
 from shapepose_fg.core.errors import naming
 from shapepose_fg.core.notes import Notes
 from shapepose_fg.core.observation_table import ObservationTable
 from shapepose_fg.core.reconstruction import Reconstruction, Status
-from shapepose_fg.core.scales import LARGEST
 from shapepose_fg.core.storage.kept_arrays import ANEW, KeptArrays
 from shapepose_fg.core.storage.schema import Column, columns_of
 from shapepose_fg.pipeline.runs.chunks import Border
@@ -191,20 +189,17 @@ def checkpoint_arrays(checkpoint: Checkpoint) -> dict[str, NDArray[Any]]:
     return arrays
 
 
-_NUMBERS = partial(Column, dtype=np.int64, most=MOST_NUMBER)
+_NUMBERS = partial(Column, dtype=np.int64, most=2**53)
 _ROWS = {
     "track": _NUMBERS("N"),
     "candidate": Column("N J V", np.intp),
-    "initial": Column("N J 3", most=LARGEST),
-    "evidence": Column("N", most=LARGEST),
+    "initial": Column("N J 3", most=1e6),
+    "evidence": Column("N", most=1e6),
 }
 """Columns of a row that is not solved yet; the rest comes from the cameras."""
 _FOLLOWED = {"at": _NUMBERS("2"), "state.numbers": _NUMBERS("2"), "state.rows": _NUMBERS("D")}
-_FOLLOWED |= {
-    "state.ids": _NUMBERS("A"),
-    "state.mean": Column("A J S", most=LARGEST, finite=True),
-}
-_FOLLOWED["state.covariance"] = Column("A J S S", most=LARGEST**2, finite=True)
+_FOLLOWED |= {"state.ids": _NUMBERS("A"), "state.mean": Column("A J S", most=1e6, finite=True)}
+_FOLLOWED |= {"state.covariance": Column("A J S S", most=1e12, finite=True)}
 _FOLLOWED |= {f"rows.{name}": column for name, column in _ROWS.items()}
 _FOLLOWED |= {f"border.{name}": column for name, column in columns_of(Border).items()}
 """Columns of `checkpoint_arrays`."""

@@ -21,7 +21,6 @@ from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.rotation import exp_so3
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, MIRROR, TARGET_SKELETONS, slots
 from shapepose_fg.core.arrays import Array
-from shapepose_fg.core.scales import LOST_M
 from shapepose_fg.core.skeleton import SMPL_24
 from shapepose_fg.simulation.training.corruption import CorruptionConfig, corrupt
 from shapepose_fg.simulation.training.differentiable import (
@@ -240,13 +239,15 @@ def prepared(
 
 
 def mean_variance(information: Tensor) -> Tensor:
-    """(B, K) mean variance over the axes, m²; infinite above `LOST_M` squared, e.g. for a ray."""
+    """(B, K) mean variance over the axes, m²; infinite above `_SEEN_M` squared, e.g. for a ray."""
     variance = torch.diagonal(inverse_3x3(information + 0.1 * torch.eye(3)), dim1=-2, dim2=-1).mean(
         -1
     )
-    return torch.where(variance < LOST_M**2, variance, torch.inf)
+    return torch.where(variance < _SEEN_M**2, variance, torch.inf)
 
 
+_SEEN_M = 0.2
+"""Standard deviation, m, above which joints are ignored for a person's position."""
 _OFFERED = torch.zeros(len(TARGET_SKELETONS), len(BODY_POINTS))
 for _row, _names in enumerate(TARGET_SKELETONS.values()):
     _OFFERED[_row, list(slots(_names))] = 1

@@ -16,7 +16,6 @@ from shapepose_fg.core.drawing import bones_of, colour_of, vertex_normals
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import Known, Reconstruction
 from shapepose_fg.core.storage.files import write_atomically
-from shapepose_fg.io.detections.view_streams import MARGIN
 from shapepose_fg.io.footage.footage import Picture
 from shapepose_fg.io.footage.placement import Placement
 from shapepose_fg.viz.bodies import joined
@@ -33,6 +32,9 @@ _OPACITY = 0.45
 """Opacity of bodies, so that the picture behind them stays visible."""
 _FINE = 8
 """Number of fractional bits of pixel coordinates in OpenCV's drawing functions."""
+_REACH = 0.5
+"""Distance outside the picture, as a share of its size, beyond which points are not drawn: the
+distortion is not calibrated there, and its polynomial may map them back into the picture."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,7 @@ class PictureView:
         flat = np.asarray(xy, dtype=np.float64).reshape(-1, 2)
         size = np.array(self.camera.image_size)
         with np.errstate(invalid="ignore"):
-            near = np.all((flat > -MARGIN * size) & (flat < (1 + MARGIN) * size), axis=1)
+            near = np.all((flat > -_REACH * size) & (flat < (1 + _REACH) * size), axis=1)
         drawn = np.full(flat.shape, np.nan)
         on_picture = self.placement.to_picture(self.camera.distort(flat[near]))
         drawn[near] = (on_picture + 0.5) * self.scale - 0.5

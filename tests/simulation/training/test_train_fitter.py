@@ -181,7 +181,7 @@ def test_a_few_batches_on_another_body_are_as_near_as_ours_and_nearer_than_the_o
     ]
     assert found["trained"].joints_mm < 1.1 * own.joints_mm  # 5 mm noise to joints missing: 50 mm
     assert found["raw"].joints_mm > 1.1 * found["trained"].joints_mm  # betas mean something else
-    monkeypatch.setattr(optimisers, "MOST_STEPS", 2)
+    monkeypatch.setattr(optimisers, "MAX_ITERATIONS", 2)
     # Two steps of the plain optimiser took 1.5 times as long as the network (measured once, not
     # here).
     assert compared({"plain": plain}, people, 256)["plain"].joints_mm > found["trained"].joints_mm
