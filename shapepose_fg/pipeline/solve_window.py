@@ -130,7 +130,7 @@ def _assigned(
         observations = new
         if assigning.over_time:
             other = changed(before.rows(rows_in(before, now)), now)
-            if other.sum() < _SETTLED * new.seen.sum():
+            if other.sum() <= _SETTLED * new.seen.sum():
                 break
             marked = np.isin([each.frame for each in frames], now.frame[other.any(axis=(1, 2))])
             asked = near_in_time(marked[:, None], frame_s, _CHANGED_S)[:, 0]

@@ -47,3 +47,23 @@ def test_wrong_detections_are_exchanged():
     is_wrong = given & (found.candidate % 27 >= 25)
     assert is_wrong.sum() < (rows.candidate % 27 >= 25).sum() / 2
     assert not is_wrong[~np.isin(found.frame, WRONG)].any()
+
+
+def test_people_without_detections_keep_their_rows():
+    """A window in which nobody is seen, of a recording in which cameras are covered for a while."""
+    scene = built_in_scene(people=1, cameras=3, frames=4)
+    frames = [Input(t, np.full(3, t / scene.fps), Detections.empty(), scene.rig) for t in range(4)]
+    rows = Observations.concatenate(
+        [
+            Observations.of(
+                np.full((1, 25, 3), -1), each.detections, scene.keypoints[each.frame],
+                frame=np.array([each.frame]), time_s=each.time_s[None], track=np.array([0]),
+            )
+            for each in frames
+        ]
+    )  # fmt: skip
+    asked = Assigning(frames, BODY_25, 8, over_time=True)
+    fitter, views = make_fitter(BodyConfig()), Views.of(scene.rig)
+    found = solve_window(rows, views, fitter, EstimatorConfig(), assigning=asked).observations
+    np.testing.assert_array_equal(found.frame, rows.frame)
+    assert not found.seen.any()
