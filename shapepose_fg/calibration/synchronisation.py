@@ -58,8 +58,6 @@ class Synchronised:
     drift: Array
     """(V,) drift, seconds per second that the camera falls behind; 0 in recordings of under four
     minutes."""
-    drift_sigma: Array
-    """(V,) standard deviation of the drift."""
     middle_s: float
     """Time for which the offset is stated, on the camera's own clock, s."""
 
@@ -119,13 +117,11 @@ def synchronise(
     offset, sigma, sure = offsets(seen, rig, fps, first, most_s, np.zeros(len(rig)), progress)
     middle, none = (first.start + first.stop) / 2 / fps, np.zeros(len(rig))
     if len(first) == len(frames):
-        return Synchronised(offset, sigma, sure, none, none, middle)
+        return Synchronised(offset, sigma, sure, none, middle)
     seen = at_regular_times(Sightings.of(detections, frames[-end:]), time_s, fps)
-    later, later_sigma, _ = offsets(seen, rig, fps, frames[-end:], _DRIFT_S, offset, progress)
+    later, *_ = offsets(seen, rig, fps, frames[-end:], _DRIFT_S, offset, progress)
     lasts = (frames.stop - end / 2) / fps - middle
-    return Synchronised(
-        offset, sigma, sure, (later - offset) / lasts, np.hypot(sigma, later_sigma) / lasts, middle
-    )
+    return Synchronised(offset, sigma, sure, (later - offset) / lasts, middle)
 
 
 def offsets(

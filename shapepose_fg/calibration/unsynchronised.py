@@ -83,7 +83,7 @@ def calibrate_unsynchronised(
     assert found is not None
     progress(total, total)
     none, middle = np.zeros(V), (frames.start + frames.stop) / 2 / fps
-    clocks = Synchronised(offset, sigma, sure, none, none, middle)
+    clocks = Synchronised(offset, sigma, sure, none, middle)
     if problems := (*problems, *clocks.undetermined(rig)):
         raise Undetermined(problems, found)
     return found, clocks

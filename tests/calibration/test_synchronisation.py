@@ -45,7 +45,6 @@ def test_clocks_that_run_apart(rig, two_people, monkeypatch):
     )
     found = synchronise(seen, rig, FPS, range(300), 2.0)
     assert np.abs(found.drift - drift).max() < 0.001
-    assert (np.abs(found.drift - drift)[1:] < 4 * found.drift_sigma[1:]).all()
     # Frame 250 of the third camera was exposed after 10 s of a clock that is 3 in 1,000 slow.
     assert found.at(10.0)[2] == pytest.approx(10.03 - 0.3, abs=0.008)
 
