@@ -13,7 +13,7 @@ from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.proposal.candidates import Candidates
-from shapepose_fg.proposal.nearby import LEAST_AFFINITY, FrameArrays, nearby
+from shapepose_fg.proposal.nearby import LEAST_AFFINITY, PASSES, FrameArrays, nearby
 from shapepose_fg.proposal.proposals import ProposalConfig, Proposals
 
 _NEAR_M = 0.08
@@ -24,8 +24,6 @@ _FAR_M = 0.25
 _REACH_M = 0.6
 """A joint whose place is not known yet is sought this far around its neighbours on the skeleton: no
 limb from a joint to the next is longer, the trunk aside."""
-_PASSES = 2
-"""Number of further passes, each with the neighbours that the last one assigned."""
 
 
 def associate(
@@ -45,14 +43,14 @@ def associate(
     """
     own, places = by_support(proposals, candidates, detections, len(rig)), proposals.places
     real = np.ones(len(proposals), dtype=bool)
-    rounds = 1 + _PASSES
+    rounds = 1 + PASSES
     while rounds > 0:
         own = _claimed(places, own, detections, rig, skeleton)
         keep = seen_twice(own >= 0, skeleton).mean(axis=1) >= config.min_observed_parts
         real[np.flatnonzero(real)[~keep]] = False
         places, own = places[keep], own[keep]
         # Detections of dropped proposals are reassigned.
-        rounds = rounds - 1 if keep.all() else _PASSES
+        rounds = rounds - 1 if keep.all() else PASSES
     return Observations.of(own, detections, places), int((~real).sum())
 
 

@@ -25,6 +25,11 @@ mostly 0, true ones above 0.4."""
 OVERLAP_M = 0.025
 """Distance of two people's projected joints, as a length at their depth, m, below which one
 detection serves both. A detector's error is 2 to 3 cm."""
+NEAR_M = 0.06
+"""Standard deviation of the nearness score around an exactly known position, as a length at the
+joint's depth, m."""
+PASSES = 2
+"""Number of further passes of an assignment, each with the affinities to the previous one."""
 
 
 class FrameArrays(NamedTuple):

@@ -12,10 +12,8 @@ from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.kernel_geometry import solved
 from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.proposal.nearby import FrameArrays, nearby
+from shapepose_fg.proposal.nearby import NEAR_M, FrameArrays, nearby
 
-_NEAR_M = 0.06
-"""Standard deviation of the nearness score, as a length at the joint's depth, m; as in `assign`."""
 _FAR_M = 0.15
 """Maximum distance of a joint from the ray of its detection, m."""
 _SURE_AFFINITY = 0.5
@@ -139,7 +137,7 @@ def _claimed(places: Array, own: Index, frame: Frame, *, exclusive: bool) -> Ind
     unplaced = np.isnan(places[..., 0])
     if unplaced.any():
         near = near.with_tied(own, unplaced, frame.arrays)
-    nearness = np.exp(-0.5 * near.distance_m**2 / _NEAR_M**2)
+    nearness = np.exp(-0.5 * near.distance_m**2 / NEAR_M**2)
     lost = np.isinf(near.distance_m)
     chosen, claims = near.claimed(nearness, lost, _SURE_AFFINITY, own, world, frame.arrays)
     if exclusive:

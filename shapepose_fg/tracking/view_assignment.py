@@ -9,16 +9,15 @@ from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.compiled import kernel
 from shapepose_fg.proposal.nearby import (
     LEAST_AFFINITY,
+    NEAR_M,
     OVERLAP_M,
+    PASSES,
     FrameArrays,
     claim,
     find_near,
     share,
 )
 
-_NEAR_M = 0.06
-"""Standard deviation of the nearness score around an exact prediction, as a length at the joint's
-depth, m."""
 _FAR_M = 0.12
 """Distance, plus twice the prediction's sigma, up to which a detection is near, m."""
 FARTHEST_M = 0.5
@@ -30,8 +29,6 @@ seen near in this view. A foot kicking at 150 m/s² moves this far in 0.1 s."""
 _TRUNK_JOINTS = 2
 """Joints of trunk and head that a view must see near before far detections of arms and legs are
 accepted."""
-_PASSES = 2
-"""Number of further passes, each with the affinities to the previous assignment."""
 _ODDS = 5.0
 """Log-odds that a detection is a person's, per unit of score."""
 _EVEN = 0.45
@@ -174,8 +171,8 @@ def _assign(
         sought[e] = lost[a, j]
         nearness[e] = -np.inf
         if sought[e] or distance_m[e] < gate_m[a, j]:
-            nearness[e] = np.exp(-0.5 * distance_m[e] ** 2 / (_NEAR_M**2 + sigma_m[a, j] ** 2))
-    for n in range(1 + _PASSES):
+            nearness[e] = np.exp(-0.5 * distance_m[e] ** 2 / (NEAR_M**2 + sigma_m[a, j] ** 2))
+    for n in range(1 + PASSES):
         for e in range(count if n > 0 else 0):
             a, j, v = person[e], of_joint[detection[e]], arrays.of_view[detection[e]]
             if arrays.swings[j] and not sought[e] and not distance_m[e] < gate_m[a, j]:
