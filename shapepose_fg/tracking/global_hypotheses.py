@@ -21,14 +21,10 @@ from shapepose_fg.core.detections import Input
 from shapepose_fg.proposal.nearby import FrameArrays
 from shapepose_fg.tracking.motion_filter import JointStates
 from shapepose_fg.tracking.track_selection import EvidenceTable, SelectedTracks, weighed
-from shapepose_fg.tracking.tracker import Tracker, Tracks
+from shapepose_fg.tracking.tracker import SEARCH_S, Tracker, Tracks
 
 Array = NDArray[np.float64]
 
-_SEARCH_S = 0.3
-"""Interval between searches for new people in each world, s; half that between searches among all
-detections. In a world that lacks a person, the others take that person's detections, so every world
-is searched: in crowds before three cameras this finds two to six more people of a hundred."""
 _TWINS_S = 0.1
 """Interval between checks for duplicate worlds, s."""
 _RESTART_S = 1.3
@@ -219,7 +215,7 @@ def _seeds(tracker: Tracker, frames: Sequence[Input]) -> list[Seed]:
     none = np.zeros((0, len(tracker.skeleton), len(frames[0].rig)), dtype=np.intp)
     back = Seed(len(frames) - 1, nobody, none, forwards=False)
     parts = np.array_split(
-        np.arange(len(frames)), max(1, round((times[-1] - times[0]) / (2 * _SEARCH_S)))
+        np.arange(len(frames)), max(1, round((times[-1] - times[0]) / (2 * SEARCH_S)))
     )
     keys = [int(part[len(part) // 2]) for part in parts if len(part) > 0]
     found = [(key, *_newcomers(tracker, nobody, none, frames[key])) for key in keys]
@@ -351,7 +347,7 @@ def _follow(
             }
             rest = np.setdiff1d(np.arange(len(tracks)), gone)
             tracks, candidate = tracks.rows(rest), candidate[rest]
-        if abs(time_s - sought_s) < _SEARCH_S:
+        if abs(time_s - sought_s) < SEARCH_S:
             continue
         sought_s = time_s
         for world in [

@@ -23,7 +23,7 @@ from shapepose_fg.estimation.draft import MODEL_SIGMA_M
 from shapepose_fg.estimation.mirrored_sides import DOUBTED
 from shapepose_fg.proposal.people_2d import group_people
 from shapepose_fg.tracking.motion_filter import LOST_M, JointStates
-from shapepose_fg.tracking.tracker import Tracker, Tracks
+from shapepose_fg.tracking.tracker import SEARCH_S, Tracker, Tracks
 
 _NEAR_M = 0.05
 """Standard deviation of a detection from a perfectly predicted joint, as a length at
@@ -46,8 +46,6 @@ _LOST = 0.001
 _NEVER = 1e-4 * _LOST**2
 """Ratio of probabilities below which a state is impossible in a comparison: one in 10,000, even if
 the other state costs two swaps."""
-_LOOK_S = 0.3
-"""Interval between comparisons of a track with a body, and between searches for people, s."""
 
 
 @dataclass(frozen=True)
@@ -176,7 +174,7 @@ def correct_swaps(tracker: Tracker, frames: Sequence[Input], people: Tracks) -> 
             tracks, candidate = tracker.step(tracks, frame.detections, frame.rig, time_s)
             alive = tracker.alive(tracks)
             tracks, candidate = tracks.rows(alive), candidate[alive]
-        if time_s - sought_s >= _LOOK_S:
+        if time_s - sought_s >= SEARCH_S:
             sought_s = time_s
             places, _ = tracker.newcomers(tracks, candidate, frame.detections, frame.rig)
             if len(places) > 0:
@@ -190,7 +188,7 @@ def correct_swaps(tracker: Tracker, frames: Sequence[Input], people: Tracks) -> 
         compared.append(seen)
         for row, number in enumerate(tracks.ids.tolist()):
             views, before = seen.of_person(number), looks.get(number, [])
-            if not before or time_s - before[-1].time_s >= _LOOK_S:
+            if not before or time_s - before[-1].time_s >= SEARCH_S:
                 looks[number] = [
                     *before,
                     _Look(n, time_s, tracks.joints.rows(np.array([row])), views),

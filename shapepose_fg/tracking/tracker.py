@@ -33,6 +33,11 @@ NoteDropped = Callable[[str, list[int]], None]
 """Records a reason, and the frames in which a person was dropped for it."""
 
 
+SEARCH_S = 0.3
+"""Interval between searches for new people in each world, and between comparisons of a track with a
+body, s; half that between searches among all detections. In a world that lacks a person, the others
+take that person's detections, so every world is searched: in crowds before three cameras this finds
+two to six more people of a hundred."""
 _APART_M = 0.25
 """Minimum mean distance of a new person's joints from any track's, m; nearer is the same person."""
 _MOST_PEOPLE = 64
