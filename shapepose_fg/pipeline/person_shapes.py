@@ -10,7 +10,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from shapepose_fg.body.fitting.energy import SETTLED, BodyEnergy, EnergyTargets, Held, nothing
+from shapepose_fg.body.fitting.energy import (
+    BATCH,
+    SETTLED,
+    BodyEnergy,
+    EnergyTargets,
+    Held,
+    nothing,
+)
 from shapepose_fg.body.fitting.evidence import weigh
 from shapepose_fg.body.fitting.fitter import BodyConfig, JointTargets
 from shapepose_fg.body.fitting.priors import PosePrior
@@ -24,8 +31,6 @@ from shapepose_fg.core.reconstruction import BODY, Reconstruction
 from shapepose_fg.core.rows import Rows
 from shapepose_fg.estimation.floor import LOOK_S, Floor
 
-_BATCH = 64
-"""Rows per batch: their Hessians fit into the cache."""
 _NOT_ROBUST = 1e9
 """Width of the robust kernel, standard deviations, at which it has no effect."""
 _STEPS = 2
@@ -180,8 +185,8 @@ def _batches(rows: WindowBodies, energy: BodyEnergy) -> Iterator[tuple[Index, Wi
     bodies relative to their translations.
     """
     ok = np.flatnonzero(np.isfinite(rows.betas).all(axis=1))
-    for at in range(0, len(ok), _BATCH):
-        mine = rows.rows(some := ok[at : at + _BATCH])
+    for at in range(0, len(ok), BATCH):
+        mine = rows.rows(some := ok[at : at + BATCH])
         yield some, mine, energy.parameters(mine.body, mine.transl)
 
 

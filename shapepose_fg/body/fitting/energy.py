@@ -24,6 +24,8 @@ from shapepose_fg.body.model.rotation import exp_so3, log_so3
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.rows import Rows as FitRows
 
+BATCH = 64
+"""Number of rows whose Hessians fit into the cache, and that are fitted together."""
 SETTLED = 1e6
 """Precision of a beta that is fixed by other rows of the same person."""
 VISIBLE_M_PER_RAD = 1e-3

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from shapepose_fg.body.fitting.energy import BodyEnergy, EnergyTargets, Evaluated
+from shapepose_fg.body.fitting.energy import BATCH, BodyEnergy, EnergyTargets, Evaluated
 from shapepose_fg.body.fitting.evidence import Evidence, weigh
 from shapepose_fg.body.fitting.fitter import (
     BodyConfig,
@@ -22,8 +22,6 @@ from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.rows import Rows
 
-_CHUNK = 64
-"""Number of rows per batch of fits; their Hessians fit into the cache, and memory is bounded."""
 _CONVERGED = 9.0
 """Without a network: maximum decrease of the energy that a Newton step predicts for a converged row
 (3 sigma of the posterior). With a network, `BodyConfig.unfinished` is used after the plain
@@ -147,7 +145,7 @@ class SmplFitter(BodyFitter):
             free, held = self.optimiser.arrive(
                 targets, variance, None if start is None else start[some]
             )
-            for near in _parts(len(free), _CHUNK):
+            for near in _parts(len(free), BATCH):
                 given = targets.rows(near)
                 part = JointPosterior.of(
                     self.optimiser.evaluated(free[near], given, held.rows(near))
