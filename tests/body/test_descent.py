@@ -20,9 +20,9 @@ from shapepose_fg.body.fitting.network import (
 from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel
-from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model.rotation import exp_so3
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, TARGET_SKELETONS, slots
+from tests.body.mirrored_offsets import symmetric
 
 ALL = tuple(range(len(BODY_POINTS)))
 ROWS = 6
@@ -182,7 +182,7 @@ def test_what_the_network_sees(any_body, name):
     """Against dense inverses and the points' Jacobian; the detector's joints lie elsewhere than the
     body's.
     """
-    offsets = KeypointOffsets.symmetric({"LHip": (0.05, 0.06, 0.0), "LWrist": (0.0, 0.0, -0.05)})
+    offsets = symmetric({"LHip": (0.05, 0.06, 0.0), "LWrist": (0.0, 0.0, -0.05)})
     model, places = any_body.with_keypoints(TARGET_SKELETONS[name]), slots(TARGET_SKELETONS[name])
     model = model.with_keypoint_offsets(offsets)
     rest, state = [place for place in ALL if place not in places], states()

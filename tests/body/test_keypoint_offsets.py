@@ -86,21 +86,6 @@ def test_mirrored_joints_ride_on_mirrored_bones():
         assert other == swapped
 
 
-def test_symmetric_offsets_are_mirrored():
-    offsets = KeypointOffsets.symmetric({"LHip": (0.035, 0.02, 0.01), "Neck": (0.0, -0.03, 0.0)})
-    xyz = dict(zip(BODY_25.joints, offsets.xyz_m.tolist(), strict=True))
-    assert xyz["LHip"] == [0.035, 0.02, 0.01]
-    assert xyz["RHip"] == [-0.035, 0.02, 0.01]
-    assert xyz["Neck"] == [0.0, -0.03, 0.0]
-    assert xyz["LKnee"] == [0.0, 0.0, 0.0]
-    with pytest.raises(ValueError, match="give LHip or RHip, not both"):
-        KeypointOffsets.symmetric({"LHip": (0.0, 0.0, 0.0), "RHip": (0.0, 0.0, 0.0)})
-    with pytest.raises(ValueError, match="Neck is on the plane of symmetry"):
-        KeypointOffsets.symmetric({"Neck": (0.01, 0.0, 0.0)})
-    with pytest.raises(ValueError, match="no joint 'Hip'"):
-        KeypointOffsets.symmetric({"Hip": (0.0, 0.0, 0.0)})
-
-
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [

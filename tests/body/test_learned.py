@@ -14,9 +14,9 @@ from shapepose_fg.body.fitting.fitter import BodyConfig, BodyFit, FitStatus, Joi
 from shapepose_fg.body.fitting.fitters import SmplFitter
 from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
-from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS, TARGET_SKELETONS
 from shapepose_fg.core.skeleton import BODY_25
+from tests.body.mirrored_offsets import symmetric
 
 COUNT = 32
 WRIST, ELBOW = BODY_25.index("RWrist"), BODY_25.index("RElbow")
@@ -210,7 +210,7 @@ def test_no_rows_give_no_bodies(fitter):
 
 
 def test_a_detector_that_puts_joints_elsewhere_is_followed(fitter, shipped_weights, joints):
-    offsets = KeypointOffsets.symmetric({"LHip": (0.05, 0.06, 0.0), "LAnkle": (0.0, 0.0, -0.05)})
+    offsets = symmetric({"LHip": (0.05, 0.06, 0.0), "LAnkle": (0.0, 0.0, -0.05)})
     elsewhere = fitter.with_keypoint_offsets(offsets)
     truth = elsewhere.model.keypoints(draw_bodies(COUNT))
     hip = BODY_25.index("LHip")
@@ -235,7 +235,7 @@ def test_offsets_of_joints_that_a_skeleton_lacks_change_nothing(shipped_weights)
     model = BodyModel.default().with_keypoints(TARGET_SKELETONS["COCO_17"])
     plain = SmplFitter(model, weights=shipped_weights)
     targets = known_to(model.keypoints(draw_bodies(4)), 0.01)
-    offsets = KeypointOffsets.symmetric({"Neck": (0.0, 0.15, 0.0), "LBigToe": (0.1, 0.0, 0.1)})
+    offsets = symmetric({"Neck": (0.0, 0.15, 0.0), "LBigToe": (0.1, 0.0, 0.1)})
     moved = plain.with_keypoint_offsets(offsets).fit(targets)
     np.testing.assert_array_equal(moved.joints, plain.fit(targets).joints)
 

@@ -22,8 +22,9 @@ from shapepose_fg.pipeline.pipeline import PipelineConfig, estimate_offsets, rec
 from shapepose_fg.proposal.thinning import ThinnedFrames
 from shapepose_fg.simulation import DetectorConfig, built_in_scene, simulate
 from shapepose_fg.simulation.scene import Scene
+from tests.body.mirrored_offsets import symmetric
 
-ODD = KeypointOffsets.symmetric(
+ODD = symmetric(
     {
         "LHip": (0.035, 0.03, 0.0),
         "LShoulder": (0.01, -0.02, -0.01),

@@ -6,7 +6,7 @@ in the frame of the bone that the joint moves with, so it is one vector per join
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -89,31 +89,6 @@ class KeypointOffsets:
     def identity(cls) -> "KeypointOffsets":
         """Zero offsets."""
         return cls(np.zeros((25, 3)), np.zeros(25), np.zeros(25, dtype=np.intp), RIDES_ON)
-
-    @classmethod
-    def symmetric(cls, metres: Mapping[str, Sequence[float]]) -> "KeypointOffsets":
-        """Offsets by joint name, (x, y, z) metres; the mirror joint gets the mirrored offset.
-
-        `symmetric({"LHip": (0.035, 0.02, 0.0)})` moves both hips outwards and up. Raises ValueError
-        for an unknown joint, if both sides of a pair are given, and for a central joint with an
-        offset to one side.
-        """
-        xyz = np.zeros((25, 3))
-        given = [BODY_25.index(name) for name in metres]
-        for joint, offset in zip(given, metres.values(), strict=True):
-            mirror = BODY_25.mirror[joint]
-            if mirror != joint and mirror in given:
-                raise ValueError(
-                    f"give {BODY_25.joints[joint]} or {BODY_25.joints[mirror]}, not both"
-                )
-            if mirror == joint and offset[0] != 0:
-                raise ValueError(
-                    f"{BODY_25.joints[joint]} is on the plane of symmetry: its x must be 0, got "
-                    f"{offset[0]}"
-                )
-            xyz[mirror] = np.array(offset) * (-1.0, 1.0, 1.0)
-            xyz[joint] = offset
-        return cls(xyz, np.zeros(25), np.zeros(25, dtype=np.intp), RIDES_ON)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values for run.json and `save`: an entry per joint, millimetres with 3 digits."""
