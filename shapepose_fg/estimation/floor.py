@@ -51,10 +51,6 @@ class Floor:
     share: float
     """Share of the measurements of standing feet that agree with the floor."""
 
-    def above(self, points: Array) -> Array:
-        """(...,) height of points (..., 3) above the floor, metres."""
-        return np.asarray(points @ self.normal - self.height_m)
-
     def as_dict(self) -> dict[str, Any]:
         """Plain values for run.json; `from_dict` reads them back."""
         return {"found": True, "normal": self.normal.tolist(), "height_m": self.height_m} | {
