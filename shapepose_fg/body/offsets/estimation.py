@@ -62,7 +62,6 @@ class OffsetPrior(Settings):
 def learn_offsets(
     targets: JointTargets,
     model: BodyModel,
-    pose_prior: PosePrior | None = None,
     config: BodyConfig | None = None,
     prior: OffsetPrior | None = None,
 ) -> KeypointOffsets:
@@ -73,9 +72,8 @@ def learn_offsets(
     `model` are replaced, not added to. If no row can be fitted, the offsets are zero with the
     prior's sigma.
     """
-    pose_prior = PosePrior.default() if pose_prior is None else pose_prior
     prior = OffsetPrior() if prior is None else prior
-    wide = pose_prior.widened(_POSE_WIDENING)
+    wide = PosePrior.default().widened(_POSE_WIDENING)
     config = BodyConfig() if config is None else config
     precision = np.linalg.inv(_prior_covariance(prior))
     model, fit = model.with_keypoint_offsets(_made(np.zeros(75), precision, np.zeros(25))), None
