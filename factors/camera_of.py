@@ -42,7 +42,8 @@ def camera_of(pixel: Callable[[Array], Array | None], near: Array) -> Camera | N
         off = _seen(camera, X) - uv
         if not np.isfinite(off).all():
             return None
-        steps = np.eye(11) * 1e-6 * _scales(camera)
+        # Typical changes of the entries of K, px, of the rotation, rad, and of the position, m.
+        steps = np.eye(11) * 1e-6 * np.array([camera.calibration().fx()] * 5 + [1.0] * 6)
         slopes = [
             (_seen(_moved(camera, d), X) - _seen(_moved(camera, -d), X)).ravel() / 2 for d in steps
         ]
@@ -78,13 +79,6 @@ def _of_matrix(P: Array) -> Camera:
     K, R = (L.T * signs)[::-1, ::-1], (Q * signs).T[::-1]
     pose = gtsam.Pose3(gtsam.Rot3(R.T), -np.linalg.solve(P[:, :3], P[:, 3]))
     return Camera(pose, make_calibration(K / K[2, 2]))
-
-
-def _scales(camera: Camera) -> Array:
-    """(11,) typical magnitude of a change of the five entries of K (px), the rotation (rad) and the
-    position (m).
-    """
-    return np.array([camera.calibration().fx()] * 5 + [1.0] * 6)
 
 
 def _moved(camera: Camera, change: Array) -> Camera:

@@ -170,8 +170,9 @@ class BodyGraph(PersonWindow):
         state, before = BodyState(betas, root, others, zero), self.window.joints(self.state)
         of_body = self.window.joints(state) - self.window.origin
         joints = of_body + self.window.deviation(of_body) + self.window.origin
-        for joint in self._variables(values):
-            joints[:, joint] = [values.atPoint3(key) for key in self.keys[:, joint].tolist()]
+        for joint, keys in enumerate(self.keys.T.tolist()):
+            if values.exists(keys[0]):
+                joints[:, joint] = [values.atPoint3(key) for key in keys]
         self.state = replace(state, deviation=joints - of_body - self.window.origin)
         self.window.last = self.window.around(self.state, of_body)
         return float(np.linalg.norm(joints - before, axis=-1).mean())
@@ -192,10 +193,6 @@ class BodyGraph(PersonWindow):
             part[..., :3] = part[..., :3] @ turns.mT
         shape = every[self.shape_key, self.shape_key] / self.widen
         return Marginals(self.window, self.state, poses, steps, shape, across)
-
-    def _variables(self, values: gtsam.Values) -> list[int]:
-        """The joints among `values`."""
-        return [n for n, key in enumerate(self.keys[0].tolist()) if values.exists(key)]
 
     def _bodies(self) -> Array:
         """(T, N) values of the bodies."""
