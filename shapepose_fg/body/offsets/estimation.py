@@ -30,7 +30,7 @@ from shapepose_fg.body.kernels.solving import reduce_systems
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.keypoint_offsets import LARGEST_M, RIDES_ON, KeypointOffsets
 from shapepose_fg.core.arrays import Array, Real
-from shapepose_fg.core.bounds import Metres, Repeats, Settings
+from shapepose_fg.core.bounds import Metres, Settings
 from shapepose_fg.core.skeleton import BODY_25
 
 _CHUNK = 128
@@ -54,9 +54,6 @@ class OffsetPrior(Settings):
     """Prior standard deviation of the offsets, metres per axis; they are shrunk towards zero."""
     asymmetry_sigma_m: Metres = 0.003
     """Prior standard deviation of the asymmetry between left and right, metres per axis."""
-    rounds: Repeats = 1
-    """Number of alternations between fits and offsets. Because bodies are eliminated, not fixed,
-    the first solution is nearly the last: more rounds change the body's predictions by 0.2 mm."""
 
 
 def learn_offsets(
@@ -76,23 +73,19 @@ def learn_offsets(
     wide = PosePrior.default().widened(_POSE_WIDENING)
     config = BodyConfig() if config is None else config
     precision = np.linalg.inv(_prior_covariance(prior))
-    model, fit = model.with_keypoint_offsets(_made(np.zeros(75), precision, np.zeros(25))), None
-    for _ in range(prior.rounds):
-        fitter = SmplFitter(model, wide, config)
-        fit = fitter.fit(targets, fit)
-        sizes = Sizes.of(model)
-        far = sizes.far(fit.betas)
-        if np.count_nonzero(far) > _MANY * len(far):
-            targets = targets.larger(np.where(far, 1 / sizes.ratio(fit.betas), 1.0))
-            fit = fitter.fit(targets)
-        if not fit.ok.any():
-            break
-        energy = BodyEnergy(model, wide)
-        evidence = weigh(targets, config.model_sigma_m)
-        model = model.with_keypoint_offsets(
-            _solved(energy, fit, evidence, config.kernel_scale, precision)
-        )
-    return model.keypoint_offsets
+    model = model.with_keypoint_offsets(_made(np.zeros(75), precision, np.zeros(25)))
+    fitter, sizes = SmplFitter(model, wide, config), Sizes.of(model)
+    fit = fitter.fit(targets)
+    far = sizes.far(fit.betas)
+    if np.count_nonzero(far) > _MANY * len(far):
+        targets = targets.larger(np.where(far, 1 / sizes.ratio(fit.betas), 1.0))
+        fit = fitter.fit(targets)
+    if not fit.ok.any():
+        return model.keypoint_offsets
+    # Because bodies are eliminated, not fixed, the first solution is nearly the last: further
+    # rounds change the body's predictions by 0.2 mm.
+    energy, evidence = BodyEnergy(model, wide), weigh(targets, config.model_sigma_m)
+    return _solved(energy, fit, evidence, config.kernel_scale, precision)
 
 
 def _solved(
