@@ -145,7 +145,7 @@ def _fetched(file: str, progress: Callable[[int, int], object]) -> bytes:
             problems.append(f"{base}/{file} ({told})")
     raise InputError(
         f"the network cannot be downloaded from {' or '.join(problems)}; download it by hand and "
-        f"give the path of the {_INSIDE} in it"
+        f"give --network the path of the {_INSIDE} in it"
     )
 
 
