@@ -60,8 +60,8 @@ class Known(IntEnum):
     """The joint has no position (NaN), or the file is older than this column."""
     SEEN = 1
     """In this frame, detections of at least two views were used that very probably belong to the
-    person (`estimation.window_solution.strong_detections`); in files older than `WEAK`, of at least one
-    view."""
+    person (`estimation.window_solution.strong_detections`); in files older than `WEAK`, of at
+    least one view."""
     BODY = 2
     """Without a detection in this frame: inferred from the body, which other joints determine."""
     MOTION = 3
