@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import get_lapack_funcs
 
 from factors import DEFAULT_WIDTH_SIGMA, Motion
 from shapepose_fg.body.fitting.chains import Links, linked
@@ -434,9 +435,10 @@ class BodyWindow:
         )
         poses, arrow, steps = np.empty((T, N, N)), np.empty((T, N, 10)), np.zeros((T, N, N))
         after, arrows = np.zeros((n * N, n * N)), np.zeros((n * N, 10))
+        (invert,) = get_lapack_funcs(("trtri",))  # of triangles, three times as fast as inv
         for t in range(T - 1, -1, -1):
             L, ahead = kept[t, :N, :N], kept[t, N : N + n * N, :N]
-            inverse = np.linalg.inv(np.tril(L))
+            inverse = np.tril(invert(L, lower=1)[0])
             W = ahead @ inverse
             across = -after @ W  # of those after it with this one
             own = inverse.T @ inverse - W.T @ across

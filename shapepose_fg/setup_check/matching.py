@@ -224,8 +224,8 @@ class Pairs:
 def rays_of(sightings: Sightings, views: Views) -> Array:
     """(S, J, 3) unit directions in the world from the camera to each joint; NaN where not seen."""
     inverse = np.linalg.inv(views.K)[sightings.view]
-    camera = np.einsum("sij,skj->ski", inverse[:, :, :2], sightings.xy) + inverse[:, None, :, 2]
-    world = np.einsum("sji,skj->ski", views.cTw[sightings.view, :, :3], camera)
+    camera = sightings.xy @ inverse[:, :, :2].mT + inverse[:, None, :, 2]
+    world = camera @ views.cTw[sightings.view, :, :3]
     return np.asarray(world / np.linalg.norm(world, axis=-1, keepdims=True))
 
 

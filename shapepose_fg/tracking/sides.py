@@ -43,6 +43,9 @@ _AGREES = 0.99
 swap."""
 _LOST = 0.001
 """Probability that a track's sides, or a part's, swap from one comparison to the next."""
+_NEVER = 1e-4 * _LOST**2
+"""Ratio of probabilities below which a state is impossible in a comparison: one in 10,000, even if
+the other state costs two swaps."""
 _LOOK_S = 0.3
 """Interval between comparisons of a track with a body, and between searches for people, s."""
 
@@ -242,11 +245,18 @@ def _own_sides(tracker: Tracker, looks: Sequence[_Look], *, followed: bool) -> t
     states = exchanges(tracker.skeleton)
     order = np.array([_order(state, tracker.skeleton) for state in states])  # (S, J)
     joints = JointStates.concatenate([look.joints for look in looks])
-    weight = _likeness(joints.position[:, order], joints.sigma_m[:, order], tracker.fitter)
     number = np.arange(len(states))
     prior = _prior(len(states))[number ^ number[:, None]]  # view's swaps given person's
-    for look, row in zip(looks, weight, strict=True):
-        row += np.logaddexp.reduce(look.views[:, None] + prior, axis=2).sum(axis=0)
+    weight = np.array(
+        [np.logaddexp.reduce(look.views[:, None] + prior, axis=2).sum(axis=0) for look in looks]
+    )
+    # A body can only lower a weight: none is fitted in states that are impossible anyway.
+    first = number == weight.argmax(axis=1)[:, None]
+    for asked in (first, ~first):
+        weight[weight < weight[first][:, None] + np.log(_NEVER)] = -np.inf
+        n, s = np.nonzero(asked & np.isfinite(weight))
+        at, sigma_m = joints.position[n[:, None], order[s]], joints.sigma_m[n[:, None], order[s]]
+        weight[n, s] += _likeness(at, sigma_m, tracker.fitter)
     change = np.log(np.where(np.eye(len(states), dtype=bool), 1 - _LOST, _LOST))
     ahead, back = np.zeros_like(weight), np.zeros_like(weight)
     ahead[0] = change[0] if followed else 0.0
@@ -260,16 +270,14 @@ def _own_sides(tracker: Tracker, looks: Sequence[_Look], *, followed: bool) -> t
 
 
 def _likeness(places: Array, sigma_m: Array, fitter: BodyFitter | None) -> Array:
-    """(N, S) log-likelihood of joints at `places` (N, S, J, 3), metres, with sigma `sigma_m` (N, S,
-    J), by their distance from a fitted body; 0 without a `fitter`.
+    """(N,) log-likelihood of joints at `places` (N, J, 3), metres, with sigma `sigma_m` (N, J), by
+    their distance from a fitted body; 0 without a `fitter`.
     """
-    N, S, J, _ = places.shape
     if fitter is None:
-        return np.zeros((N, S))
+        return np.zeros(len(places))
     known = sigma_m < LOST_M
     information = (known / np.square(sigma_m))[..., None, None] * np.eye(3)
-    fit = fitter.fit(JointTargets(places.reshape(-1, J, 3), information.reshape(-1, J, 3, 3)))
-    squared = np.square(fit.joints.reshape(places.shape) - places).sum(axis=-1)
+    squared = np.square(fitter.fit(JointTargets(places, information)).joints - places).sum(axis=-1)
     squared = np.nan_to_num(squared / (np.square(sigma_m) + MODEL_SIGMA_M**2), nan=_FARTHEST)
     return -np.where(known, np.minimum(squared, _FARTHEST), 0.0).sum(axis=-1) / 2
 

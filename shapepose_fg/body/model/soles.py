@@ -17,6 +17,8 @@ _ANKLES, _KNEES = (
 )
 SINK_M = 0.01
 """Depth below the floor that is tolerated, m: flesh and soles are soft."""
+_SKIN_M = 0.3
+"""Distance from the skin of hands, head and trunk to their joints, at most, m."""
 _ROWS = 8
 """Number of bodies per batch of vertices."""
 
@@ -52,23 +54,29 @@ def above_floor(model: BodyModel, bodies: Bodies, normal: Array, height_m: float
     and smaller if the detector sees no feet (38.3 before, 37.1 after).
     """
     betas, orient, pose, transl = bodies
-    turned = exp_so3(_bends(model, bodies, normal, height_m))
+    low = lowest_of_feet(model, bodies, normal)
+    bends = _bends(model, bodies, low, normal, height_m)
     pose, ankles = pose.copy(), np.array(_ANKLES) - 1
-    pose[:, ankles] = log_so3(turned @ exp_so3(pose[:, ankles]))
-    sunk = np.maximum(
-        height_m - SINK_M - _lowest(model, (betas, orient, pose, transl), normal), 0.0
+    pose[:, ankles] = log_so3(exp_so3(bends) @ exp_so3(pose[:, ankles]))
+    # Bodies that stand upright and are not bent are lowest at the feet that were found.
+    height = model.joints(BodyParameters(*bodies)) @ normal - height_m
+    height[:, np.concatenate(_BONES)] = np.inf
+    asked = bends.any(axis=(1, 2)) | (height < _SKIN_M).any(axis=1)
+    lowest = (low @ normal).min(axis=1)
+    lowest[asked] = _lowest(
+        model, (betas[asked], orient[asked], pose[asked], transl[asked]), normal
     )
+    sunk = np.maximum(height_m - SINK_M - lowest, 0.0)
     return betas, orient, pose, transl + sunk[:, None] * normal
 
 
-def _bends(model: BodyModel, bodies: Bodies, normal: Array, height_m: float) -> Array:
-    """(B, 2, 3) rotations of the ankles that lift the lowest points of the feet, as rotation
-    vectors in the frame of the shank, rad.
+def _bends(model: BodyModel, bodies: Bodies, low: Array, normal: Array, height_m: float) -> Array:
+    """(B, 2, 3) rotations of the ankles that lift the lowest points `low` (B, 2, 3) of the feet, as
+    rotation vectors in the frame of the shank, rad.
     """
     parameters = BodyParameters(*bodies)
     ankles = model.joints(parameters)[:, _ANKLES]
     shanks = model.bone_rotations(parameters)[:, _KNEES]
-    low = lowest_of_feet(model, bodies, normal)
     sunk = np.maximum(height_m - SINK_M - low @ normal, 0.0)
     arm = low - ankles
     flat = arm - (arm @ normal)[..., None] * normal
