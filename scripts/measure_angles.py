@@ -40,7 +40,7 @@ ROWS = (
 
 def scenes(mocap: Mocap) -> Iterator[tuple[str, Scene]]:
     """The recordings by name."""
-    yield "demo, 6 cameras", built_in_scene(frames=int(FPS * SECONDS), fps=FPS)
+    yield "demo, 6", built_in_scene(frames=int(FPS * SECONDS), fps=FPS)
     for name, counts in RECORDINGS.items():
         for cameras in counts:
             frames = int(FPS * SECONDS)
