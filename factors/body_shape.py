@@ -1,7 +1,8 @@
-"""Joints hang on a body whose pose and shape are variables: E_shape of Eq. 3, linear in the body.
+"""Connects joints to a body whose pose and shape are variables (E_shape of Eq. 3), linearly.
 
-A pose is a vector, and so is the shape. Derivatives are those around one pose and shape; `joints`
-are the body's where both vectors are zero, by the linear model.
+Residual, metres: r = x - joints - by_pose theta - by_shape beta. Pose theta and shape beta are
+vectors. The body is linearised around one pose and shape; `joints` are the linear model's joints
+where both vectors are zero.
 """
 
 from itertools import repeat
@@ -23,8 +24,8 @@ def shape_factors(
     by_shape: ArrayLike,
     sigma_m: ArrayLike,
 ) -> list[gtsam.NonlinearFactor]:
-    """For each of D joints, metres: r = x - joints - by_pose theta - by_shape beta ~ N(0, sigma_m²
-    I), with one standard deviation for all, or (D,).
+    """Make the factors of D joints, metres: r = x - joints - by_pose theta - by_shape beta ~ N(0,
+    sigma_m² I), with one standard deviation for all, or (D,).
 
     `keys` (D,) of the positions, `body_keys` (D,) of their poses, `joints` (D, 3) of the body
     where theta and beta are zero, `by_pose` (D, 3, N) and `by_shape` (D, 3, 10) its derivatives.
@@ -64,7 +65,7 @@ def pose_factors(
     right: NDArray[np.float64],
     count: int,
 ) -> list[gtsam.NonlinearFactor]:
-    """Linear knowledge about poses that follow each other: r = sum_k A_k theta_(t+k) - b ~ N(0, I).
+    """Make linear factors on K successive poses: r = sum_k A_k theta_(t+k) - b ~ N(0, I).
 
     `matrices` are the K matrices A_k, (S, M, N) each, `right` (S, M), of factors that begin at the
     poses `body_keys` (S + K - 1,); `count` is N.

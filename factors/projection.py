@@ -47,8 +47,9 @@ def projection_factor(
     key: int,
     kernel: Kernel | None = None,
 ) -> gtsam.NoiseModelFactor:
-    """Detection of the joint `key` at `uv` (2,) by a camera with a fixed pose: one variable, a
-    `Point3`.
+    """Make the factor of a detection at `uv` (2,) by a camera with a fixed pose.
+
+    Its variable is the joint `key`, a `Point3`; `sigma_px` is the standard deviation per axis.
     """
     return gtsam.TriangulationFactorCal3_S2(camera, _pixel(uv), isotropic(2, sigma_px, kernel), key)
 
@@ -98,12 +99,12 @@ def posed_projection_factor(
     kernel: Kernel | None = None,
     body_T_sensor: gtsam.Pose3 | None = None,
 ) -> gtsam.NoiseModelFactor:
-    """Detection of the joint `key` at `uv` (2,) by a camera with an unknown or moving pose: two
-    variables.
+    """Make the factor of a detection at `uv` (2,) by a camera with an unknown or moving pose.
 
-    `pose_key` is a `Pose3`, world from camera; or, with `body_T_sensor` (robot from camera), world
-    from the robot that carries the camera. The world frame as a whole is not determined: fix a pose
-    with a prior.
+    Its variables are the joint `key`, a `Point3`, and `pose_key`, a `Pose3`: world from camera, or,
+    with `body_T_sensor` (robot from camera), world from the robot that carries the camera.
+    `sigma_px` is the standard deviation per axis. The world frame as a whole is not determined:
+    fix a pose with a prior.
     """
     model: noiseModel.Base = isotropic(2, sigma_px, kernel)
     if body_T_sensor is None:

@@ -6,8 +6,9 @@
 The rooms are those of tests/calibration/filmed_by_phones.py; people walk as in the recorded motions
 of `--data FOLDER` (or SHAPEPOSE_DATA). The command is told 65 degrees, --focal and one distance, or
 with `--logs` the lenses that the phones have logged. It prints the rows of the table in
-docs/evaluation/cameras.md: errors, and in brackets two standard deviations, for the carried phone
-the bound of its error (95 %). Run it from a clone. About three minutes per room on one core.
+docs/evaluation/cameras.md: errors, and in brackets two standard deviations, with the number of
+fixed phones whose rotation is within its own; for the carried phone the bound of its error (95 %).
+Run it from a clone. About three minutes per room on one core.
 """
 
 import argparse
@@ -89,10 +90,10 @@ def measure(room: int, mocap: Mocap, folder: Path, logs: bool) -> str:
     degrees, mm = (float((each**2).mean() ** 0.5) for each in errors(poses, phones[-1].wTc, by))
     carried = told["moving"][names[-1]]
     return (
-        f"{row} {turn.max():.2f}° ({sure[:, 0].max():.2f}) | {move.max():.0f} mm "
-        f"({sure[:, 1].max():.0f}) | {100 * by[2] - 100:+.1f} % "
-        f"({200 * told['sigma_scale']:.1f}) | {degrees:.2f}° ({carried['within_deg']:.2f}), "
-        f"{mm:.0f} mm ({carried['within_mm']:.0f}) |"
+        f"{row} {turn.max():.2f}° ({sure[:, 0].max():.2f}; {(turn < sure[:, 0]).sum()} of "
+        f"{len(turn)} inside) | {move.max():.0f} mm ({sure[:, 1].max():.0f}) | "
+        f"{100 * by[2] - 100:+.1f} % ({200 * told['sigma_scale']:.1f}) | "
+        f"{degrees:.2f}° ({carried['within_deg']:.2f}), {mm:.0f} mm ({carried['within_mm']:.0f}) |"
     )
 
 

@@ -43,8 +43,8 @@ _BURST_S, _BURSTS = 10.0, 6
 """Duration of the intervals in which people are tracked, s, and their number, spread over the
 recording."""
 _FEW, _ROUGH, _ROUNDS, _HALF_ROUNDS = 30, 6, 6, 2
-"""Number of frames in the first rounds, number of these rounds, of rounds with all frames, and of
-rounds with each half of them."""
+"""Number of frames in the first rounds of association and adjustment, number of these rounds,
+number of rounds with all frames, and number of rounds with each half of the frames."""
 _LEAST_SCORE, _LEAST_S = 0.15, 3.0
 """Minimum score of a pair of cameras, and minimum common person-seconds."""
 _MOST_SIGMA_DEG, _MOST_APART_DEG = 1.0, 2.0
@@ -137,11 +137,11 @@ def calibrate(
     """Estimate the poses of the cameras of `rig`, ignoring its own poses, from the people in
     `detections`.
 
-    `lens` has the prior standard deviations of the lenses, of all or of each; that of the poses is
-    ignored. The scale
-    comes from `measured` distances, or from the stature of adults. `start` are approximate cameras,
-    which replace the search. Raises Undetermined if cameras share too few people, or motion does
-    not determine them; InputError if measured distances contradict each other.
+    `lens` has the prior standard deviations of the lens parameters, for all cameras or for each;
+    those of the poses are ignored. The scale comes from `measured` distances, or from the stature
+    of adults. `start` are approximate cameras, which replace the search. Raises Undetermined if
+    cameras share too few people, or motion does not determine them; InputError if measured
+    distances contradict each other.
     """
     measured = measured or Measured()
     views = len(rig)

@@ -52,14 +52,15 @@ def calibrate_unsynchronised(
     V = len(rig)
     frames = frames[: round(WHOLE_S * fps)]
     sightings = at_regular_times(Sightings.of(detections, frames), time_s, fps)
-    total = V - 1 + 100 * _ROUNDS
+    total = 100 * (1 + _ROUNDS)
     tracks = own_tracks(sightings, rig, fps)
-    shift = offsets_without_poses(tracks, fps, most_s, Steps(progress, total))
+    paired = Steps(lambda done, pairs: progress(100 * done // pairs, total), V - 1)
+    shift = offsets_without_poses(tracks, fps, most_s, paired)
     following, found, problems = next_of(sightings), None, tuple[str, ...]()
     for turn in range(_ROUNDS):
         seen = on_one_clock(sightings, following, shift, detections.skeleton)
         times = FrameTimes.from_fps(fps, seen.frames.stop)
-        begin = V - 1 + 100 * turn
+        begin = 100 * (1 + turn)
         start = None if found is None else found.rig
 
         def part(step: int, steps: int, begin: int = begin) -> None:

@@ -254,7 +254,7 @@ def calibrate(
         show_json(told)
     else:
         show(table(("camera", *heads), [(name, *each) for name, each in rows], caption=_CAPTION))
-        print("\n".join(lines[1:]))
+        show("\n".join(lines[1:]))
         given = rate.given()
         if times is not None and clocks is not None:
             show_clocks(clocks, rig)
@@ -351,9 +351,7 @@ def _world(found: "Calibrated", stature: float | None, distances: list[str]) -> 
 
     world = found.world
     if distances:
-        whose = (
-            f"{' '.join(distances)}; the median stature of the people is {world.stature_m:.2f} m"
-        )
+        whose = f"{' '.join(distances)}, which makes people {world.stature_m:.2f} m tall (median)"
     else:
         whose = (
             f"median stature {stature:g} m"
@@ -374,7 +372,7 @@ def _world(found: "Calibrated", stature: float | None, distances: list[str]) -> 
     )
     better = "; a distance measured between two cameras, --distance, gives lengths to about 1 %"
     return [
-        f"scale: {whose}: ± {100 * world.sigma_scale:.1f} %, one sigma",
+        f"scale: {whose}; one sigma is {100 * world.sigma_scale:.1f} %",
         f"up: z, {level}; the floor is at 0",
         (
             "error of a joint against the other cameras, on frames that were not used: "

@@ -91,7 +91,7 @@ def show(content: "RenderableType") -> None:
     """Print on stdout; colours only on a terminal. Text is not parsed as markup, because it
     contains names and paths.
     """
-    console().print(content, crop=False)
+    console().print(content, crop=False, highlight=False)
 
 
 def show_json(value: Any) -> None:

@@ -60,15 +60,17 @@ class Known(IntEnum):
     """The joint has no position (NaN), or the file is older than this column."""
     SEEN = 1
     """In this frame, detections of at least two views were used that very probably belong to the
-    person (`estimation.outcome.how_known`); in files older than `WEAK`, of at least one view."""
+    person (`estimation.window_solution.strong_detections`); in files older than `WEAK`, of at
+    least one view."""
     BODY = 2
     """Without a detection in this frame: inferred from the body, which other joints determine."""
     MOTION = 3
     """Without a detection and without a body: interpolated by the motion model from other
     frames."""
     WEAK = 4
-    """Fewer than two such views: a joint that only one view detected, or detections with a low
-    probability. Body and motion model contribute considerably to its position."""
+    """Detections were used, but not of two views that very probably belong to the person: only one
+    view detected the joint, or scores or probabilities are low. Body and motion model contribute
+    considerably to its position."""
 
     @classmethod
     def observed(cls, known: Whole) -> Mask:
@@ -407,7 +409,7 @@ def _read_run(file: Path, people_id: object) -> dict[str, Any]:
 
 
 def with_body(*columns: Array) -> Mask:
-    """(N,) which rows have a body: all values of the `BODY` columns, each (N, ...), are known."""
+    """(N,) mask of the rows with a body: all values of the `BODY` columns, (N, ...), are finite."""
     return np.logical_and.reduce(
         [np.isfinite(each).all(axis=tuple(range(1, each.ndim))) for each in columns]
     )

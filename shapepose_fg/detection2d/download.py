@@ -40,7 +40,8 @@ class NamedNetwork:
     size: tuple[int, int]
     """Width and height of the network's input, pixels."""
     boxes: str | None = None
-    """Name of the YOLOX network that detects people for it; None if this is such a network."""
+    """Name of the YOLOX network that detects people for it; None if this network itself
+    detects people."""
 
 
 @lru_cache(maxsize=1)
@@ -145,7 +146,7 @@ def _fetched(file: str, progress: Callable[[int, int], object]) -> bytes:
             problems.append(f"{base}/{file} ({told})")
     raise InputError(
         f"the network cannot be downloaded from {' or '.join(problems)}; download it by hand and "
-        f"give the path of the {_INSIDE} in it"
+        f"give --network the path of the {_INSIDE} in it"
     )
 
 

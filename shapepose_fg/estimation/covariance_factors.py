@@ -18,8 +18,8 @@ USUAL_M = 0.01
 REJECTED = 0.1
 """Share of rejected evidence that means as much as a doubled variance."""
 _LASTS_S, _LASTS, _PRIOR_COUNT = 1.0, 0.4, 20.0
-"""Time apart, s, at which residuals are compared for lasting errors; the usual share of these, and
-its weight as a number of squared standard deviations."""
+"""Time lag, s, at which residuals are compared for correlated errors; the prior share of correlated
+errors, and the prior's weight, as a number of squared standard deviations."""
 _LOOKS = 8
 """Number of frames, evenly over the window, from which it is taken how much it averages."""
 _ANYWHERE = 1e-3
@@ -104,10 +104,10 @@ def signs_of_doubt(marginals: Marginals) -> tuple[Array, Array, Array]:
 
 
 def signs_of_lasting(marginals: Marginals) -> tuple[float, float]:
-    """The share of a window's errors that last, and how many times larger than those of the window
-    the variances are that the same views leave in a frame by itself.
+    """The share of correlated errors in a window, and the ratio of the variances that the same
+    views give in a single frame to those of the window.
 
-    Errors that are new in every frame are averaged over time, those that last are not.
+    Errors that are new in every frame are averaged over time, correlated ones are not.
     """
     window, last = marginals.window, marginals.window.last
     some = slice(None, None, max(len(window) // _LOOKS, 1))
@@ -130,8 +130,8 @@ def signs_of_lasting(marginals: Marginals) -> tuple[float, float]:
 
 
 def _share_lasting(marginals: Marginals) -> float:
-    """Share of the detections' variance that lasts: the correlation of residuals that are
-    `_LASTS_S` apart.
+    """Share of correlated errors in the variance of detections: the correlation of residuals that
+    are `_LASTS_S` apart.
     """
     window, evidence = marginals.window, marginals.window.last.evidence
     sigma = np.where(evidence.inlier, window.sigmas_px, np.inf)[..., None]

@@ -27,7 +27,7 @@ def ready(values: Array) -> Array:
 @kernel("f4 f2 f4 f3 f0 f0 f0 f3")
 def complete(cameras, focal, xy, confidence, scale_m, reach_m, least_depth, points):
     """Fill in `points` (N, J, 3) that are NaN if at least two views see and agree on them
-    (`linearisation.triangulate`).
+    (`gated_views.triangulate`).
     """
     weight, x = np.empty(xy.shape[2]), np.empty(3)
     for n in range(len(points)):
@@ -87,7 +87,7 @@ def look(
     points, cameras, focal, xy, sigmas, fixed_depth, least_depth, reach, by_reach, robust, width,
     inlier, residual, information, gradient,
 ):  # fmt: skip
-    """Kernel of `linearisation.linearise`; fills in the last four arrays, initially false, NaN, and
+    """Kernel of `gated_views.linearise`; fills in the last four arrays, initially false, NaN, and
     zeros.
 
     `sigmas` (N, J, V) are 0 if not seen; `focal` (S, V) pixels. `reach` is that of the gate, or

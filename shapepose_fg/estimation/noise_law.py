@@ -153,7 +153,8 @@ class Residuals:
     squared: Array
     """(R, 2) squared residuals along the principal axes of the triangulated covariance, m²."""
     others: Array
-    """(R, 2) variances of the triangulated position along these axes by Eq. 1, ascending, m²."""
+    """(R, 2) variances of the triangulated position along its principal axes by Eq. 1, ascending,
+    m²."""
     of_others: Array
     """(R, V) scores of the triangulated detections in the other views; 0 for none."""
 

@@ -120,7 +120,7 @@ class BodyGraph(PersonWindow):
         deque(map(graph.push_back, factors), maxlen=0)
 
     def _others(self, joints: Mask, turns: Array) -> list[gtsam.NonlinearFactor]:
-        """What all but these `joints` say of each body and the shape."""
+        """Factors with the information of all joints but `joints` about each body and the shape."""
         H, pull = frame_systems(self.window, self.state, ~joints)
         H[:, 10:13] = turns.mT @ H[:, 10:13]
         H[..., 10:13] = H[..., 10:13] @ turns
@@ -153,7 +153,9 @@ class BodyGraph(PersonWindow):
         return np.asarray(np.linalg.inv(found), dtype=np.float64)
 
     def refresh(self) -> None:
-        """Gate and linearise again around the state, after the deviations of joints changed."""
+        """Gate the detections and linearise again around the current state, after the variances of
+        the joints' deviations from the body have changed.
+        """
         of_body = self.window.joints(self.state) - self.state.deviation - self.window.origin
         self.window.last = self.window.around(self.state, of_body)
 

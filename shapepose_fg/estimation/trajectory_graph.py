@@ -2,8 +2,8 @@
 
 Joints of a frame are points; every detection is a robust projection factor: for a static camera on
 the joint, for a carried one on the joint and its carrier's pose. Odometry factors connect
-consecutive poses. `Trajectories` keeps each window's marginal on the poses, with joints eliminated,
-for the whole recording.
+consecutive poses. `pipeline.trajectories` keeps each window's marginal on the poses, with joints
+eliminated, for the whole recording.
 """
 
 from collections import deque

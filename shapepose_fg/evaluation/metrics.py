@@ -262,13 +262,18 @@ def covariance_calibration(errors: Real, covariances: Real) -> CovarianceCalibra
     error = np.asarray(errors, dtype=np.float64).reshape(-1, 3)
     covariance = np.asarray(covariances, dtype=np.float64).reshape(-1, 3, 3)
     if len(error) != len(covariance):
-        raise ValueError(f"one covariance for each error: got {len(covariance)} for {len(error)}")
+        raise ValueError(
+            f"each error needs one covariance, got {len(error)} errors and {len(covariance)} "
+            "covariances"
+        )
     finite = np.isfinite(error).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
     error, covariance = error[finite], covariance[finite]
     try:
         root = np.linalg.cholesky(covariance)
     except np.linalg.LinAlgError:
-        raise ValueError("a covariance is not positive definite") from None
+        raise ValueError(
+            "covariances must be positive definite, or NaN where they are unknown"
+        ) from None
     nees = np.sum(np.linalg.solve(root, error[..., None])[..., 0] ** 2, axis=1)
     # `2 gammaincinv(1.5, level)` is the quantile of chi-squared with 3 degrees of freedom.
     # Probabilities for which `covariance_calibration` computes the coverage of the

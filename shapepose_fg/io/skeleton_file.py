@@ -91,8 +91,8 @@ def read_skeleton(path: str | Path) -> Skeleton:
     )
     if not isinstance(anchor, str) and set(anchor) not in _HIPS:
         raise InputError(
-            f"{path}: an anchor of two joints must be the hips; name other midpoints under "
-            "[middles]"
+            f"{path}: an anchor of two joints must be the right and the left hip; for another "
+            "midpoint, define it under [middles] and give its name as the anchor"
         )
     core = [points.get(joint, joint) for joint in file.core or ()]
     if file.core is None:

@@ -81,7 +81,7 @@ class FactorReason:
     """Joints that the factors connect it to, as `person 3's RWrist`; empty for factors on this
     joint only."""
     share: float
-    """Share of the information about the joint that these factors give, 0 to 1."""
+    """Share of the user's factors in the information about the joint, 0 to 1."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""All steps from frames to rows, built from the settings: the data of every process."""
+"""The data that every process needs to solve windows (`Setup`), and the tracker made from it."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -33,7 +33,7 @@ FAST_M_S = 3.0
 """Speed of the fastest joints covered by the tracker's predictions, m/s: a hand that is thrown up
 or strikes."""
 UNSEEN_S = 0.3
-"""Longest gap without detections over which predictions cover such joints, s."""
+"""Longest gap without detections, s, over which predictions cover joints as fast as `FAST_M_S`."""
 _ON_TRIAL = 0.5
 """Factor on the required probability in single frames before a body is fitted."""
 _FALSE_POSITIVE = "hardly any detections of their own, or at the position of another person"

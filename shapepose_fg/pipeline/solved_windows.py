@@ -185,7 +185,10 @@ def solve_chunk(setup: Setup, job: tuple[Chunk, Sequence[Input]]) -> SolvedChunk
         spans = list(windows_of(engine, chunk, lambda frame: given[frame - chunk.first]))
     frames = [each.frame for span in spans for each, _ in span.decided[span.start : span.stop]]
     if frames != list(chunk.own):
-        raise RuntimeError(f"windows of {len(frames)} frames were found for a chunk of {chunk.own}")
+        raise RuntimeError(
+            f"{len(frames)} frames were solved in the windows of the chunk {chunk.own}, which must "
+            "be all of its frames, each once; please report this error"
+        )
     parts = tuple(map(setup.solve, spans))
     notes = book.flush()
     notes.dropped = {

@@ -43,9 +43,10 @@ class ThinnedFrames(DerivedFrames):
 
 
 def thinned(every: Detections, rig: Rig, config: CandidateConfig) -> tuple[Detections, bool]:
-    """Thin a frame's detections and sort them; also returns whether the limits were exceeded.
+    """Sort a frame's detections, and leave out faulty ones (`view_faults`) and those above the
+    limits.
 
-    Faulty detections are also removed (`view_faults`).
+    Returns the detections, and whether the limits removed any.
     """
     order = np.lexsort((every.confidence, every.joint, *every.xy.T))
     found = every.rows(order)
@@ -84,7 +85,8 @@ def thinned_candidates(
 ) -> Candidates:
     """At most `config.most_candidates` candidates per joint, fewer if there are too many links.
 
-    Strong ones are kept first, then those with most votes and confidence.
+    Strong candidates (`Candidates.strong`) are kept first, then those with most votes, then those
+    with the highest score.
     """
     most = config.most_candidates
     kept = _with_most(candidates, most)

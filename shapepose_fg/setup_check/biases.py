@@ -186,41 +186,33 @@ class Residuals:
         """
         P, J, _, V = *information.shape[:3], self.size_px.shape[1]
         C = V * (Q - 3 + 3 * self.parts)
-        # Order: common biases, cameras, individual people's shifts and scalings, residual.
-        common = 2 * V * J
-        total, log = np.zeros((common + C + 3 * V * P + 1, common + C + 3 * V * P + 1)), 0.0
-        prior = np.repeat([shift**-2, larger**-2], [2 * V, V])
+        own, people = slice(C, C + 2 * V), slice(C, C + 3 * V * P)
+        # The joints' common biases, and what they have in common with cameras, people's shifts and
+        # scalings, and the residual. A joint's bias is the sum of the person's own, the shift of
+        # the whole person, and the common bias.
+        whole, log = np.zeros((people.stop + 1, people.stop + 1)), 0.0
+        common, across = np.zeros((J, 2 * V, 2 * V)), np.zeros((J, 2 * V, len(whole)))
         for person in range(P):
-            own = slice(C, C + 2 * V)
             of_own = information[person][:, own]
             known = of_own[:, :, own] + np.eye(2 * V) / level**2
-            left = information[person] - of_own.swapaxes(1, 2) @ np.linalg.solve(known, of_own)
+            left = information[person] - of_own.mT @ (np.linalg.inv(known) @ of_own)
             log -= 0.5 * float(np.linalg.slogdet(known * level**2)[1].sum())
-            # A joint's bias is the sum of the person's own, the shift of the whole person, and the
-            # common bias.
-            whole = np.zeros((common + left.shape[1], common + left.shape[1]))
-            whole[common:, common:] = left.sum(axis=0)
-            for joint in range(J):
-                bias = slice(2 * V * joint, 2 * V * (joint + 1))
-                whole[bias, bias], whole[bias, common:] = left[joint, own, own], left[joint, own]
-                whole[common:, bias] = left[joint, :, own]
-            shared = slice(common + C, common + C + 3 * V)
-            known = whole[shared, shared] + np.diag(prior)
-            log -= 0.5 * float(np.linalg.slogdet(known / prior)[1])
-            whole -= whole[:, shared] @ np.linalg.solve(known, whole[shared])
-            begin = common + C + 3 * V * person
-            at = np.concatenate([np.arange(common + C), begin + np.arange(3 * V), [len(total) - 1]])
-            total[at[:, None], at] += whole
-        found = []
+            mine = np.arange(C + 3 * V * person, C + 3 * V * (person + 1))
+            at = np.concatenate([np.arange(C), mine, [people.stop]])
+            common += left[:, own, own]
+            across[:, :, at] += left[:, own]
+            whole[at[:, None], at] += left.sum(axis=0)
+        prior, found = np.tile(np.repeat([shift**-2, larger**-2], [2 * V, V]), P), []
         for ratio in ratios:
-            size = level * np.tile(np.repeat(np.broadcast_to(ratio, V), 2), J)
-            known = total[:common, :common] + np.diag(size**-2)
-            rest = total[common:, common:] - total[common:, :common] @ np.linalg.solve(
-                known, total[:common, common:]
-            )
-            likely = log - 0.5 * float(
-                np.linalg.slogdet(known * size[:, None] * size)[1] + rest[-1, -1]
-            )
+            size = level * np.repeat(np.broadcast_to(ratio, V), 2)
+            known = common + np.diag(size**-2)
+            solved = np.linalg.inv(known) @ across
+            rest = whole - across.reshape(-1, len(whole)).T @ solved.reshape(-1, len(whole))
+            shared = rest[people, people] + np.diag(prior)
+            rest -= rest[:, people] @ np.linalg.solve(shared, rest[people])
+            spread = np.linalg.slogdet(known * size[:, None] * size)[1].sum()
+            spread += np.linalg.slogdet(shared / prior)[1]
+            likely = log - 0.5 * float(spread + rest[-1, -1])
             found.append(Marginal(rest[:-1, :-1], rest[:-1, -1], likely))
         return found
 

@@ -15,12 +15,14 @@ _WORSE = 0.2
 """Drop of a camera's score, against the corrected camera, above which it is excluded: it sees
 people 3 % of their size, 5 cm, from where it should, on average."""
 _OF_PEOPLE = (Kind.UNIT, Kind.UP, Kind.PICTURE_SIZE, Kind.STOPPED, Kind.CROWDED)
-"""Kinds that affect all cameras alike, matter little, or are handled elsewhere."""
+"""Kinds of findings that exclude no camera: they affect all alike, matter little, or are handled
+elsewhere."""
 
 
 def trust_of(findings: Sequence[Finding], given: Look, right: Look, frames: range) -> Trust:
-    """Trust in the cameras as `given`, after `findings`; `right` is the look with these mistakes
-    corrected.
+    """Decide from `findings` which cameras are left out or doubted, in which of the `frames`.
+
+    `given` is the recording with the cameras as given, `right` with the found mistakes corrected.
     """
     wrong: list[Spell] = []
     whole = frames.start, frames.stop

@@ -62,7 +62,7 @@ Fitted = Callable[[Array, Array, Pinhole], Pinhole | None]
 
 @dataclass(frozen=True)
 class Match:
-    """Matches between a camera's sightings and people."""
+    """E matches between a camera's sightings of people and the people that other cameras see."""
 
     person: Index
     """(E,) rows of the people."""

@@ -68,7 +68,7 @@ class Pinhole:
 
     def project(self, points: Array) -> tuple[Array, Array]:
         """Pixels (..., 2) and depths (...) of `points` (..., 3) in the world."""
-        at = points @ (self.K @ self.cTw[:, :3]).T + self.K @ self.cTw[:, 3]
+        at = np.tensordot(points, self.K @ self.cTw[:, :3], (-1, 1)) + self.K @ self.cTw[:, 3]
         with np.errstate(divide="ignore", invalid="ignore"):
             return at[..., :2] / at[..., 2:], at[..., 2]
 
@@ -306,7 +306,8 @@ def distances(
     person (E,), sighting (E,) and error (E,), as a share of the sighting's size.
     """
     person, sighting = same_frame(frame, seen.frame)
-    error = miss_px(points[person], seen.xy[sighting], camera)
+    at, depth = camera.project(points)
+    error = miss_px(at[person], depth[person], seen.xy[sighting])
     return person, sighting, median_of(error, MIN_JOINTS) / seen.size_px[sighting]
 
 
@@ -330,11 +331,10 @@ def least_of_each(key: Index, value: Array) -> Index:
     return order[np.unique(key[order], return_index=True)[1]]
 
 
-def miss_px(points: Array, xy: Array, camera: Pinhole) -> Array:
-    """(N, J) distance of projected `points` (N, J, 3) from the joints `xy` (N, J, 2), pixels;
-    infinite behind the camera, NaN for joints not seen.
+def miss_px(at: Array, depth: Array, xy: Array) -> Array:
+    """(N, J) distance of joints projected to `at` (N, J, 2), at `depth` (N, J), from the joints
+    `xy` (N, J, 2), pixels; infinite behind the camera, NaN for joints not seen.
     """
-    at, depth = camera.project(points)
     miss = np.sqrt(np.square(at - xy).sum(axis=-1))
     return np.where((depth <= 0) & ~np.isnan(xy[..., 0]), np.inf, miss)
 

@@ -194,8 +194,8 @@ def _camera_figures(diagnosis: Diagnosis, rig: Rig) -> tuple[CameraFigures, ...]
         others, mine, camera = look.others(view), look.seen_by(view), look.camera(view)
         matched = match(others, mine, camera)
         points = others.points[matched.person]
-        depth = camera.project(points)[1]
-        out_px = miss_px(points, mine.xy[matched.sighting], camera)
+        at, depth = camera.project(points)
+        out_px = miss_px(at, depth, mine.xy[matched.sighting])
         figures = CameraFigures(
             camera=name,
             people=int(seen[view]),

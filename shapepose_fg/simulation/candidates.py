@@ -164,7 +164,7 @@ class Candidates(Rows):
     owner: Mask
     """(D, P) people to whom a candidate belongs; none if it is false, two if two joints merged."""
     reach_px: Array
-    """(D,) distance to a better candidate of the same joint below which this one is suppressed,
+    """(D,) distance to a better candidate of the same joint below which a candidate is suppressed,
     pixels."""
 
 

@@ -45,7 +45,7 @@ class DetectorStatistics:
     """(2,) share of people in a view with half, or four fifths, of the joints missed without
     occlusion."""
     lost_memory: Array
-    """(2, 2) share and time constant, s, of a fast and a slow component of such losses."""
+    """(2, 2) share and time constant, s, of a fast and a slow component of the losses in `lost`."""
     lost_correlation: Array
     """(25, 25) correlation of losses between a person's joints."""
     confidence: Array

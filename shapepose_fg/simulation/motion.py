@@ -59,7 +59,7 @@ class Build:
         self.pelvis_m, self.ankle_m, self.shoulder_m = (
             float(rest[joint, 1] - floor) for joint in (0, 7, 16)
         )
-        """Heights of these joints of an upright body, metres."""
+        """Heights of pelvis, ankle and shoulder of an upright body above its soles, metres."""
         hip, knee, ankle = rest[list(LEGS[0])]
         self.leg_m = float(np.linalg.norm(knee - hip) + np.linalg.norm(ankle - knee))
         """Length of thigh and shank together, metres."""

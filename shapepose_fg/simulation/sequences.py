@@ -100,7 +100,7 @@ class Room:
         self.performed: list[Performance] = []
         """Motions of the people, in order of arrival."""
         self.names: list[str] = []
-        """Names of the recordings of these motions."""
+        """Name of the recording of each motion in `performed`."""
 
     def add_pair(self, betas: Array, pair: tuple[Clip, Clip]) -> None:
         """Add two people who dance together, with a common scale, so that held hands
@@ -317,7 +317,8 @@ def sequence(
     takes = salsa_takes(mocap, split)
     if len(takes) == 0:
         raise ValueError(
-            f"these recordings hold no salsa take of split {split!r}: give the whole file"
+            f"these recordings have no salsa take of split {split!r}; give the complete "
+            "cmu_smpl24.npz (docs/simulation.md)"
         )
     rng = np.random.default_rng([config.seed, list(TAKES).index(split)])
     body = BodyModel.default() if body is None else body
@@ -353,7 +354,7 @@ def sequence(
 
 
 def salsa_takes(mocap: Mocap, split: Split) -> list[tuple[int, int]]:
-    """Pairs of clips of a split, lead and follow."""
+    """The salsa takes of a split: numbers of the clips of the lead and of the follower."""
     return [pair for pair in mocap.pairs if _take(mocap.names[pair[0]]) in TAKES[split]]
 
 
@@ -372,7 +373,8 @@ def _dances(
         segments = [segment for pair in drawn for segment in _together_in(mocap, pair, config, fps)]
         if len(segments) == 0:
             raise ValueError(
-                "there is no salsa take in which the two dance together: give the whole file"
+                "these recordings have no salsa take in which the two dancers are close "
+                "together; give the complete cmu_smpl24.npz (docs/simulation.md)"
             )
         yield from segments
 
@@ -406,7 +408,8 @@ def _drawn(clips: list[int], count: int, rng: np.random.Generator) -> list[int]:
     """Draw `count` clips; none is repeated before all are drawn once."""
     if count > 0 and len(clips) == 0:
         raise ValueError(
-            "there are no standing or walking people in these recordings: give the whole file"
+            "these recordings have no standing or walking people; give the complete "
+            "cmu_smpl24.npz (docs/simulation.md)"
         )
     rounds = -(-count // max(len(clips), 1))
     return [clips[index] for _ in range(rounds) for index in rng.permutation(len(clips))][:count]

@@ -5,7 +5,7 @@ A world is a global hypothesis: a set of tracks that share no detection. People 
 several frames, tracked from there forwards and backwards, and the tracks that explain most are
 selected (`track_selection.py`). The selected people are then joined in one world in the frames that
 show them best, and tracked again from there, so that they no longer take each other's detections.
-Alternatives are sought in what people with evidence throughout leave.
+Alternatives are sought in the detections that people with evidence throughout do not use.
 """
 
 from collections.abc import Iterable, Sequence

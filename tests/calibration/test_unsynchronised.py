@@ -98,6 +98,9 @@ def test_the_command_finds_poses_and_times_from_people_alone(
         out, error = capsys.readouterr()
         assert ended.value.code == code and said in " ".join((out + error).split())
     assert steps[-1][0] == steps[-1][1] and steps == sorted(steps)
+    # The first offsets, of three pairs, take about as long as a round of poses: the time left is
+    # estimated from these steps.
+    assert steps[2][0] > 0.15 * steps[2][1]
     turn, move, _ = off_after_growing(read_rig("new.json"), rig)
     assert turn.max() < 0.4 and move.max() < 0.03
     rows = np.array(

@@ -458,7 +458,7 @@ BAD_SKELETONS = [
     (
         'anchor = ["r_hip", "l_hip"]',
         'anchor = ["r_sho", "l_sho"]',
-        "an anchor of two joints must be the hips",
+        "an anchor of two joints must be the right and the left hip",
     ),
     ('name = "ours"', "", "name is missing; docs/joints.md describes the file"),
     ('neck = "Neck"', 'nick = "Neck"', "body.nick is not a keypoint of ours; it has head"),

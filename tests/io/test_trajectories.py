@@ -183,7 +183,8 @@ def test_a_trajectory_of_a_camera_of_any_calibration(tmp_path, rig):
         (["cam1"], "must name a camera and a file"),
         (
             ["cam0=a.tum", "cam1=a.tum"],
-            "a camera can have one trajectory, and it belongs to this camera only; give the pose",
+            "the camera has a trajectory already, or the file is given for another camera, too; "
+            "give the pose",
         ),
     ):
         with pytest.raises(InputError) as refused:

@@ -312,7 +312,7 @@ def test_a_chunk_without_its_frames_is_an_error_and_no_gap(scene, recording):
     given = tuple(Input(n, np.full(4, n / 25), Detections.empty(), scene.rig) for n in range(16))
     short = Chunk(range(0, 12), 0, 16, ended=False)  # half a window and 0.3 s more are needed
     with pytest.raises(
-        RuntimeError, match=r"windows of 0 frames were found for a chunk of range\(0, 12\)"
+        RuntimeError, match=r"0 frames were solved in the windows of the chunk range\(0, 12\)"
     ):
         solve_chunk(setup, (short, given))
 

@@ -17,7 +17,8 @@ from shapepose_fg.core.storage.npz import read_npz
 NUM_ANGLES = 69
 """Number of angles: 23 local rotations below the root, axis-angle, in SMPL's order."""
 NUM_MOVING = 3 + NUM_ANGLES + 3
-"""Number of moving parameters: rotation of the root, the other 69 angles, position of the root."""
+"""Number of parameters that change over time: rotation vector of the root (3), 69 angles, position
+of the root (3)."""
 
 _CURE = "install the package again"
 _SAMPLES = 2000

@@ -31,12 +31,13 @@ _FRAME, _SPREAD = "frame.", "spread"
 
 @dataclass(frozen=True, eq=False)
 class FitterWeights:
-    """A trained update network and the frame in which it works."""
+    """A trained update network, and the person's coordinate frame in which it works."""
 
     network: UpdateNetwork
     """The trained network."""
     frame: PersonFrame
-    """Frame with mean body and mean pose, from which it starts."""
+    """Coordinate frame of a person, with the mean body in its mean pose, from which the network
+    starts."""
     body: str
     """Fingerprint of the body model used in training (see `fingerprint`)."""
     spread: Array = field(default_factory=lambda: np.ones(len(BODY_POINTS)))

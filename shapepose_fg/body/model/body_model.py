@@ -229,7 +229,7 @@ class BodyModel:
         after frame.
         """
         if only.ndim != 1:
-            raise ValueError(f"only must be (M,) numbers of vertices, got {only.shape}")
+            raise ValueError(f"`only` must be (M,) indices of vertices, got {only.shape}")
         key = only.tobytes()
         if self._last_part is None or self._last_part[0] != key:
             self._last_part = (key, self._mesh.part(only))

@@ -24,9 +24,6 @@ Arrays = Mapping[str, NDArray[Any]]
 _SUFFIX = ".safetensors"
 ANEW = "start that run again with --restart"
 """Cure in error messages about a damaged set."""
-_SAID = {"about", "arrays", "sha256"}
-"""Keys of a file's metadata: plain values about the set, digests of the arrays, and a digest of all
-metadata."""
 _ALIGNED = 64
 """Alignment of arrays, bytes."""
 

@@ -134,8 +134,8 @@ def with_trajectories(rig: Rig, given: Sequence[str]) -> Rig:
                 'and "bTc"'
             )
             raise InputError(
-                f"--trajectory {each[:80]}: a camera can have one trajectory, and it belongs to"
-                f" this camera only; {cure}"
+                f"--trajectory {each[:80]}: the camera has a trajectory already, or the file is"
+                f" given for another camera, too; {cure}"
             )
         trajectories.append(read_trajectory(file, name))
         cameras[name] = replace(cameras[name], carrier=name, bTc=np.eye(4))

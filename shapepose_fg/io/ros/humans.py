@@ -68,7 +68,7 @@ class _Limb(NamedTuple):
 
     @property
     def names(self) -> tuple[str, str, str]:
-        """Names of these three joints."""
+        """Names of the three joints between trunk and upper link."""
         side, _, name = self.links[0].partition("_")
         return f"{side}_y_{name}", f"{side}_p_{name}", f"{side}_r_{name}"
 

@@ -2,9 +2,10 @@
 
 Half of the people are seen by a few virtual cameras: each view hides some joints, misses some, and
 reports the others with a confidence and an error drawn from the simulator's tables; the rays are
-triangulated with the pipeline's weights. So depth is worse than width, a joint may be a single ray,
-and stated covariances are sometimes wrong. The rest have isotropic noise. Then whole limbs, sides
-and halves are removed, joints become outliers, and sides are swapped.
+triangulated with the pipeline's weights. Errors are therefore larger in depth than across the view,
+a joint may be known only along a ray, and some of the given covariances are wrong. The rest have
+isotropic noise. Then whole limbs, sides and halves are removed, joints become outliers, and sides
+are swapped.
 """
 
 from dataclasses import dataclass
