@@ -20,9 +20,11 @@ class WindowGraphConfig(Settings):
     rho_3d: Share = 1.0
     """rho_3D of Eq. 4: joints with at most this mean confidence over all views are constrained by
     the body."""
+    weight_2d: Factor = 1.0
+    """w_2D of Eq. 5, multiplies the squared reprojection errors. With correct sigmas both weights
+    are 1."""
     weight_shape: Factor = 1.0
-    """w_shape of Eq. 5, multiplies the squared distances to the body model; w_2D is 1. With correct
-    sigmas both are 1."""
+    """w_shape of Eq. 5, multiplies the squared distances to the body model."""
     shape_sigma_m: MetresOrNone = 0.0
     """Positive: common standard deviation of the body's constraint on all joints, as in Eq. 3 with
     its single weight, m. 0: the body's own covariance, which differs by joint and direction."""

@@ -11,6 +11,7 @@ import gtsam
 import numpy as np
 
 from factors import (
+    DEFAULT_WIDTH_SIGMA,
     KernelName,
     body_prior_factors,
     make_camera,
@@ -137,9 +138,12 @@ class WindowGraph(PersonWindow):
     def _seen(self, used: Mask) -> Sequence[gtsam.NonlinearFactor]:
         """Projection factors of used observations."""
         _, joint, view = chosen = np.nonzero(used)
+        # In pixels the kernel's width is as before the weight scaled the sigma.
+        scale, kernel = 1.0 / np.sqrt(self.config.weight_2d), self._kernel
+        width = None if kernel is None else DEFAULT_WIDTH_SIGMA[kernel] / scale
         return projection_factors(
             cameras_of(self._views), view, self.keys[0, joint], self._observations.xy[chosen],
-            self._sigmas_px[chosen], robust_kernel(self._kernel),
+            scale * self._sigmas_px[chosen], robust_kernel(kernel, width),
         )  # fmt: skip
 
     def _pulled(self, pulls: JointTargets) -> list[gtsam.NonlinearFactor]:

@@ -258,13 +258,45 @@ def test_priors_pull_the_joints_they_are_set_for_and_are_taken_back(five_cameras
     np.testing.assert_allclose(graph.solve(truth), views_alone, atol=1e-9)
 
 
-def test_the_body_s_weight_divides_the_covariances(five_cameras, person):
+def test_weights_divide_the_covariances(five_cameras, person):
     truth, xy, sigmas = person
+    plain = graph_of(five_cameras, xy, sigmas)
+    plain.solve(truth)
+    heavy = graph_of(
+        five_cameras,
+        xy,
+        sigmas,
+        WindowGraphConfig(weight_2d=4.0, max_iterations=100, tolerance=1e-12),
+    )
+    heavy.solve(truth)
+    np.testing.assert_allclose(4.0 * heavy.covariance(), plain.covariance(), rtol=1e-6)
     body = graph_of(five_cameras, xy, 0.0 * sigmas, WindowGraphConfig(weight_shape=9.0))
     covariance = random_covariances(25, 0.05)
     body.set_priors(~NO_PRIOR, truth, covariance)
     body.solve(truth)
     np.testing.assert_allclose(9.0 * body.covariance(), covariance, rtol=1e-8)
+
+
+@pytest.mark.parametrize("kernel", ["huber", "cauchy", "geman_mcclure", "tukey"])
+def test_the_weight_of_the_views_multiplies_their_cost_kernel_and_all(five_cameras, person, kernel):
+    """One view is 60 px off, where every kernel bends: four times the weight is four times the
+    cost.
+    """
+    truth, xy, sigmas = person
+    xy = xy.copy()
+    xy[:, 2, 0] += 60.0
+    costs = []
+    for weight in (1.0, 4.0):
+        observed = xy[None], sigmas[None]
+        config = WindowGraphConfig(weight_2d=weight, max_iterations=1)
+        window = window_of(five_cameras, *observed, config, kernel, [0])
+        none = JointTargets(np.zeros((1, 25, 3)), np.zeros((1, 25, 3, 3)))
+        window.solve(observed[1] > 0, none, truth[None])
+        values = gtsam.Values()
+        for key in window.values.keys():  # noqa: SIM118 - GTSAM's, not a dictionary's
+            values.insert(key, truth[split_key(key).joint] if key in window.keys else np.zeros(3))
+        costs.append(window.graph.error(values))  # where nobody moves, so that motion costs nothing
+    assert costs[1] == pytest.approx(4.0 * costs[0], rel=1e-9)
 
 
 def test_a_factor_added_late_counts(five_cameras, person):
@@ -354,6 +386,8 @@ def test_a_bone_length_of_one_s_own_is_kept(five_cameras, person):
 
 
 def test_refuses_settings_that_make_no_sense():
+    with pytest.raises(ValueError, match="weight_2d must be positive"):
+        WindowGraphConfig(weight_2d=0.0)
     with pytest.raises(ValueError, match="rho_3d must be between 0 and 1"):
         WindowGraphConfig(rho_3d=1.5)
 
