@@ -23,6 +23,7 @@ from factors.keys import (
     joint_keys,
     offset_key,
     offset_keys,
+    reported_keys,
     shape_key,
     split_camera_key,
     split_key,
@@ -32,6 +33,7 @@ from factors.keys import (
 )
 from factors.lasting import (
     lasting_blocks,
+    lasting_difference_factors,
     lasting_prior_factors,
     offset_factors,
 )
@@ -66,6 +68,7 @@ from factors.projection import (
     inlier_gate,
     make_calibration,
     make_camera,
+    moving_projection_factors,
     posed_projection_factor,
     posed_projection_factors,
     projection_factor,
@@ -112,6 +115,7 @@ __all__ = [
     "joint_keys",
     "kernel_weight",
     "lasting_blocks",
+    "lasting_difference_factors",
     "lasting_prior_factors",
     "linear_factor",
     "load_graph",
@@ -120,6 +124,7 @@ __all__ = [
     "matrices",
     "motion_covariance",
     "motion_factors",
+    "moving_projection_factors",
     "odometry_factors",
     "offset_factors",
     "offset_key",
@@ -130,6 +135,7 @@ __all__ = [
     "projection_factor",
     "projection_factors",
     "reported_factor",
+    "reported_keys",
     "robust",
     "robust_kernel",
     "save_graph",

@@ -26,11 +26,11 @@ MAX_JOINT = 999
 MAX_FRAME = 99_999_999
 """Largest frame number in a key: 19 days at 60 frames a second."""
 
-_JOINT, _VELOCITY, _CAMERA, _OFFSET, _ACCELERATION, _BODY = 1, 2, 3, 4, 8, 9
+_JOINT, _VELOCITY, _CAMERA, _OFFSET, _REPORTED, _ACCELERATION, _BODY = 1, 2, 3, 4, 7, 8, 9
 _STATE = (_JOINT, _VELOCITY, _ACCELERATION)
 _SOURCES = 3
 _NAMES = {_JOINT: "position", _VELOCITY: "velocity", _ACCELERATION: "acceleration"}
-_NAMES |= {_CAMERA: "camera", _BODY: "body"}
+_NAMES |= {_CAMERA: "camera", _REPORTED: "reported position", _BODY: "body"}
 _NAMES |= {_OFFSET + source: f"offset {source}" for source in range(_SOURCES)}
 _PER_JOINT = MAX_FRAME + 1
 _PER_PERSON = (MAX_JOINT + 1) * _PER_JOINT
@@ -105,6 +105,14 @@ def offset_keys(
 ) -> NDArray[np.int64]:
     """`offset_key` for arrays: `joints` and `frames` broadcast against each other."""
     return _pack(_offset(source), person, joints, frames)
+
+
+def reported_keys(person: int, joints: ArrayLike, frames: ArrayLike = 0) -> NDArray[np.int64]:
+    """Keys of reported positions (`Point3`, metres, world), which contain all errors. `joint_keys`
+    are the positions of the optimised graph of detections, body priors and motion. `joints` and
+    `frames` broadcast against each other.
+    """
+    return _pack(_REPORTED, person, joints, frames)
 
 
 def body_keys(person: int, frames: ArrayLike) -> NDArray[np.int64]:

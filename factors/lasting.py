@@ -99,6 +99,48 @@ def lasting_blocks(
     return scaled, of_offsets, (scaled @ means[..., None])[..., 0]
 
 
+def lasting_difference_factors(
+    keys: ArrayLike,
+    of_keys: ArrayLike,
+    offset_keys: ArrayLike,
+    differences: ArrayLike,
+    covariances: ArrayLike,
+    white_share: float,
+) -> list[gtsam.NonlinearFactor]:
+    """D measured differences of positions, `keys` (D,) minus `of_keys` (D,): `differences` (D, 3),
+    metres, with correlated errors. These have `covariances` (D, 3, 3), positive definite, m², of
+    which the share `white_share` is independent in each frame.
+
+        r = R (y - x - d) - sqrt(1 - w) b  ~  N(0, w I),
+
+        with R the symmetric root of the information.
+    """
+    away, shape = np.asarray(differences, dtype=np.float64), np.shape(keys)
+    values, vectors = np.linalg.eigh(np.asarray(covariances, dtype=np.float64))
+    if not (
+        shape == np.shape(of_keys) == np.shape(offset_keys) == away.shape[:1] == values.shape[:1]
+    ):
+        raise ValueError(
+            "keys, of_keys and offset_keys must be (D,), differences (D, 3), covariances (D, 3, 3)"
+        )
+    if not (np.isfinite(away).all() and (values > 0).all()):
+        raise ValueError("differences must be finite and covariances positive definite")
+    if not 0 < white_share < 1:
+        raise ValueError(f"white_share must be between 0 and 1, got {white_share}")
+    scaled = (vectors / np.sqrt(white_share * values)[:, None]) @ vectors.mT
+    right, every = (
+        (scaled @ away[..., None])[..., 0],
+        [np.asarray(each) for each in (keys, of_keys, offset_keys)],
+    )
+    reported, of, offsets = (each.tolist() for each in every)
+    of_offset = repeat(-np.sqrt((1.0 - white_share) / white_share) * np.eye(3))
+    unit = repeat(noiseModel.Unit.Create(3))
+    linear = map(
+        gtsam.JacobianFactor, reported, scaled, of, -scaled, offsets, of_offset, right, unit
+    )
+    return contained(linear, np.concatenate(every))
+
+
 def _projectors(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
     """R R^+ of each R (D, 3, 3): the projectors on their ranges, the identity exactly where R has
     full rank.

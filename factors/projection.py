@@ -17,7 +17,8 @@ import numpy as np
 from gtsam import noiseModel
 from numpy.typing import ArrayLike, NDArray
 
-from factors.noise import Kernel, isotropic, isotropic_models
+from factors.motion import contained
+from factors.noise import Kernel, KernelName, isotropic, isotropic_models, kernel_weight
 
 
 def make_camera(K: ArrayLike, wTc: ArrayLike) -> gtsam.PinholeCameraCal3_S2:
@@ -88,6 +89,61 @@ def projection_factors(
     models = isotropic_models(2, sigmas_px, kernel)
     chosen = [cameras[index] for index in views.tolist()]
     return list(map(gtsam.TriangulationFactorCal3_S2, chosen, points, models, key_list.tolist()))
+
+
+def moving_projection_factors(
+    keys: ArrayLike,
+    velocity_keys: ArrayLike,
+    lead_s: ArrayLike,
+    points: ArrayLike,
+    slopes: ArrayLike,
+    residuals: ArrayLike,
+    sigmas_px: ArrayLike,
+    kernel: KernelName | None = None,
+    width: float = 1.0,
+) -> list[gtsam.NonlinearFactor]:
+    """D detections of moving joints, exposed `lead_s` (D,) seconds after the time of their states;
+    linear factors.
+
+    At the exposure, the joint is at x + lead v, with position x (`keys` (D,)) and velocity v
+    (`velocity_keys` (D,)). The projection is linearised at `points` (D, 3), metres in the world,
+    with the derivative of the pixel `slopes` (D, 2, 3), pixels per metre, and the residual
+    `residuals` (D, 2), pixels. The weight of a robust kernel, with its `width` in standard
+    deviations, is computed once, at this point.
+    """
+    position, velocity = np.asarray(keys), np.asarray(velocity_keys)
+    at, slope, off = (np.asarray(each, dtype=np.float64) for each in (points, slopes, residuals))
+    lead, sigma, count = (
+        np.asarray(lead_s, dtype=np.float64),
+        np.asarray(sigmas_px, dtype=np.float64),
+        len(at),
+    )
+    shapes = [np.shape(each) for each in (position, velocity, lead, sigma, at, slope, off)]
+    if shapes != [(count,)] * 4 + [(count, 3), (count, 2, 3), (count, 2)]:
+        raise ValueError(
+            "keys, lead_s and sigmas_px must be (D,), points (D, 3), slopes (D, 2, 3), got "
+            f"{shapes}"
+        )
+    if (
+        not all(np.isfinite(each).all() for each in (lead, sigma, at, slope, off))
+        or not (sigma > 0).all()
+    ):
+        raise ValueError("every observation must be finite and its sigma positive")
+    weight = np.sqrt(kernel_weight(kernel, np.linalg.norm(off, axis=1) / sigma, width)) / sigma
+    slope = slope * weight[:, None, None]
+    right = (slope @ at[..., None])[..., 0] - off * weight[:, None]
+    order = np.argsort(position, kind="stable")
+    first = np.flatnonzero(np.diff(position[order], prepend=position[order[:1]] - 1))
+    linear = [
+        gtsam.JacobianFactor(
+            int(position[rows[0]]), slope[rows].reshape(-1, 3),
+            int(velocity[rows[0]]), (slope[rows] * lead[rows, None, None]).reshape(-1, 3),
+            right[rows].ravel(), noiseModel.Unit.Create(2 * len(rows)),
+        )
+        for rows in np.split(order, first[1:])
+        if len(rows) > 0
+    ]  # fmt: skip
+    return contained(linear, np.concatenate([position, velocity]))
 
 
 def posed_projection_factor(

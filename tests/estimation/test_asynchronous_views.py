@@ -4,10 +4,11 @@ the frame's.
 
 from dataclasses import replace
 
+import gtsam
 import numpy as np
 import pytest
 
-from factors import project_with_jacobian
+from factors import joint_key, moving_projection_factors, project_with_jacobian, velocity_key
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.detections import Detections, Recording
 from shapepose_fg.core.frame_times import FrameTimes
@@ -52,6 +53,53 @@ def observed(rig: Rig, moving, time_s: np.ndarray, shutter_s: float = 0.0) -> Ob
         frame=np.arange(len(xy)),
         time_s=time_s,
     )
+
+
+def test_a_factor_of_a_moving_point_is_the_projection_to_first_order(five_cameras, moving):
+    """Error and slope of all views together against those of the projection at the views' own
+    times.
+    """
+    rig, (places, velocity) = five_cameras, moving
+    x, v, uv = places[3], velocity[3], seen_at(five_cameras, moving, LEADS_S[None])[0, 3] + 2.0
+    at = x + LEADS_S[:, None] * v
+    pixel, _, slope = project_with_jacobian(at, rig.K, rig.cTw)
+    keys = [joint_key(0, 3)] * 5, [velocity_key(0, 3)] * 5
+    factors = moving_projection_factors(
+        *keys, LEADS_S, at, slope, pixel - uv, np.full(5, 1.5), "cauchy", 2.0
+    )
+    assert len(factors) == 1
+    weight = 1 / (1 + (np.linalg.norm(pixel - uv, axis=1) / 1.5 / 2.0) ** 2)
+
+    def cost(dx, dv) -> float:
+        xy, _, _ = project_with_jacobian(x + dx + LEADS_S[:, None] * (v + dv), rig.K, rig.cTw)
+        return float((weight * ((xy - uv) ** 2).sum(axis=1)).sum() / 1.5**2 / 2)
+
+    def error(dx, dv) -> float:
+        values = gtsam.Values()
+        values.insert(joint_key(0, 3), x + dx)
+        values.insert(velocity_key(0, 3), v + dv)
+        return factors[0].error(values)
+
+    nothing, step = np.zeros(3), 1e-4
+    assert error(nothing, nothing) == pytest.approx(cost(nothing, nothing), rel=1e-9)
+    for axis in np.eye(3):
+        for along in ((step * axis, nothing), (nothing, 10 * step * axis)):
+            back = tuple(-each for each in along)
+            assert error(*along) - error(*back) == pytest.approx(
+                cost(*along) - cost(*back), rel=1e-4, abs=1e-7
+            )
+
+
+def test_observations_that_do_not_fit_are_refused():
+    keys, good = (
+        ([1, 1], [2, 2], [0.0, 0.01]),
+        (np.ones((2, 3)), np.ones((2, 2, 3)), np.ones((2, 2)), np.ones(2)),
+    )
+    assert len(moving_projection_factors(*keys, *good)) == 1
+    with pytest.raises(ValueError, match=r"points \(D, 3\)"):
+        moving_projection_factors(*keys, good[0][:1], *good[1:])
+    with pytest.raises(ValueError, match="finite"):
+        moving_projection_factors(*keys, good[0] * np.nan, *good[1:])
 
 
 def test_views_within_a_millisecond_are_of_one_time(five_cameras, moving):

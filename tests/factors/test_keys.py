@@ -9,6 +9,7 @@ from factors import (
     joint_keys,
     offset_key,
     offset_keys,
+    reported_keys,
     split_camera_key,
     split_key,
     velocity_key,
@@ -31,6 +32,7 @@ def test_a_key_says_again_what_it_was_made_of(person, joint, frame):
         joint_key,
         velocity_key,
         offset_key,
+        lambda *numbers: int(reported_keys(*numbers)),
     ):
         assert split_key(make(person, joint, frame)) == (person, joint, frame)
     assert split_camera_key(camera_key(person, frame)) == (person, frame)

@@ -9,12 +9,15 @@ import pytest
 from factors import (
     assert_jacobian,
     assert_zero_at_truth,
+    isotropic,
     joint_keys,
+    lasting_difference_factors,
     lasting_prior_factors,
     motion_covariance,
     motion_factors,
     offset_factors,
     offset_keys,
+    reported_keys,
     velocity_keys,
 )
 
@@ -342,3 +345,56 @@ def test_a_message_of_full_rank_is_split_as_it_is_written():
 def test_refuses_what_makes_no_sense(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_a_difference_whose_error_lasts_is_in_the_marginals_with_all_of_it():
+    """y = x + d + e, with e of covariance D_t that lasts: Var(y) = Var(x) + D, and so on over
+    time.
+    """
+    rng, times, T, w, tau = np.random.default_rng(3), np.array([0.0, 0.1, 0.15, 0.4]), 4, 0.3, 0.5
+    keys, of, offsets = (
+        reported_keys(2, 7, np.arange(T)),
+        joint_keys(2, 7, np.arange(T)),
+        offset_keys(2, 7, np.arange(T), 2),
+    )
+    roots = rng.normal(0, 0.02, (T, 3, 3))
+    D = roots @ roots.mT + 1e-6 * np.eye(3)
+    difference = rng.normal(0, 0.1, (T, 3))
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    for n in range(T):
+        graph.push_back(gtsam.PriorFactorPoint3(int(of[n]), np.zeros(3), isotropic(3, 0.05)))
+        for key, at in ((of[n], np.zeros(3)), (keys[n], difference[n]), (offsets[n], np.zeros(3))):
+            values.insert(int(key), at)
+    factors = lasting_difference_factors(keys, of, offsets, difference, D, w)
+    for factor in [*factors, *offset_factors(offsets, times, tau)]:
+        graph.push_back(factor)
+    assert graph.error(values) == pytest.approx(0.0, abs=1e-18)
+    found = gtsam.Marginals(graph, values)
+    for n in range(T):
+        np.testing.assert_allclose(
+            found.marginalCovariance(int(keys[n])), 0.05**2 * np.eye(3) + D[n], rtol=1e-9
+        )
+    both = found.jointMarginalCovariance(gtsam.KeyVector(keys[:2].tolist())).at(
+        int(keys[0]), int(keys[1])
+    )
+    values_0, vectors_0 = np.linalg.eigh(D[0])
+    values_1, vectors_1 = np.linalg.eigh(D[1])
+    root_0, root_1 = (
+        v * np.sqrt(e) @ v.T for e, v in ((values_0, vectors_0), (values_1, vectors_1))
+    )
+    np.testing.assert_allclose(both, (1 - w) * np.exp(-0.1 / tau) * root_0 @ root_1, atol=1e-9)
+
+
+@pytest.mark.parametrize("wrong", ["keys", "covariance", "share"])
+def test_a_difference_that_makes_no_sense_is_refused(wrong):
+    keys = joint_keys(0, 0, np.arange(2 if wrong == "keys" else 1))
+    covariance = np.zeros((1, 3, 3)) if wrong == "covariance" else np.eye(3)[None]
+    with pytest.raises(ValueError, match=r"must be|positive definite"):
+        lasting_difference_factors(
+            keys,
+            joint_keys(0, 1, [0]),
+            offset_keys(0, 0, [0]),
+            np.zeros((1, 3)),
+            covariance,
+            1.0 if wrong == "share" else 0.5,
+        )
