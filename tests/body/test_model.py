@@ -60,7 +60,7 @@ def test_some_vertices_are_those_of_the_mesh_whatever_the_type_of_their_numbers(
         np.testing.assert_allclose(
             tiny_model.vertices(parameters, only), whole[:, only], atol=1e-12
         )
-    with pytest.raises(ValueError, match=r"only must be \(M,\)"):
+    with pytest.raises(ValueError, match=r"only` must be \(M,\)"):
         tiny_model.vertices(parameters, np.array([[1, 0]]))
 
 
