@@ -183,7 +183,7 @@ class PipelineConfig(Settings):
 
     @classmethod
     def fast(cls) -> "PipelineConfig":
-        """Keyframes only, eight to ten a second: half the time or less (docs/evaluation.md,
+        """Keyframes only, eight to ten a second: two thirds of the time (docs/evaluation.md,
         "Presets").
         """
         return cls(
