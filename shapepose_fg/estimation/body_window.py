@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import get_lapack_funcs
 
 from factors import DEFAULT_WIDTH_SIGMA, Motion
 from shapepose_fg.body.fitting.chains import Links, linked
@@ -426,6 +425,9 @@ class BodyWindow:
 
     def covariances(self, state: BodyState) -> "Marginals":
         """Marginal covariances of every frame's variables, around the last solution."""
+        # Imported here: the first kernels load it anyway, commands without a window do not.
+        from scipy.linalg import get_lapack_funcs
+
         here = self.last
         kept, front = self._eliminated(state.root, here, 0.0)
         T, N = here.pull.shape
