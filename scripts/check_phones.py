@@ -8,8 +8,7 @@ of `--data FOLDER` (or SHAPEPOSE_DATA). The command is told 65 degrees, --focal 
 with `--logs` the lenses that the phones have logged. It prints the rows of the table in
 docs/evaluation/cameras.md: errors, and in brackets two standard deviations; the numbers of fixed
 phones whose rotation and position are within theirs; for the carried phone the bound of its error
-(95 %).
-Run it from a clone. About three minutes per room on one core.
+(95 %). Run it from a clone. About three minutes per room on one core.
 """
 
 import argparse

@@ -424,7 +424,9 @@ class BodyWindow:
         return [(np.arange(len(self)), marginals)]
 
     def covariances(self, state: BodyState) -> "Marginals":
-        """Marginal covariances of every frame's variables, around the last solution."""
+        """Marginal covariances of every frame's variables, around the last solution. LinAlgError if
+        they are not determined.
+        """
         # Imported here: the first kernels load it anyway, commands without a window do not.
         from scipy.linalg import get_lapack_funcs
 
@@ -440,7 +442,10 @@ class BodyWindow:
         (invert,) = get_lapack_funcs(("trtri",))  # of triangles, three times as fast as inv
         for t in range(T - 1, -1, -1):
             L, ahead = kept[t, :N, :N], kept[t, N : N + n * N, :N]
-            inverse = np.tril(invert(L, lower=1)[0])
+            inverse, singular = invert(L, lower=1)
+            if singular:
+                raise np.linalg.LinAlgError("a frame of the window is not determined")
+            inverse = np.tril(inverse)
             W = ahead @ inverse
             across = -after @ W  # of those after it with this one
             own = inverse.T @ inverse - W.T @ across

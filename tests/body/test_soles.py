@@ -55,6 +55,16 @@ def test_a_foot_that_points_into_the_floor_is_bent_and_the_body_stays():
     assert abs(out[2][0, 6, 0]) < 0.1
 
 
+def test_who_is_in_it_without_feet_is_lifted():
+    """Upside down, the head 10 cm in the floor: feet are neither near it nor bent."""
+    bodies = standing(1)
+    bodies[1][:] = [np.pi, 0.0, 0.0]
+    bodies[3][:, 1] -= vertices(bodies)[..., 1].min() + 0.1
+    out = above_floor(MODEL, bodies, UP, 0.0)
+    assert -SINK_M - 0.01 < vertices(out)[..., 1].min() < SINK_M
+    np.testing.assert_allclose(out[2], bodies[2], atol=1e-9)
+
+
 def test_who_is_in_it_with_more_than_feet_is_lifted():
     bodies = standing(1)
     bodies[3][:, 1] -= 1.2
