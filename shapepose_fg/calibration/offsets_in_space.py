@@ -65,20 +65,16 @@ class InSpace:
         busy = sum(len(each.frame) for each in tracks) / max(high - low, 1)
         count = min(len(every), int(_MOST_PLACED / max(busy, 1.0)))
         times = every[(len(every) - count) // 2 :][:count]
-        none = np.zeros(0, np.intp)
-        time, view, track, xy = [none], [none], [none], [np.zeros((0, tracks[0].rays.shape[1], 2))]
+        parts, owners = list[Sightings](), list[Index]()
         for v, each in enumerate(tracks):
             now = times[:, None] + shift[v]
             row, which = np.nonzero((now >= each.frame[each.first]) & (now < each.lasts))
-            time.append(row)  # frames of sightings are 0 or more
-            view.append(np.full(len(row), v))
-            track.append(which)
-            xy.append(_pixels(each.at(which, times[row] + shift[v])[0], views, v))
-        xy, whose = np.concatenate(xy), np.concatenate(track)
-        seen = Sightings(
-            np.concatenate(time), np.concatenate(view), xy, np.isfinite(xy[..., 0]).astype(float)
-        )
-        enough = np.isfinite(xy[..., 0]).sum(axis=1) >= MIN_JOINTS
+            xy = _pixels(each.at(which, times[row] + shift[v])[0], views.K[v] @ views.cTw[v, :, :3])
+            there = np.isfinite(xy[..., 0]).astype(float)
+            parts.append(Sightings(row, np.full(len(row), v), xy, there))
+            owners.append(which)
+        seen, whose = Sightings.concatenate(parts), np.concatenate(owners)
+        enough = seen.confidence.sum(axis=1) >= MIN_JOINTS
         seen, whose = seen.rows(enough), whose[enough]
         groups = Pairs.of(seen, views).groups(len(seen), tuple(range(len(tracks))))
         member = np.where(groups.member >= 0, np.append(whose, -1)[groups.member], -1)
@@ -127,23 +123,13 @@ class InSpace:
         """Directions and their speeds (P, J, V, 3), pixels (P, J, V, 2), and sizes (P, V) in
         rad.
         """
-        parts = []
-        for view, each in enumerate(self.tracks):
-            rays, speed, size = each.at(
-                np.maximum(self.member[:, view], 0), self.time + shift[view]
-            )
-            there = self.member[:, view] >= 0
-            rays = np.where(there[:, None, None], rays, np.nan)
-            parts.append(
-                (rays, speed, _pixels(rays, self.views, view), np.where(there, size, np.nan))
-            )
-        rays, speed, xy, size = zip(*parts, strict=True)
-        return (
-            np.stack(rays, axis=2),
-            np.stack(speed, axis=2),
-            np.stack(xy, axis=2),
-            np.stack(size, axis=1),
-        )
+        members = enumerate(zip(self.tracks, np.maximum(self.member, 0).T, strict=True))
+        found = [each.at(track, self.time + shift[view]) for view, (each, track) in members]
+        rays, speed = (np.stack([each[n] for each in found], axis=2) for n in (0, 1))
+        there = self.member >= 0
+        rays = np.where(there[:, None, :, None], rays, np.nan)
+        size = np.where(there, np.stack([each[2] for each in found], axis=1), np.nan)
+        return rays, speed, _pixels(rays, self.views.K @ self.views.cTw[:, :, :3]), size
 
     def _moving(self, points: Array, speed: Array) -> Array:
         """(P, J, 3) velocities of joints at `points`, metres per frame, from changes of directions
@@ -226,7 +212,7 @@ def _across(points: Array, moving: Array, centre: Array) -> Array:
     return (moving - (moving * away).sum(axis=-1, keepdims=True) * away / far**2) / far
 
 
-def _pixels(rays: Array, views: Views, view: int) -> Array:
-    """(N, J, 2) pixels of directions in the world (N, J, 3)."""
-    at = rays @ (views.K[view] @ views.cTw[view, :, :3]).T
+def _pixels(rays: Array, camera: Array) -> Array:
+    """(..., 2) pixels of directions in the world (..., 3), in cameras K R (..., 3, 3)."""
+    at = (camera @ rays[..., None])[..., 0]
     return np.asarray(at[..., :2] / at[..., 2:])

@@ -158,9 +158,7 @@ def offsets(
         progress(number + 1, len(pairs))
     coarse, sure = chosen(curves, lags, len(rig), round(_AROUND_S * fps))
     fine = Pairwise(tracks, views, coarse.astype(float), fps)
-    shift, covariance = fine.solved()
-    if len(rig) > 2:
-        shift, covariance = InSpace.of(replace(fine, shift=shift)).settled()
+    shift, covariance = InSpace.of(fine).settled() if len(rig) > 2 else fine.solved()
     offset = -(shift + start)
     offset = offset - offset[0]
     return offset / fps, _WIDER * np.sqrt(np.diag(covariance)) / fps, sure
