@@ -10,7 +10,7 @@ from shapepose_fg.calibration.adjustment import Adjusted
 from shapepose_fg.calibration.people import People
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Rig
-from shapepose_fg.core.decompositions import nearest_rotation
+from shapepose_fg.core.decompositions import nearest_rotation, rotation_angle
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.floor import Floor, find_floor
@@ -136,14 +136,14 @@ def grown(adjusted: Adjusted, factor: float) -> Adjusted:
 
 def apart(one: Rig, other: Rig) -> tuple[Array, Array]:
     """(V,) degrees and metres between the cameras of two rigs, after alignment by a similarity."""
-    near, far = (np.stack([camera.wTc[:3, :3] for camera in each.cameras]) for each in (one, other))
+    near, far = (each.wTc[:, :3, :3] for each in (one, other))
     a, b = (each.centres - each.centres.mean(axis=0) for each in (one, other))
     size = max(float(np.linalg.norm(a) * np.linalg.norm(b)) / len(one), 1e-9)
     R = nearest_rotation(b.T @ a / size + np.einsum("vij,vkj->ik", far, near))
     grown = float(np.linalg.norm(b) / max(np.linalg.norm(a), 1e-9))
-    turned = np.einsum("ij,vjk,vik->v", R, near, far)  # the traces of far' R near
-    turns = np.degrees(np.arccos(np.clip((turned - 1) / 2, -1.0, 1.0)))
-    return turns, np.linalg.norm(grown * a @ R.T - b, axis=1)
+    return np.degrees(rotation_angle(R @ near @ far.mT)), np.linalg.norm(
+        grown * a @ R.T - b, axis=1
+    )
 
 
 def at_once(people: People) -> int:

@@ -3,7 +3,7 @@ validation.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -14,7 +14,8 @@ from shapepose_fg.calibration.adjustment import LENS, Adjusted, Freedom, adjust,
 from shapepose_fg.calibration.levelling import apart, grown, scaled
 from shapepose_fg.calibration.people import LEAST_PEOPLE, Footage, People, missed_px
 from shapepose_fg.core.arrays import Array, Index
-from shapepose_fg.core.camera import Camera, Rig, Views
+from shapepose_fg.core.camera import Rig, Views
+from shapepose_fg.core.decompositions import rigid
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import FrameTimes
@@ -115,17 +116,11 @@ class Refinement:
         """(V,) change of each camera: rotation in degrees, translation in mm, focal length in %,
         principal point in pixels.
         """
-        turn, move, focal, centre = [], [], [], []
-        for old, new in zip(self.given.cameras, self.adjusted.rig.cameras, strict=True):
-            angle, way = difference(old.cTw, new.cTw)
-            turn.append(angle)
-            move.append(1e3 * way)
-            focal.append(100 * (new.K[0, 0] / old.K[0, 0] - 1))
-            centre.append(np.hypot(*(new.K[:2, 2] - old.K[:2, 2])))
-        return {
-            name: np.array(each)
-            for name, each in zip(_UNITS, (turn, move, focal, centre), strict=True)
-        }
+        old, new = self.given, self.adjusted.rig
+        turn, move = difference(old.cTw, new.cTw)
+        focal = new.K[:, 0, 0] / old.K[:, 0, 0] - 1
+        centre = np.linalg.norm(new.K[:, :2, 2] - old.K[:, :2, 2], axis=1)
+        return {"turn": turn, "move": 1e3 * move, "focal": 100 * focal, "centre": centre}
 
     def sigma(self) -> dict[str, Array]:
         """(V,) standard deviations of what `change` gives, in the same units."""
@@ -202,7 +197,7 @@ def refine(
     stature = build_of(found.people.points, detections.skeleton).stature
     notes = tuple(_undetermined(found, freedom, counts))
     sure = 1.0
-    if all(new is old for new, old in zip(start.cameras, rig.cameras, strict=True)):
+    if np.array_equal(start.wTc, rig.wTc):
         sure = Problem.of(given).off(freedom.sigmas[:Q], reference)
     return Refinement(rig, found, freedom, was, now, counts, notes, missed, stature, sure)
 
@@ -211,23 +206,14 @@ def _found_again(findings: list[Finding], found: Views, rig: Rig) -> Rig:
     """The rig; cameras misaligned by degrees are rotated to fit the people seen by the others."""
     kinds = (Kind.TURNED, Kind.MOVED, Kind.PRINCIPAL_POINT)
     turned = {view for each in findings if each.kind in kinds for view in each.cameras}
-    cameras = list(rig.cameras)
+    wTc = rig.wTc
     for view in turned:
-        camera = rig.cameras[view]
-        right, down = (found.K[view] - camera.K)[:2, 2] / camera.K[0, 0]  # similar to a rotation
+        K = rig.K[view]
+        right, down = (found.K[view] - K)[:2, 2] / K[0, 0]  # similar to a rotation
         cTw = exp_so3(np.array([-down, right, 0.0])) @ found.cTw[view]
-        if difference(cTw, camera.cTw)[0] > _BUMPED_DEG:
-            new = (
-                camera.name,
-                camera.K,
-                cTw,
-                camera.image_size,
-                camera.distortion.tolist(),
-                camera.lens,
-            )
-            wTc = Camera.from_camera_from_world(*new).wTc
-            cameras[view] = replace(camera, wTc=wTc)
-    return replace(rig, cameras=tuple(cameras))
+        if difference(cTw, rig.cTw[view])[0] > _BUMPED_DEG:
+            wTc[view] = rigid(cTw[:, :3].T, -cTw[:, :3].T @ cTw[:, 3])
+    return rig.at_poses(wTc)
 
 
 def settle(

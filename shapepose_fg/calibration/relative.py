@@ -15,7 +15,6 @@ from scipy.optimize import least_squares
 from shapepose_fg.body.model.rotation import exp_so3, hat
 from shapepose_fg.calibration.tracks import Tracks
 from shapepose_fg.core.arrays import Array, Index, Mask
-from shapepose_fg.core.compiled import kernel
 from shapepose_fg.core.decompositions import basis_across
 from shapepose_fg.setup_check.evidence import KERNEL
 from shapepose_fg.setup_check.matching import GATE, MIN_JOINTS, depths_of_meeting
@@ -71,7 +70,7 @@ class Together:
         self.possible = int(
             np.minimum((rows[0] >= 0).sum(axis=0), (rows[1] >= 0).sum(axis=0)).sum()
         )
-        self.rays = (np.ascontiguousarray(one.rays), np.ascontiguousarray(other.rays))
+        self.rays = (one.rays, other.rays)
         self.size = (one.size, other.size)
         self.alike = _at_once(rows[0]), _at_once(rows[1])
 
@@ -79,10 +78,24 @@ class Together:
         """(H, K) residuals of pairs of tracks under essential matrices (H, 3, 3), as shares of
         people's size.
         """
-        total, count = (np.zeros((len(E), len(self.tracks))) for _ in range(2))
-        _misses(*self.rays, *self.size, self.rows, self.pair, np.ascontiguousarray(E), total, count)
-        enough = count >= 0.5 * self.count
-        return np.where(enough & (count > 0), total / np.maximum(count, 1), GATE)
+        one, other = self.rows.T
+        a, b = self.rays[0][one], self.rays[1][other]
+        known = np.isfinite(a[..., 0]) & np.isfinite(b[..., 0])
+        (row, _), seen = np.nonzero(known), known.sum(axis=1)
+        a, size_a, b, size_b = a[known], self.size[0][one[row]], b[known], self.size[1][other[row]]
+        share = np.where(seen >= MIN_JOINTS, 1 / np.maximum(seen, 1), 0.0)
+        count = np.bincount(self.pair, share > 0, len(self.tracks))
+        enough = (count >= 0.5 * self.count) & (count > 0)
+        found = np.full((len(E), len(self.tracks)), GATE)
+        for n, each in enumerate(E):
+            plane, back = a @ each.T, b @ each
+            scale = np.minimum(
+                np.linalg.norm(plane, axis=1) * size_b, np.linalg.norm(back, axis=1) * size_a
+            )
+            away = np.minimum(np.abs((plane * b).sum(axis=1)) / (scale + 1e-12), GATE)
+            total = np.bincount(self.pair[row], share[row] * away, len(self.tracks))
+            found[n, enough] = total[enough] / count[enough]
+        return found
 
     def chosen(self, miss: Array) -> tuple[Mask, float]:
         """Which pairs of tracks (K,) are one person each, greedily by residual, and their total
@@ -244,46 +257,3 @@ def _at_once(rows: Index) -> Mask:
     """(K, K) whether tracks overlap in time, and so are different people."""
     there = (rows >= 0).astype(np.float64)
     return np.asarray(there @ there.T > 0)
-
-
-@kernel("f3 f3 f1 f1 i2 i1 f3 f2 f2")
-def _misses(
-    a: Array,
-    b: Array,
-    size_a: Array,
-    size_b: Array,
-    rows: Index,
-    pair: Index,
-    E: Array,
-    total: Array,
-    count: Array,
-) -> None:
-    """Add to `total` (H, K) the mean residuals of joints over pairs of rows (N, 2), and to `count`
-    their number.
-    """
-    plane, back = np.empty(3), np.empty(3)
-    for h in range(len(E)):
-        for n in range(len(rows)):
-            one, other = rows[n, 0], rows[n, 1]
-            miss, seen = 0.0, 0
-            for j in range(a.shape[1]):
-                if a[one, j, 0] != a[one, j, 0] or b[other, j, 0] != b[other, j, 0]:  # NaN
-                    continue
-                square, other_square, dot = 0.0, 0.0, 0.0
-                for i in range(3):
-                    plane[i], back[i] = 0.0, 0.0
-                    for k in range(3):
-                        plane[i] += E[h, i, k] * a[one, j, k]
-                        back[i] += E[h, k, i] * b[other, j, k]
-                    square += plane[i] ** 2
-                    other_square += back[i] ** 2
-                    dot += plane[i] * b[other, j, i]
-                away = max(
-                    abs(dot) / (np.sqrt(square) * size_b[other] + 1e-12),
-                    abs(dot) / (np.sqrt(other_square) * size_a[one] + 1e-12),
-                )
-                miss += min(away, GATE)
-                seen += 1
-            if seen >= MIN_JOINTS:
-                total[h, pair[n]] += miss / seen
-                count[h, pair[n]] += 1

@@ -21,6 +21,11 @@ def is_rotation(R: Array) -> bool:
     )
 
 
+def rotation_angle(R: Array) -> Array:
+    """(...) angles of rotations (..., 3, 3), rad, to 1e-8."""
+    return np.arccos(np.clip((np.trace(R, axis1=-2, axis2=-1) - 1) / 2, -1.0, 1.0))
+
+
 def rigid(R: Array, t: Array) -> Array:
     """(..., 4, 4) rigid transformations with rotations R (..., 3, 3) and translations t (...,
     3).

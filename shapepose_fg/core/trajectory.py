@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index, Mask
-from shapepose_fg.core.decompositions import is_rotation, rigid
+from shapepose_fg.core.decompositions import is_rotation, rigid, rotation_angle
 
 DRIFT = 0.01
 """Default drift of an odometry, per metre: wheel and visual odometry drift by about 1 % of the
@@ -146,10 +146,9 @@ class Trajectory:
         `time_s` (T,).
         """
         steps = np.linalg.inv(poses[:-1]) @ poses[1:]
-        cosine = np.clip((np.trace(steps[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1.0, 1.0)
         way = (
             np.linalg.norm(steps[:, :3, 3], axis=1)
-            + _M_A_RAD * np.arccos(cosine)
+            + _M_A_RAD * rotation_angle(steps[:, :3, :3])
             + _M_A_S * np.diff(time_s)
         )
         # Error of rotation, rad, per metre of translational error of an odometry; both

@@ -15,6 +15,7 @@ import numpy as np
 from factors import gaussian
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Rig
+from shapepose_fg.core.decompositions import rotation_angle
 from shapepose_fg.core.errors import naming
 from shapepose_fg.core.frame_times import segments
 from shapepose_fg.core.observations import Observations
@@ -107,7 +108,7 @@ def about(given: Rig, refined: Rig) -> list[dict[str, Any]]:
         ]
         was, covariance = old.at(new.time_s), new.covariance_at(new.time_s)
         moved = np.linalg.norm(new.wTb[:, :3, 3] - was[:, :3, 3], axis=1)
-        cosine = (np.trace(new.wTb[:, :3, :3] @ was[:, :3, :3].mT, axis1=1, axis2=2) - 1) / 2
+        turned = rotation_angle(new.wTb[:, :3, :3] @ was[:, :3, :3].mT)
         variance = np.einsum("tii->ti", covariance)
         told.append(
             {
@@ -118,7 +119,7 @@ def about(given: Rig, refined: Rig) -> list[dict[str, Any]]:
                     float(np.linalg.norm(np.diff(new.wTb[:, :3, 3], axis=0), axis=1).sum()), 3
                 ),
                 "moved_mm": round(1e3 * float(moved.max()), 1),
-                "turned_deg": round(float(np.degrees(np.arccos(np.clip(cosine, -1, 1)).max())), 3),
+                "turned_deg": round(float(np.degrees(turned.max())), 3),
                 "sigma_mm": round(1e3 * float(np.sqrt(np.median(variance[:, 3:].mean(axis=1)))), 1),
                 "sigma_deg": round(
                     float(np.degrees(np.sqrt(np.median(variance[:, :3].mean(axis=1))))), 3

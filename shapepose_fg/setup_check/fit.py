@@ -9,7 +9,7 @@ import numpy as np
 from shapepose_fg.body.model.rotation import exp_so3
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Views
-from shapepose_fg.core.decompositions import nearest_rotation
+from shapepose_fg.core.decompositions import nearest_rotation, rotation_angle
 from shapepose_fg.core.rows import Rows
 from shapepose_fg.setup_check.matching import (
     GATE,
@@ -259,9 +259,7 @@ def _solved(
     given = Views(camera.K[None], camera.cTw[None])
 
     def moved(x: Array) -> Views:
-        change = np.zeros((1, Q))
-        change[0, columns] = x
-        return changed(given, change)
+        return changed_one(given, 0, columns, x)
 
     def residuals(x: Array) -> Array:
         at, place, _ = seen_by(points, moved(x))
@@ -314,13 +312,18 @@ def placing(A: Array) -> Array:
     return np.linalg.solve(H, A.mT)
 
 
-def difference(cTw: Array, other: Array) -> tuple[float, float]:
-    """Rotation in degrees and distance of centres between two poses (3, 4)."""
-    cosine = (np.trace(cTw[:, :3] @ other[:, :3].T) - 1) / 2
-    centres = [-each[:, :3].T @ each[:, 3] for each in (cTw, other)]
-    return float(np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))), float(
-        np.linalg.norm(centres[0] - centres[1])
-    )
+def difference(cTw: Array, other: Array) -> tuple[Array, Array]:
+    """Rotations (...) in degrees and distances (...) of centres between poses (..., 3, 4)."""
+    centres = [(-each[..., :3].mT @ each[..., 3:])[..., 0] for each in (cTw, other)]
+    turns = rotation_angle(cTw[..., :3] @ other[..., :3].mT)
+    return np.rad2deg(turns), np.linalg.norm(centres[0] - centres[1], axis=-1)
+
+
+def changed_one(views: Views, view: int, columns: list[int], change: Array) -> Views:
+    """The cameras with `change` (n,) applied to some parameters of one of them."""
+    every = np.zeros((len(views), Q))
+    every[view, columns] = change
+    return changed(views, every)
 
 
 def changed(views: Views, change: Array) -> Views:

@@ -17,7 +17,17 @@ from shapepose_fg.core.camera import Views
 from shapepose_fg.setup_check.biases import Marginal, Residuals
 from shapepose_fg.setup_check.evidence import Look, observed
 from shapepose_fg.setup_check.findings import Finding, Kind
-from shapepose_fg.setup_check.fit import CENTRE, FOCAL, MOVE, POSE, TURN, Q, changed, difference
+from shapepose_fg.setup_check.fit import (
+    CENTRE,
+    FOCAL,
+    MOVE,
+    POSE,
+    TURN,
+    Q,
+    changed,
+    changed_one,
+    difference,
+)
 from shapepose_fg.setup_check.matching import followed
 
 ONE = {
@@ -167,7 +177,7 @@ class Problem:
             for _ in range(1 if starts[kind] is self.given else 2):
                 before = _between(self.given, views, view)[which]
                 likely, change = self._likelihood(directions, sigma, views, before)
-                views = _moved(views, view, which, change)
+                views = changed_one(views, view, which, change)
             likely += self._rare(kind) - float(np.log(len(ONE[kind])))
             found.append(Cause(named(kind, view, self.given, views), likely, views))
         return found
@@ -282,12 +292,6 @@ def _between(given: Views, views: Views, view: int) -> Array:
     return np.array([*turn, *move, *centre, np.log(views.K[view, 0, 0] / given.K[view, 0, 0])])
 
 
-def _moved(views: Views, view: int, which: list[int], change: Array) -> Views:
-    every = np.zeros((len(views), Q))
-    every[view, which] = change
-    return changed(views, every)
-
-
 def named(kind: Kind, view: int, given: Views, views: Views) -> Finding:
     """The finding for a change of a single camera: the calibration's value relative to the fitted
     one.
@@ -300,4 +304,5 @@ def named(kind: Kind, view: int, given: Views, views: Views) -> Finding:
         return Finding(kind, (view,), degrees, ((x, y),))
     turn, moved = difference(given.cTw[view], views.cTw[view])
     # Rotation, degrees, above which a translated and rotated camera is called rotated.
-    return Finding(Kind.TURNED if turn > 1.0 else kind, (view,), turn, moved=moved)
+    kind = Kind.TURNED if turn > 1.0 else kind
+    return Finding(kind, (view,), float(turn), moved=float(moved))
