@@ -369,16 +369,14 @@ class Look:
         views = np.unique(self.sightings.view).tolist()
         if len(views) < 2:
             return 0.0
-        _, error, possible = self.pair(*views)
-        return float((1 - error / GATE).sum() / max(possible, 1))
+        groups, possible = self.pair(*views)
+        return float((1 - groups.error / GATE).sum() / max(possible, 1))
 
-    def pair(self, first: int, second: int) -> tuple[Groups, Array, int]:
-        """P people seen by two cameras, distances of their rays (P,), and the number of possible
-        matches.
-        """
+    def pair(self, first: int, second: int) -> tuple[Groups, int]:
+        """People seen by two cameras, and the number of possible matches."""
         groups = self.pairs.groups(len(self.sightings), (first, second))
         possible = possible_matches(self.seen_by(first).frame, self.seen_by(second).frame)
-        return groups, self.pairs.errors_of(groups, first, second), possible
+        return groups, possible
 
     @cached_property
     def total(self) -> float:

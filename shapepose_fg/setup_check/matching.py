@@ -135,6 +135,9 @@ class Groups(Rows):
     """(P,) frame of each person."""
     member: Index
     """(P, V) row of the sighting by each camera, -1 for none."""
+    error: Array
+    """(P,) median distance of the rays of the two cameras by which each was found, as a share of
+    the size."""
 
 
 @dataclass(frozen=True)
@@ -191,7 +194,7 @@ class Pairs:
         V = len(allowed)
         live = np.flatnonzero(allowed[self.views].all(axis=1))
         members, thirds = self.members, self.third
-        frames, rows = [], []
+        found = [Groups(np.zeros(0, np.intp), np.zeros((0, V), np.intp), np.zeros(0))]
         while len(live := live[free[members[live]].all(axis=1)]) > 0:
             supported = (
                 free[thirds[live]] & (thirds[live] >= 0) & allowed & (self.third_error[live] < GATE)
@@ -203,22 +206,8 @@ class Pairs:
             chosen = live[best]
             member[np.arange(len(best))[:, None], self.views[chosen]] = members[chosen]
             free[member[member >= 0]] = False
-            frames.append(self.frame[chosen])
-            rows.append(member)
-        if len(rows) == 0:
-            return Groups(np.zeros(0, np.intp), np.zeros((0, V), np.intp))
-        return Groups(np.concatenate(frames), np.concatenate(rows))
-
-    def errors_of(self, groups: Groups, first: int, second: int) -> Array:
-        """(P,) distances between the rays of two cameras, for people associated by
-        these two only.
-        """
-        of_pair = (self.views == (first, second)).all(axis=1)
-        members = self.members[of_pair].tolist()
-        error = {
-            (a, b): miss for (a, b), miss in zip(members, self.error[of_pair].tolist(), strict=True)
-        }
-        return np.array([error[a, b] for a, b in groups.member[:, [first, second]].tolist()])
+            found.append(Groups(self.frame[chosen], member, self.error[chosen]))
+        return Groups.concatenate(found)
 
 
 def rays_of(sightings: Sightings, views: Views) -> Array:

@@ -93,9 +93,9 @@ def parted(look: Look) -> tuple[int | None, int | None] | None:
     views = np.unique(look.sightings.view).tolist()
     if len(views) != 2:
         return None
-    groups, error, _ = look.pair(*views)
+    groups, _ = look.pair(*views)
     one, other = (look.seen_by(view).frame for view in views)
-    found = parting(one, other, groups.frame, error)
+    found = parting(one, other, groups.frame, groups.error)
     if found is None or found.drop < _PARTED or min(found.before, found.after) > _POOR:
         return None
     return found.frames

@@ -215,11 +215,13 @@ def _camera_figures(diagnosis: Diagnosis, rig: Rig) -> tuple[CameraFigures, ...]
 
 def _pair_figures(look: Look, rig: Rig, first: int, second: int) -> PairFigures:
     names = rig.names[first], rig.names[second]
-    groups, error, possible = look.pair(first, second)
+    groups, possible = look.pair(first, second)
     if possible == 0:
         return PairFigures(*names, None, None)
-    miss = error * look.sightings.size_px[groups.member[:, first]]
-    return PairFigures(*names, float((error < GATE / 2).sum() / possible), quantile(miss, 0.5))
+    miss = groups.error * look.sightings.size_px[groups.member[:, first]]
+    return PairFigures(
+        *names, float((groups.error < GATE / 2).sum() / possible), quantile(miss, 0.5)
+    )
 
 
 def quantile(values: Array, part: float) -> float | None:
