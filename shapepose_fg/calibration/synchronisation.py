@@ -1,8 +1,7 @@
 """Time offsets of any size between cameras with known poses, with subframe accuracy, from people.
 
 First all offsets between two cameras are scanned (`offset_scan`); then tracks are associated, and
-offsets between pairs of cameras refined (`pairwise`); then each camera is compared with people
-triangulated by the others (`offsets_in_space`).
+offsets refined to parts of a frame (`subframe_offsets`).
 """
 
 from collections.abc import Callable
@@ -12,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from shapepose_fg.calibration.offsets_in_space import InSpace
-from shapepose_fg.calibration.pairwise import Pairwise
+from shapepose_fg.calibration.subframe_offsets import InSpace, Pairwise
 from shapepose_fg.calibration.tracks import Tracks, at_regular_times
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig, Views
@@ -46,7 +44,7 @@ maximum drift searched for there, s."""
 @dataclass(frozen=True)
 class Synchronised:
     """Time offsets of cameras: frame f of camera v, at t = f / fps on its own clock, was exposed at
-    `at(t)`.
+    `of_views(t)`.
     """
 
     offset_s: Array
@@ -60,10 +58,6 @@ class Synchronised:
     minutes."""
     middle_s: float
     """Time for which the offset is stated, on the camera's own clock, s."""
-
-    def at(self, time_s: Array | float) -> Array:
-        """(..., V) times on the common clock for times (...,) on each camera's own clock."""
-        return self.of_views(np.asarray(time_s)[..., None])
 
     def of_views(self, time_s: Array) -> Array:
         """(..., V) times on the common clock for times (..., V) on the cameras' own clocks."""

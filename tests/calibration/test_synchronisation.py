@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from shapepose_fg.calibration import synchronisation
-from shapepose_fg.calibration.offsets_in_space import InSpace
-from shapepose_fg.calibration.pairwise import Pairwise
+from shapepose_fg.calibration.subframe_offsets import InSpace, Pairwise
 from shapepose_fg.calibration.synchronisation import synchronise
 from shapepose_fg.calibration.tracks import Tracks, at_regular_times
 from shapepose_fg.cli.main import main
@@ -46,7 +45,7 @@ def test_clocks_that_run_apart(rig, two_people, monkeypatch):
     found = synchronise(seen, rig, FPS, range(300), 2.0)
     assert np.abs(found.drift - drift).max() < 0.001
     # Frame 250 of the third camera was exposed after 10 s of a clock that is 3 in 1,000 slow.
-    assert found.at(10.0)[2] == pytest.approx(10.03 - 0.3, abs=0.008)
+    assert found.of_views(np.full(4, 10.0))[2] == pytest.approx(10.03 - 0.3, abs=0.008)
 
 
 def test_frames_of_any_rate_are_interpolated_to_regular_times():
