@@ -62,10 +62,11 @@ class Pairwise:
         same person.
         """
         one, pairs = self.tracks[0], self.same(0, 1)
+        begin = one.first[pairs[:, 0]]
         stop = np.append(one.first[1:], len(one.frame))[pairs[:, 0]]
-        rows = [np.arange(*each) for each in zip(one.first[pairs[:, 0]], stop, strict=True)]
+        rows = [np.arange(*each) for each in zip(begin, stop, strict=True)]
         every = np.concatenate([np.zeros(0, np.intp), *rows])
-        tracks = np.repeat(pairs[:, 1], [len(each) for each in rows])
+        tracks = np.repeat(pairs[:, 1], stop - begin)
         thin = max(1, -(-len(every) // _MOST_SAMPLES))
         return every[::thin], tracks[::thin]
 
