@@ -15,7 +15,7 @@ from typing import Any, TypeVar, cast
 
 import cloudpickle
 
-from shapepose_fg.core.errors import InputError, WorkLost
+from shapepose_fg.core.errors import InputError, WorkLost, naming, optional
 from shapepose_fg.core.provenance import program_digest, versions
 from shapepose_fg.pipeline.workers import Pool, Processes, naming_lost_work, packed
 
@@ -161,15 +161,10 @@ def _client(address: str) -> Iterator[Any]:
     Client = _dask()
     import dask.config
 
-    try:
+    words, cure = "no Dask scheduler answers there ({})", "start one with `dask scheduler`"
+    with naming(f"--cluster {address}", f"{cure}, or leave it out", words, OSError, ValueError):
         # Time limit for an answer of a cluster, s.
         client = Client(address, timeout=10)
-    except (OSError, ValueError, TimeoutError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(
-            f"--cluster {address}: no Dask scheduler answers there ({reason}); start one with"
-            " `dask scheduler`, or leave it out"
-        ) from None
     with client, dask.config.set({"distributed.admin.large-graph-warning-threshold": "1GiB"}):
         yield client
 
@@ -206,13 +201,7 @@ def this_program() -> dict[str, str]:
 
 def _dask() -> Any:
     """Dask's client class; raises InputError if it is not installed."""
-    try:
-        from distributed import Client
-    except ImportError:
-        raise InputError(
-            'Dask is not installed; pip install "shapepose-fg[cluster]", or leave out --cluster'
-        ) from None
-    return Client
+    return optional("distributed", "cluster").Client
 
 
 def one_item(
