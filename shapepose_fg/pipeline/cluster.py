@@ -17,7 +17,7 @@ import cloudpickle
 
 from shapepose_fg.core.errors import InputError, WorkLost, naming, optional
 from shapepose_fg.core.provenance import program_digest, versions
-from shapepose_fg.pipeline.workers import Pool, Processes, naming_lost_work, packed
+from shapepose_fg.pipeline.workers import Pool, Processes, naming_lost_work, nothing, packed
 
 Shared = TypeVar("Shared")
 
@@ -93,10 +93,10 @@ def local_cluster(count: int, *, dashboard: bool = False) -> Iterator[Scheduler]
     Raises InputError if Dask is not installed. With `dashboard`, and bokeh installed, the scheduler
     has one.
     """
-    _dask()
+    optional("distributed", "cluster")
     # Dask's processes import `__main__`, which fails for some notebooks and scripts: an own process
     # leads them.
-    with Processes(1, _nothing) as one, naming_lost_work():
+    with Processes(1, nothing) as one, naming_lost_work():
         yield one.submit(_local_cluster, count, dashboard and has_dashboard()).result()
         one.submit(_end_local_cluster).result()
 
@@ -136,10 +136,6 @@ def _end_local_cluster() -> None:
     _running.pop().close()
 
 
-def _nothing() -> None:
-    """No-op initialiser for the process that leads a cluster."""
-
-
 def has_dashboard() -> bool:
     """Whether a scheduler of this machine can have a dashboard."""
     return find_spec("bokeh") is not None
@@ -158,7 +154,7 @@ def look_at(address: str) -> Scheduler:
 @contextmanager
 def _client(address: str) -> Iterator[Any]:
     """A connection to the scheduler at an address, configured for large tasks."""
-    Client = _dask()
+    Client = optional("distributed", "cluster").Client
     import dask.config
 
     words, cure = "no Dask scheduler answers there ({})", "start one with `dask scheduler`"
@@ -197,11 +193,6 @@ def _refuse_other(process: str, own: dict[str, str], theirs: dict[str, str]) -> 
 def this_program() -> dict[str, str]:
     """Versions of everything that affects the results of this process."""
     return {**versions(), _ITSELF: program_digest()}
-
-
-def _dask() -> Any:
-    """Dask's client class; raises InputError if it is not installed."""
-    return optional("distributed", "cluster").Client
 
 
 def one_item(
