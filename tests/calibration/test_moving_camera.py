@@ -88,7 +88,7 @@ def test_it_is_refused_if_it_is_less_sure_than_asked_or_the_fixed_cameras_are(wa
     assert "are asked (--tolerance); give the lenses" in said
     assert start.refusal("phone", *(1.1 * bounds)) is None
     shifted = replace(walk, spread=np.full((*walk.points.shape, 1), 0.05))
-    other = filmed.started(shifted, MOST_S, Freedom())
+    other = filmed._refined(start, shifted, MOST_S, Freedom(), 0.0)
     assert other.sigma_move_m == pytest.approx(np.hypot(start.sigma_move_m, 0.0866), rel=0.1)
 
 
