@@ -213,9 +213,12 @@ def refined_pose(R: Array, t: Array, a: Array, b: Array, size: Array) -> tuple[A
     (N,) rad.
     """
     known = np.isfinite(a[..., 0]) & np.isfinite(b[..., 0])
-    # Three rows: NumPy adds up rows of three numbers ten times as slowly.
-    a, b = (np.ascontiguousarray(each[known].T) for each in (a, b))
-    size = np.broadcast_to(size[:, None], known.shape)[known]
+    # In three rows: sums over a last axis of three numbers are slow.
+    size, a, b = (
+        np.broadcast_to(size[:, None], known.shape)[known],
+        a[known].T.copy(),
+        b[known].T.copy(),
+    )
     across = basis_across(t)
 
     def moved(x: Array) -> tuple[Array, Array]:
