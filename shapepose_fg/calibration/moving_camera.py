@@ -526,7 +526,8 @@ class _Fit:
         """
         poses = self.filmed._placed(self.moved(x))
         slopes = np.zeros((len(poses), 6, len(x)))
-        for n in range(len(self.sigmas) + self._steps.size):
+        # The lens and the offset move no pose.
+        for n in np.flatnonzero([*self.sigmas[:7], *np.zeros(5), *self._steps.flat]):
             other = self.filmed._placed(self.moved(x + _TINY * (np.arange(len(x)) == n)))
             turn = poses[:, :3, :3].mT @ other[:, :3, :3]
             slopes[:, :3, n] = (turn - turn.mT)[:, [2, 0, 1], [1, 2, 0]] / 2 / _TINY

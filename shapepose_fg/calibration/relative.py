@@ -226,7 +226,12 @@ def refined_pose(R: Array, t: Array, a: Array, b: Array, size: Array) -> tuple[A
     (N,) rad.
     """
     known = np.isfinite(a[..., 0]) & np.isfinite(b[..., 0])
-    size, a, b = np.broadcast_to(size[:, None], known.shape)[known], a[known], b[known]
+    # In three rows: sums over a last axis of three numbers are slow.
+    size, a, b = (
+        np.broadcast_to(size[:, None], known.shape)[known],
+        a[known].T.copy(),
+        b[known].T.copy(),
+    )
     across = basis_across(t)
 
     def moved(x: Array) -> tuple[Array, Array]:
@@ -237,9 +242,9 @@ def refined_pose(R: Array, t: Array, a: Array, b: Array, size: Array) -> tuple[A
         """Sampson's distances, of an angle on both sides, as shares of people's size."""
         turn, way = moved(x)
         E = hat(way) @ turn
-        Ea, Eb = a @ E.T, b @ E
-        scale = size * np.sqrt((Ea**2).sum(axis=1) + (Eb**2).sum(axis=1))
-        return (b * Ea).sum(axis=1) / scale
+        Ea, Eb = E @ a, E.T @ b
+        scale = size * np.sqrt((Ea**2).sum(axis=0) + (Eb**2).sum(axis=0))
+        return (b * Ea).sum(axis=0) / scale
 
     usual = max(KERNEL / 2, float(np.median(np.abs(residuals(np.zeros(5))))))
     found = least_squares(residuals, np.zeros(5), loss="cauchy", f_scale=usual, max_nfev=_STEPS)

@@ -23,16 +23,17 @@ from shapepose_fg.cli.options import (
     RESULT,
     TIME,
     RateOptions,
+    SeenOptions,
     Stature,
+    chosen_cameras,
     grouped,
     json_option,
-    names_of,
     next_reconstruct,
     option,
     picture_size,
 )
 from shapepose_fg.cli.terminal import note, progress, show, show_json, table
-from shapepose_fg.core.errors import InputError, naming
+from shapepose_fg.core.errors import InputError
 
 if TYPE_CHECKING:
     from shapepose_fg.calibration.adjustment import Freedom
@@ -51,15 +52,9 @@ of published lenses (docs/evaluation/cameras.md)."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class LensOptions:
+class LensOptions(SeenOptions):
     """Options: 2D detections, and the lenses of the cameras."""
 
-    detections: Path = option(INPUT, "Folder with the 2D detections of all cameras.", REQUIRED)
-    skeleton: str | None = option(
-        INPUT,
-        "Keypoint layout of the detector: a name such as COCO_17, or a TOML file.",
-        metavar="NAME",
-    )
     calibration: Path | None = option(
         INPUT, "Calibration with the intrinsics; poses in it are ignored."
     )
@@ -77,7 +72,6 @@ class LensOptions:
         """The cameras without poses, and the names of those whose lenses are guessed; InputError if
         lenses are unknown. `trajectories` are CAMERA=FILE: a log with intrinsics gives the lens.
         """
-        from shapepose_fg.core.camera import choose
         from shapepose_fg.io.calibration import read_rig
         from shapepose_fg.io.footage.places import per_camera
         from shapepose_fg.io.lenses import is_log, lenses_of
@@ -101,8 +95,7 @@ class LensOptions:
             given = per_camera("--field-of-view", fields, rig.names, one_for_all=True)
             guessed = {n for n, each in zip(rig.names, given, strict=True) if not is_log(each)}
         note(*rig.notes)
-        with naming("--cameras, --without"):
-            rig = rig.only(choose(rig.names, names_of(self.cameras), names_of(self.without) or ()))
+        rig = rig.only(chosen_cameras(rig.names, self.cameras, self.without))
         if len(rig) < 2:
             raise InputError(f"{self.detections}: at least 2 cameras are needed, got {len(rig)}")
         return rig, guessed

@@ -17,6 +17,7 @@ from shapepose_fg.cli.options import (
     RUN,
     TIME,
     CameraOptions,
+    chosen_cameras,
     frame_range,
     frames_option,
     grouped,
@@ -148,7 +149,11 @@ def detect(
 
     known = cameras.rig() if cameras.calibration is not None else None
     loaded = network.load()
-    opened = pictures.opened(cameras.chosen(pictures.names()) if known is None else known.names)
+    opened = pictures.opened(
+        chosen_cameras(pictures.names(), cameras.cameras, cameras.without)
+        if known is None
+        else known.names
+    )
     footage, sizes = list(opened.values()), {name: each.size for name, each in opened.items()}
     rig = known or pictures_only(list(sizes), list(sizes.values()))
     placements, concluded = placements_of(pictures.image_placement or [], sizes, rig)

@@ -203,13 +203,6 @@ class CameraOptions:
         note(*found.notes)
         return found
 
-    def chosen(self, names: Sequence[str]) -> list[str]:
-        """The camera names that the user wants, among those of videos (without a calibration)."""
-        from shapepose_fg.core.camera import choose
-
-        with naming("--cameras, --without"):
-            return choose(names, names_of(self.cameras), names_of(self.without) or ())
-
     def said(self) -> dict[str, object]:
         """The options about the calibration, to be repeated in the next command."""
         names = ("up", "unit", "image_size", "cameras", "without")
@@ -217,8 +210,8 @@ class CameraOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class DetectionOptions(CameraOptions):
-    """Cameras, and their 2D detections."""
+class SeenOptions:
+    """2D detections of cameras."""
 
     detections: Path = option(INPUT, "Folder with the 2D detections of all cameras.", REQUIRED)
     skeleton: str | None = option(
@@ -226,6 +219,11 @@ class DetectionOptions(CameraOptions):
         "Keypoint layout of the detector: a name such as COCO_17, or a TOML file.",
         metavar="NAME",
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class DetectionOptions(CameraOptions, SeenOptions):
+    """Cameras, and their 2D detections."""
 
     def rig(self) -> "Rig":
         """The cameras; InputError if they cannot be used, or if there are fewer than two."""
@@ -419,6 +417,14 @@ def refuse_missing(places: Mapping[str, Path | None]) -> None:
         raise InputError(
             f"{listed}: missing; give {them}, or --project with the folder of a Pose2Sim project"
         )
+
+
+def chosen_cameras(names: Sequence[str], cameras: str | None, without: str | None) -> list[str]:
+    """The camera names among `names` that the options --cameras and --without choose."""
+    from shapepose_fg.core.camera import choose
+
+    with naming("--cameras, --without"):
+        return choose(names, names_of(cameras), names_of(without) or ())
 
 
 def names_of(text: str | None) -> list[str] | None:

@@ -13,15 +13,15 @@ from shapepose_fg.cli.options import (
     INPUT,
     RESULT,
     argument,
+    chosen_cameras,
     frame_range,
     frames_option,
     grouped,
-    names_of,
     option,
 )
 from shapepose_fg.cli.pictures import PictureOptions
 from shapepose_fg.cli.terminal import note, progress
-from shapepose_fg.core.errors import InputError, naming
+from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import ASSUMED_FPS
 from shapepose_fg.core.result_files import results_folder
 from shapepose_fg.core.run_summary import covered_frames
@@ -74,7 +74,6 @@ def overlay(
     """
     if drawn.stills is not None and frames is not None:
         raise InputError("--stills and --frames: both select frames; give one of them")
-    from shapepose_fg.core.camera import choose
     from shapepose_fg.core.reconstruction import Reconstruction
     from shapepose_fg.io.solved_setup import cameras_of
     from shapepose_fg.viz.overlay.frames import Overlay, write_overlay
@@ -82,10 +81,8 @@ def overlay(
     folder = results_folder(results)
     with Reconstruction.open(folder) as people:
         rig, run = cameras_of(folder), people.run
-        wanted = names_of(drawn.cameras)
-        with naming("--cameras, --without"):
-            known = pictures.named(rig) if wanted is None else rig.names
-            names = choose(known, wanted, names_of(drawn.without) or ())
+        known = pictures.named(rig) if drawn.cameras is None else rig.names
+        names = chosen_cameras(known, drawn.cameras, drawn.without)
         shown = pictures.of_result(folder, run, rig, names, detections)
         if drawn.points and not people.observed:
             note(f"{folder}: observations.npz is missing, so no detections are drawn")

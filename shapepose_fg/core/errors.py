@@ -62,16 +62,23 @@ def failure(error: BaseException) -> str | None:
 
 
 @contextmanager
-def naming(place: object, cure: str = "") -> Iterator[None]:
+def naming(
+    place: object, cure: str = "", words: str = "{}", *kinds: type[Exception]
+) -> Iterator[None]:
     """Context manager: a ValueError inside the block becomes an InputError that names `place`, with
     `cure` at its end.
+
+    `words` is the sentence between them, with {} for the error. With `kinds`, errors of these
+    classes are meant, of other libraries: of their messages the first line is used.
     """
+    caught = kinds or (ValueError,)
     try:
         yield
     except InputError:
         raise
-    except ValueError as error:
-        raise InputError(f"{place}: {error}{'; ' if cure else ''}{cure}") from None
+    except caught as error:
+        said = [*str(error).splitlines(), type(error).__name__][0] if kinds else error
+        raise InputError(f"{place}: {words.format(said)}{'; ' if cure else ''}{cure}") from None
 
 
 def optional(module: str, extra: str) -> ModuleType:

@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import BaseModel, Field, FiniteFloat
 
 from shapepose_fg.core.frame_times import spans_of
+from shapepose_fg.core.validation import validated
 
 Run = dict[str, Any]
 MOST_FRAMES = 10_000_000
@@ -21,13 +22,29 @@ class _Time(BaseModel, strict=True):
     source: str = ""
 
 
+_Span = Annotated[list[int], Field(min_length=2, max_length=2)]
+
+
 class _People(BaseModel, strict=True):
     dropped: dict[str, int] = {}
     problems: list[dict[str, Any]] = []
 
 
+class _Spell(BaseModel, strict=True):
+    camera: str
+    frames: _Span
+
+
+class _Finding(BaseModel, strict=True):
+    cameras: list[str]
+    says: str
+
+
 class _Setup(BaseModel, strict=True):
     warnings: list[str] = []
+    left_out: list[_Spell] = []
+    doubted: list[_Spell] = []
+    findings: list[_Finding] = []
 
 
 class _Probability(BaseModel, strict=True):
@@ -51,9 +68,6 @@ class CameraEntry(BaseModel, strict=True):
     left_out: _Distances = _Distances()
 
 
-_Span = Annotated[list[int], Field(min_length=2, max_length=2)]
-
-
 class RunEntries(BaseModel, strict=True):
     """Entries of run.json that this program reads again; there may be others."""
 
@@ -70,6 +84,13 @@ class RunEntries(BaseModel, strict=True):
     time: _Time = _Time()
     cuts: list[Annotated[int, Field(ge=0)]] = []
     body: str | None = None
+    extra_factors: dict[str, Any] = {}
+
+
+def entries_of(run: Mapping[str, Any]) -> RunEntries:
+    """The entries of a run, as run.json has them; InputError if one of them is invalid."""
+    written = json.loads(json.dumps(dict(run), default=plain))
+    return validated(RunEntries, written, "run.json", "restore it or delete the entry")
 
 
 def merged_run(runs: Sequence[Run]) -> Run:

@@ -22,7 +22,7 @@ from shapepose_fg.estimation.camera_pose_uncertainty import carried_covariance
 from shapepose_fg.estimation.condensed_graph import gtsam_step
 from shapepose_fg.estimation.contact import feet_of
 from shapepose_fg.estimation.covariance_factors import covariance_factors
-from shapepose_fg.estimation.draft import first_places, joint_targets
+from shapepose_fg.estimation.draft import Draft, first_bodies, first_places, joint_targets
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.factor_solution import solve_with_factors
 from shapepose_fg.estimation.gated_views import (
@@ -64,8 +64,10 @@ def solve_bodies(
     config: EstimatorConfig,
     motion: MotionModel,
     functions: Sequence[FactorFunction] = (),
+    drafted: Draft | None = None,
 ) -> WindowSolution:
-    """Joints, covariances and bodies of N rows: each track over its rows, or a row by itself.
+    """Joints, covariances and bodies of N rows: each track over its rows, or a row by itself;
+    bodies begin at those `drafted`.
 
     A joint's covariance is, in this order: what its views say, if its row has no body
     (`_Found.of_views`); the marginal of its person's graph, with deviations wider for unseen joints
@@ -85,7 +87,7 @@ def solve_bodies(
     sigmas = sigmas * np.sqrt(ratio)
     evidence = linearise(observations, sigmas, X, views, gates)
     enough = (evidence.sigma_m <= config.refine.max_sigma_m).sum(axis=1) >= LEAST_JOINTS
-    start = fitter.fit(joint_targets(evidence, enough))
+    start = first_bodies(observations, joint_targets(evidence, enough), fitter, drafted)
     # Where it rejects some detections of a joint, the others are less certain, too.
     kept = evidence.inlier.sum(axis=-1) / np.maximum(observations.seen.sum(axis=-1), 1)
     sigmas = np.where(evidence.inlier, sigmas / np.maximum(kept, 1e-9)[..., None], 0.0)

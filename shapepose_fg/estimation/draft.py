@@ -9,6 +9,7 @@ from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, FitStatus, Joi
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.rows import Rows
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.gated_views import (
     ViewEvidence,
@@ -36,7 +37,7 @@ detector's deviation from the body; or a changed weight. On Shelf a quarter of a
 
 
 @dataclass(frozen=True)
-class Draft:
+class Draft(Rows):
     """Initial estimates of the joints of N rows."""
 
     observations: Observations
@@ -49,6 +50,11 @@ class Draft:
     """(N, J, 3) positions, metres; NaN if neither views nor body determine them."""
     covariance: Array
     """(N, J, 3, 3) covariances, m²; NaN like the positions."""
+
+    def updated(self, new: "Draft") -> "Draft":
+        """The estimates with those of the frames of `new` in their place."""
+        others = ~np.isin(self.observations.frame, new.observations.frame)
+        return Draft.concatenate([self.rows(others), new])
 
 
 def draft(
@@ -132,6 +138,22 @@ def first_places(
     complete = X.copy()
     complete[rows] = np.where(unknown[rows][..., None], found.places, X[rows])
     return complete
+
+
+def first_bodies(
+    observations: Observations, targets: JointTargets, fitter: BodyFitter, drafted: Draft | None
+) -> BodyFit:
+    """Bodies of N rows: of the initial estimates, for rows with the same detections; others are
+    fitted to the `targets`.
+    """
+    body = BodyFit.failed(np.full(len(targets), FitStatus.TOO_FEW_JOINTS), targets.xyz.shape[1])
+    if drafted is not None:
+        here, there = _unchanged(observations, drafted.observations)
+        body.put(here, drafted.body.rows(there))
+    new = np.flatnonzero(~body.ok)
+    if len(new) > 0:
+        body.put(new, fitter.fit(targets.rows(new)))
+    return body
 
 
 def joint_targets(evidence: ViewEvidence, enough: Mask) -> JointTargets:

@@ -14,7 +14,7 @@ from typing import Any, TypeVar, cast, get_type_hints
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from shapepose_fg.core.bounds import interval_of, range_of, violated
-from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.storage.files import read_toml
 from shapepose_fg.core.validation import describe, first_problem
 
@@ -82,10 +82,8 @@ def config_from(
         interval = interval_of(bounded[key])
         if interval and values[key] is not None and (problem := violated(interval, values[key])):
             raise InputError(f"{path}: {name} must {problem}, got {values[key]}; {cure}")
-    try:
+    with naming(path, cure, f"{prefix}{{}}"):
         return kind(**values)
-    except ValueError as error:
-        raise InputError(f"{path}: {prefix}{error}; {cure}") from None
 
 
 def toml_text(config: object) -> str:

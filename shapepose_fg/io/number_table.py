@@ -6,11 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.files import BIG, read_text
 from shapepose_fg.core.validation import is_number
 
+What = Callable[[int], str] | str
 MISSING = "-"
 """Placeholder of a missing number in the columns that allow it."""
 
@@ -57,3 +58,13 @@ def read_number_table(
         rows.append(row)
         lines.append(line)
     return names, np.array(rows).reshape(len(rows), len(names)), np.array(lines, dtype=np.intp)
+
+
+def refuse_first(path: Path, lines: Index, bad: Mask, what: What, cure: str) -> None:
+    """InputError that names the first line of a table whose row is `bad` (R,), if there is one;
+    `lines` (R,). `what` says what is wrong with it, or with a row by its number.
+    """
+    if bad.any():
+        row = int(np.argmax(bad))
+        says = what if isinstance(what, str) else what(row)
+        raise InputError(f"{path}: line {lines[row]}{says}; {cure}")

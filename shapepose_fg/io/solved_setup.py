@@ -39,14 +39,14 @@ def body_of(run: Mapping[str, Any], given: Path | None = None) -> SmplArrays:
     raise InputError(f"{file}: {problem}; restore it, or give its path with --body")
 
 
-def model_of(run: Mapping[str, Any], given: Path | None = None) -> BodyModel:
-    """The body model of `body_of`, with the detector's offsets that the run estimated."""
-    model, offsets = BodyModel(body_of(run, given)), run.get("keypoint_offsets")
-    try:
-        moved = (
-            KeypointOffsets.identity() if offsets is None else KeypointOffsets.from_dict(offsets)
-        )
-    except (KeyError, TypeError, ValueError):
-        cure = "restore the file or remove the entry"
-        raise InputError(f"run.json: keypoint_offsets is not valid; {cure}") from None
-    return model.with_keypoint_offsets(moved)
+def model_of(
+    run: Mapping[str, Any], given: Path | None = None, run_file: Path = Path("run.json")
+) -> BodyModel:
+    """The body model of `body_of`, with the detector's offsets that the run estimated; `run` is the
+    content of `run_file`.
+    """
+    arrays, default, offsets = body_of(run, given), BodyModel.default(), run.get("keypoint_offsets")
+    model = default if arrays is default.arrays else BodyModel(arrays)
+    if offsets is None:
+        return model
+    return model.with_keypoint_offsets(KeypointOffsets.read(offsets, run_file))

@@ -16,7 +16,7 @@ from shapepose_fg.core.frame_sets import CameraClock, FrameSets, align
 from shapepose_fg.core.frame_times import MOST_FPS, FrameTimes
 from shapepose_fg.core.storage.files import write_content
 from shapepose_fg.core.validation import is_number
-from shapepose_fg.io.number_table import MISSING, read_number_table
+from shapepose_fg.io.number_table import MISSING, read_number_table, refuse_first
 
 _FRAME, _TIME = "frame", "time_s"
 """Columns with a special meaning; every other column belongs to a camera."""
@@ -151,10 +151,8 @@ def _clock(path: Path, name: str, time_s: Array, lines: Index) -> CameraClock:
     """
     there = np.isfinite(time_s)
     time_s, lines = time_s[there], lines[there]
-    steps = np.diff(time_s)
-    if (steps <= 0).any():
-        what = f"line {lines[int(np.argmax(steps <= 0)) + 1]} must be later than the frame before"
-        raise InputError(f"{path}: {what}; sort frames by time")
+    steps, late = np.diff(time_s), " must be later than the frame before"
+    refuse_first(path, lines[1:], steps <= 0, late, "sort frames by time")
     step = float(np.median(steps)) if len(steps) > 0 else np.inf
     # Maximum time between frames, s; a longer one means that the file has another unit.
     if len(steps) > 0 and not 1 / MOST_FPS <= step <= 10.0:
@@ -166,12 +164,13 @@ def _clock(path: Path, name: str, time_s: Array, lines: Index) -> CameraClock:
 
 def _lines_of_frames(path: Path, numbers: Array, lines: Index, frames: int) -> Index:
     """(T,) row of the table for each frame of the recording; other rows are ignored."""
-    odd = np.flatnonzero((numbers != np.round(numbers)) | (numbers < 0))
-    if len(odd) > 0:
-        line, number = lines[odd[0]], numbers[odd[0]]
-        raise InputError(
-            f"{path}: line {line} must name a frame, 0 or more, got {number:g}; correct it"
-        )
+    refuse_first(
+        path,
+        lines,
+        (numbers != np.round(numbers)) | (numbers < 0),
+        lambda row: f" must name a frame, 0 or more, got {numbers[row]:g}",
+        "correct it",
+    )
     found, first, count = np.unique(numbers, return_index=True, return_counts=True)
     if (count > 1).any():
         raise InputError(

@@ -11,7 +11,7 @@ from shapepose_fg.core.frame_times import MOST_FPS
 from shapepose_fg.core.rig_file import COVARIANCE, POSE
 from shapepose_fg.core.trajectory import MOST_METRES, UNIT_LENGTH, Trajectory
 from shapepose_fg.core.validation import is_number
-from shapepose_fg.io.number_table import read_number_table
+from shapepose_fg.io.number_table import read_number_table, refuse_first
 
 _STRAY = {"timestamp", "frame", *POSE[1:]}
 """Columns of Stray Scanner's odometry.csv; it may have further ones, some of them empty."""
@@ -57,24 +57,18 @@ def read_trajectory(path: str | Path, name: str = "") -> Trajectory:
     names, numbers, lines, bTc = _of_phone(path, names, numbers, lines)
     columns = {each: numbers[:, place] for place, each in enumerate(names)}
     pose = np.column_stack([columns[each] for each in POSE])
-    far = np.abs(pose[:, 1:4]).max(axis=1) > MOST_METRES
-    if far.any():
-        raise InputError(
-            f"{path}: line {lines[far][0]} is more than {MOST_METRES:g} m away; write metres"
-        )
-    length = np.linalg.norm(pose[:, 4:], axis=1)
-    wrong = ~(np.abs(length - 1) < UNIT_LENGTH)
-    if wrong.any():
-        got = (
-            f"line {lines[wrong][0]}: the quaternion qx qy qz qw must have length 1, got "
-            f"{length[wrong][0]:.4g}"
-        )
-        raise InputError(f"{path}: {got}; write time x y z qx qy qz qw, qw last")
-    late = np.flatnonzero(np.diff(pose[:, 0]) < 1 / MOST_FPS)
-    if len(late) > 0:
-        raise InputError(
-            f"{path}: line {lines[late[0] + 1]} must be later than the pose before; sort by time"
-        )
+    far, length = np.abs(pose[:, 1:4]).max(axis=1), np.linalg.norm(pose[:, 4:], axis=1)
+    what = f" is more than {MOST_METRES:g} m away"
+    refuse_first(path, lines, far > MOST_METRES, what, "write metres")
+    refuse_first(
+        path,
+        lines,
+        ~(np.abs(length - 1) < UNIT_LENGTH),
+        lambda row: f": the quaternion qx qy qz qw must have length 1, got {length[row]:.4g}",
+        "write time x y z qx qy qz qw, qw last",
+    )
+    late, what = np.diff(pose[:, 0]) < 1 / MOST_FPS, " must be later than the pose before"
+    refuse_first(path, lines[1:], late, what, "sort by time")
     wTb = rigid(Rotation.from_quat(pose[:, 4:]).as_matrix(), pose[:, 1:4]) @ bTc
     covariance = None
     if any(each in columns for each in COVARIANCE):
@@ -83,12 +77,13 @@ def read_trajectory(path: str | Path, name: str = "") -> Trajectory:
         covariance = np.zeros((len(pose), 6, 6))
         row, column = np.triu_indices(6)
         covariance[:, row, column] = covariance[:, column, row] = upper
-        odd = np.linalg.eigvalsh(covariance)[:, 0] < -1e-9
-        if odd.any():
-            what = f"line {lines[odd][0]}: the covariance must have no negative eigenvalue"
-            raise InputError(
-                f"{path}: {what}; write variances about the carrier's axes, rad² and m²"
-            )
+        refuse_first(
+            path,
+            lines,
+            np.linalg.eigvalsh(covariance)[:, 0] < -1e-9,
+            ": the covariance must have no negative eigenvalue",
+            "write variances about the carrier's axes, rad² and m²",
+        )
     with naming(path, "correct it in the file"):
         return Trajectory(name or path.stem, pose[:, 0], wTb, covariance)
 

@@ -15,9 +15,9 @@ from typing import Any, TypeVar, cast
 
 import cloudpickle
 
-from shapepose_fg.core.errors import InputError, WorkLost
+from shapepose_fg.core.errors import InputError, WorkLost, naming, optional
 from shapepose_fg.core.provenance import program_digest, versions
-from shapepose_fg.pipeline.workers import Pool, Processes, naming_lost_work, packed
+from shapepose_fg.pipeline.workers import Pool, Processes, naming_lost_work, nothing, packed
 
 Shared = TypeVar("Shared")
 
@@ -93,10 +93,10 @@ def local_cluster(count: int, *, dashboard: bool = False) -> Iterator[Scheduler]
     Raises InputError if Dask is not installed. With `dashboard`, and bokeh installed, the scheduler
     has one.
     """
-    _dask()
+    optional("distributed", "cluster")
     # Dask's processes import `__main__`, which fails for some notebooks and scripts: an own process
     # leads them.
-    with Processes(1, _nothing) as one, naming_lost_work():
+    with Processes(1, nothing) as one, naming_lost_work():
         yield one.submit(_local_cluster, count, dashboard and has_dashboard()).result()
         one.submit(_end_local_cluster).result()
 
@@ -136,10 +136,6 @@ def _end_local_cluster() -> None:
     _running.pop().close()
 
 
-def _nothing() -> None:
-    """No-op initialiser for the process that leads a cluster."""
-
-
 def has_dashboard() -> bool:
     """Whether a scheduler of this machine can have a dashboard."""
     return find_spec("bokeh") is not None
@@ -158,18 +154,13 @@ def look_at(address: str) -> Scheduler:
 @contextmanager
 def _client(address: str) -> Iterator[Any]:
     """A connection to the scheduler at an address, configured for large tasks."""
-    Client = _dask()
+    Client = optional("distributed", "cluster").Client
     import dask.config
 
-    try:
+    words, cure = "no Dask scheduler answers there ({})", "start one with `dask scheduler`"
+    with naming(f"--cluster {address}", f"{cure}, or leave it out", words, OSError, ValueError):
         # Time limit for an answer of a cluster, s.
         client = Client(address, timeout=10)
-    except (OSError, ValueError, TimeoutError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(
-            f"--cluster {address}: no Dask scheduler answers there ({reason}); start one with"
-            " `dask scheduler`, or leave it out"
-        ) from None
     with client, dask.config.set({"distributed.admin.large-graph-warning-threshold": "1GiB"}):
         yield client
 
@@ -202,17 +193,6 @@ def _refuse_other(process: str, own: dict[str, str], theirs: dict[str, str]) -> 
 def this_program() -> dict[str, str]:
     """Versions of everything that affects the results of this process."""
     return {**versions(), _ITSELF: program_digest()}
-
-
-def _dask() -> Any:
-    """Dask's client class; raises InputError if it is not installed."""
-    try:
-        from distributed import Client
-    except ImportError:
-        raise InputError(
-            'Dask is not installed; pip install "shapepose-fg[cluster]", or leave out --cluster'
-        ) from None
-    return Client
 
 
 def one_item(

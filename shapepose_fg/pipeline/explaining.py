@@ -2,10 +2,8 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from pydantic import BaseModel
 
 from factors import kernel_weight
 from shapepose_fg.core.arrays import Array, Index
@@ -16,7 +14,7 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.joint_names import mirrored
 from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.reconstruction import Known, Reconstruction, sigma_m
-from shapepose_fg.core.validation import validated
+from shapepose_fg.core.run_summary import RunEntries, entries_of
 from shapepose_fg.estimation.factor_shares import FactorEvidence, factor_evidence
 from shapepose_fg.estimation.gated_views import inverses, observation_sigmas
 from shapepose_fg.estimation.user_factors import ExtraFactors, functions_of, name_of
@@ -40,51 +38,6 @@ _NEAR_M = 0.5
 _APART = 0.5
 """Ratio of the distances from another person's joint and this one's below which a detection is the
 other's."""
-
-
-class _Problem(BaseModel):
-    """An entry of run.json's `people.problems`."""
-
-    person: int
-    frame: int
-    joint: str
-    reason: str
-
-
-class _Spell(BaseModel):
-    """An entry of run.json's `setup.left_out` or `setup.doubted`."""
-
-    camera: str
-    frames: tuple[int, int]
-
-
-class _SetupFinding(BaseModel):
-    """An entry of run.json's `setup.findings`."""
-
-    cameras: list[str]
-    says: str
-
-
-class _Setup(BaseModel):
-    """The used part of run.json's `setup`."""
-
-    left_out: list[_Spell] = []
-    doubted: list[_Spell] = []
-    findings: list[_SetupFinding] = []
-
-
-class _People(BaseModel):
-    """The used part of run.json's `people`."""
-
-    problems: list[_Problem] = []
-
-
-class _Run(BaseModel):
-    """The used part of run.json."""
-
-    setup: _Setup = _Setup()
-    people: _People = _People()
-    extra_factors: dict[str, Any] = {}
 
 
 def explain(
@@ -117,7 +70,7 @@ def explain(
         raise InputError(
             "the cameras are not those of observations.npz; give the cameras of the reconstruction"
         )
-    told = validated(_Run, people.run, "run.json", "restore it or reconstruct the recording again")
+    told = entries_of(people.run)
     row = _row_of(people, person, frame, time_s)
     names, frame = people.joint_names.tolist(), int(people.frame[row])
     if joint not in names:
@@ -363,7 +316,7 @@ def _refused(
 
 def _findings(
     people: Reconstruction,
-    run: _Run,
+    run: RunEntries,
     row: int,
     joint: int,
     views: Sequence[ViewReason],
@@ -432,16 +385,15 @@ def _findings(
     return tuple(found)
 
 
-def _problem(people: Reconstruction, told: _Run, row: int, joint: int) -> str:
+def _problem(people: Reconstruction, told: RunEntries, row: int, joint: int) -> str:
     """The problem with a joint as run.json states it; empty where there was none."""
-    here = int(people.person[row]), int(people.frame[row]), str(people.joint_names[joint])
-    problems = told.people.problems
-    return next(
-        (each.reason for each in problems if (each.person, each.frame, each.joint) == here), ""
-    )
+    here = {"person": people.person[row], "frame": people.frame[row]}
+    here |= {"joint": people.joint_names[joint]}
+    mine = (each for each in told.people.problems if here.items() <= each.items())
+    return str(next(mine, {}).get("reason", ""))
 
 
-def _checked(people: Reconstruction, told: _Run, row: int) -> list[Finding]:
+def _checked(people: Reconstruction, told: RunEntries, row: int) -> list[Finding]:
     """What the set-up check found wrong with single cameras, according to run.json: excluded from a
     row's frame, doubted in it, or used nevertheless.
     """

@@ -62,13 +62,7 @@ def with_rows_between(
     count = np.diff(keys)[number[after]] - 1
     pair = np.repeat(after, count)
     at = keys[number[pair]] + 1 + np.arange(len(pair)) - np.repeat(np.cumsum(count) - count, count)
-    if len(at) == 0:
-        return rows
-    between = _carried(
-        rows.rows(order[pair]), rows.rows(order[pair + 1]), frame[at], time_s[at], motion
-    )
-    every = with_bodies_between(Reconstruction.concatenate([rows, between]))
-    return every.rows(np.lexsort((every.person, every.frame)))
+    return _with_carried(rows, order[pair], order[pair + 1], frame[at], time_s[at], motion)
 
 
 def strays_m(joints: Array, velocity: Array, times_s: Array) -> Array:
@@ -120,12 +114,22 @@ def with_rows_like(
     first, second = (order[np.clip(each, 0, len(order) - 1)] for each in (after - 1, after))
     ours = (solved.person[first] == rows.person[new]) & (solved.person[second] == rows.person[new])
     first, second, new = first[ours], second[ours], new[ours]
-    if len(new) == 0:
-        return solved
-    between = _carried(
-        solved.rows(first), solved.rows(second), rows.frame[new], rows.time_s[new], motion
-    )
-    every = with_bodies_between(Reconstruction.concatenate([solved, between]))
+    return _with_carried(solved, first, second, rows.frame[new], rows.time_s[new], motion)
+
+
+def _with_carried(
+    rows: Reconstruction,
+    before: Index,
+    after: Index,
+    frame: Whole,
+    time_s: Array,
+    motion: MotionModel,
+) -> Reconstruction:
+    """Add N rows between the rows `before` and `after` (N,); sorted by frame and person."""
+    if len(frame) == 0:
+        return rows
+    between = _carried(rows.rows(before), rows.rows(after), frame, time_s, motion)
+    every = with_bodies_between(Reconstruction.concatenate([rows, between]))
     return every.rows(np.lexsort((every.person, every.frame)))
 
 

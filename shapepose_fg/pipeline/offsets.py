@@ -1,7 +1,9 @@
 """Learns a detector's joint offsets and noise law from frames spread over a recording."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -25,6 +27,8 @@ from shapepose_fg.pipeline.setup import Setup
 from shapepose_fg.proposal.people_2d import whole_people
 from shapepose_fg.proposal.stage_one import StageOne
 from shapepose_fg.proposal.thinning import ThinnedFrames
+
+T = TypeVar("T")
 
 _OFFSETS, _NOISE = "keypoint-offsets", "noise-law"
 """Names under which a run stores the offsets and the noise law."""
@@ -99,26 +103,32 @@ def estimate_offsets(
 def kept_offsets(kept: KeptArrays, sample: Sample, book: Notebook) -> KeypointOffsets | None:
     """The offsets stored when the run began; `offsets_of` if there are none yet."""
     columns = [each.name for each in fields(KeypointOffsets)]
-    if len(kept.names(_OFFSETS)) > 0:
-        with naming(kept.place(_OFFSETS), ANEW):
-            return KeypointOffsets(**{name: kept.array(_OFFSETS, name) for name in columns})
-    offsets = offsets_of(sample, book)
-    if offsets is not None:
-        kept.keep(_OFFSETS, {name: getattr(offsets, name) for name in columns})
-    return offsets
+    make = partial(offsets_of, sample, book)
+    return _kept(kept, _OFFSETS, columns, make, lambda arrays: KeypointOffsets(**arrays))
 
 
 def kept_noise(kept: KeptArrays, sample: Sample, book: Notebook) -> NoiseLaw:
     """The noise law stored when the run began; `noise_of` if there is none yet."""
-    if len(kept.names(_NOISE)) > 0:
-        with naming(kept.place(_NOISE), ANEW):
-            return NoiseLaw.from_dict(
-                {name: kept.array(_NOISE, name).tolist() for name in NoiseLaw.COLUMNS}
-            )
-    noise = noise_of(sample, book)
-    if noise != NoiseLaw.shipped():
-        kept.keep(_NOISE, {name: np.array(getattr(noise, name)) for name in NoiseLaw.COLUMNS})
-    return noise
+    return _kept(kept, _NOISE, NoiseLaw.COLUMNS, lambda: noise_of(sample, book), NoiseLaw.from_dict)
+
+
+def _kept(
+    kept: KeptArrays,
+    name: str,
+    columns: Sequence[str],
+    make: Callable[[], T],
+    of: Callable[[dict[str, Any]], T],
+) -> T:
+    """What a run has stored under a name, `of` its columns; what `make` returns if there is nothing
+    yet, which is then stored, unless it is None.
+    """
+    if len(kept.names(name)) > 0:
+        with naming(kept.place(name), ANEW):
+            return of({each: kept.array(name, each) for each in columns})
+    made = make()
+    if made is not None:
+        kept.keep(name, {each: np.array(getattr(made, each)) for each in columns})
+    return made
 
 
 def noise_of(sample: Sample, book: Notebook) -> NoiseLaw:
@@ -132,16 +142,13 @@ def noise_of(sample: Sample, book: Notebook) -> NoiseLaw:
         return NoiseLaw.load(source)
     if source == "none" or len(sample) < NOISE_FRAMES:
         return NoiseLaw.shipped()
-    chosen, every, learnt = list[Observations](), list[Observations](), 0
     with book.stage("noise"):
-        for found, people in sample.people(NOISE_FRAMES):
-            whole = Observations.of(whole_people(people.candidate, found), found, people.initial)
-            chosen.append(people)
-            every.append(whole)
-            learnt += int(whole.seen.sum())
-            if learnt >= _ENOUGH:
-                break
-        rows, whole = Observations.concatenate(chosen), Observations.concatenate(every)
+        every = _enough(
+            Observations.of(whole_people(people.candidate, found), found, people.initial)
+            for found, people in sample.people(NOISE_FRAMES)
+        )
+        rows = Observations.concatenate([people for _, people in sample.people(len(every))])
+        whole = Observations.concatenate(every)
         views, config = Views.of(setup.rig, rows.time_s), setup.config.observations
         return Residuals.of(rows, whole, views, config, setup.skeleton.joints).law()
 
@@ -161,14 +168,20 @@ def offsets_of(sample: Sample, book: Notebook) -> KeypointOffsets | None:
     if source != "recording":
         return KeypointOffsets.load(source)
     with book.stage("offsets"):
-        people, learnt = list[Observations](), 0
-        for _, each in sample.people(config.offsets.frames):
-            people.append(each)
-            learnt += int(each.seen.sum())
-            if learnt >= _ENOUGH:
-                break
+        people = _enough(each for _, each in sample.people(config.offsets.frames))
         if len(people) == 0:
             return KeypointOffsets.identity()
         rows = Observations.concatenate(people)
         targets = confident_targets(rows, setup.rig, config.observations)
         return learn_offsets(targets, fitter.model, config=config.body)
+
+
+def _enough(frames: Iterable[Observations]) -> list[Observations]:
+    """The first of some frames, with `_ENOUGH` detections together."""
+    found, learnt = list[Observations](), 0
+    for each in frames:
+        found.append(each)
+        learnt += int(each.seen.sum())
+        if learnt >= _ENOUGH:
+            break
+    return found

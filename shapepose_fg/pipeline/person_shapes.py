@@ -5,8 +5,10 @@ combined by their information, and each body is turned so that its joints stay w
 them.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -97,13 +99,8 @@ class ShapeEvidence:
         return share * self.information, share * self.pull
 
 
-def evidence(
-    rows: WindowBodies, model: BodyModel, sigma_m: float = BodyConfig.model_sigma_m
-) -> dict[int, ShapeEvidence]:
-    """The evidence of rows on the shapes of their people.
-
-    `sigma_m` is the standard deviation of a detector's joint from the body's, metres.
-    """
+def _evidence(model: BodyModel, sigma_m: float, rows: WindowBodies) -> dict[int, ShapeEvidence]:
+    """The evidence of rows on the shapes of their people."""
     found, energy = dict[int, ShapeEvidence](), BodyEnergy(model, PosePrior.default())
     for some, mine, free in _batches(rows, energy):
         count, known = len(some), JointTargets.solved(mine.joints, mine.covariance)
@@ -147,18 +144,16 @@ def combined(
     return SubjectShapes(np.array(names, dtype=str), betas, information, known.body)
 
 
-def with_shape(
-    rows: WindowBodies,
-    betas: Array,
-    model: BodyModel,
-    sigma_m: float = BodyConfig.model_sigma_m,
-    floor: Floor | None = None,
+def _with_shape(
+    model: BodyModel, sigma_m: float, job: tuple[WindowBodies, Mapping[int, Array], Floor | None]
 ) -> dict[str, Array]:
-    """The bodies of rows with the shapes `betas` (R, 10), by column.
+    """The bodies of rows with the shapes of their people, by number, by column.
 
-    Poses change so that joints of bodies stay; no body sinks into the `floor`. Rows without a body
+    Poses change so that joints of bodies stay; no body sinks into the floor. Rows without a body
     stay so.
     """
+    rows, known, floor = job
+    betas = np.array([known[number] for number in rows.person.tolist()]).reshape(-1, 10)
     found = {name: getattr(rows, name).copy() for name in BODY}
     energy = BodyEnergy(model, PosePrior.default())
     for some, _, free in _batches(rows, energy):
@@ -190,6 +185,32 @@ def _batches(rows: WindowBodies, energy: BodyEnergy) -> Iterator[tuple[Index, Wi
         yield some, mine, energy.parameters(mine.body, mine.transl)
 
 
+Mapped = Callable[[Callable[[BodyModel, float, Any], Any], Iterable[Any]], Iterator[Any]]
+"""`map` over items, in any processes, of a function of a body model, the standard deviation of a
+detector's joint from the body's (metres), and an item."""
+
+
+def bodies_with_shapes(
+    parts: Callable[[], Iterable[WindowBodies]],
+    numbers: Iterable[int],
+    model: BodyModel,
+    known: SubjectShapes | None,
+    floor: Floor | None,
+    mapped: Mapped,
+) -> tuple[SubjectShapes, Iterator[dict[str, Array]]]:
+    """One shape for each of the people `numbers` (`combined`), and the bodies of each part of their
+    rows with these shapes, by column.
+    """
+    found = {number: ShapeEvidence() for number in numbers}
+    for of_part in mapped(_evidence, parts()):
+        for number, each in of_part.items():
+            found[number].add(each)
+    known = SubjectShapes.empty(fingerprint(model)) if known is None else known
+    shapes = combined(found, known, model)
+    betas = dict(zip(found, shapes.betas, strict=True))
+    return shapes, mapped(_with_shape, ((rows, betas, floor) for rows in parts()))
+
+
 def with_person_shapes(
     people: Reconstruction,
     model: BodyModel,
@@ -199,18 +220,15 @@ def with_person_shapes(
 ) -> Reconstruction:
     """Return the rows with one shape per person, and these shapes (`combined`).
 
-    Joints and their covariances do not change; bodies are those of `with_shape`.
+    Joints and their covariances do not change; bodies are those of `bodies_with_shapes`. `sigma_m`
+    is the standard deviation of a detector's joint from the body's, metres.
     """
     if len(people) == 0:
         return people
-    known = SubjectShapes.empty(fingerprint(model)) if known is None else known
-    rows, numbers = WindowBodies.of(people), np.unique(people.person)
-    found = {number: ShapeEvidence() for number in numbers.tolist()}
-    for number, each in evidence(rows, model, sigma_m).items():
-        found[number].add(each)
-    shapes = combined(found, known, model)
-    betas = shapes.betas[np.searchsorted(numbers, people.person)]
-    return replace(people, shapes=shapes, **with_shape(rows, betas, model, sigma_m, floor))
+    rows, numbers = WindowBodies.of(people), np.unique(people.person).tolist()
+    here: Mapped = lambda work, items: map(partial(work, model, sigma_m), items)  # noqa: E731
+    shapes, (bodies,) = bodies_with_shapes(lambda: [rows], numbers, model, known, floor, here)
+    return replace(people, shapes=shapes, **bodies)
 
 
 def _names(numbers: Sequence[int], known: SubjectShapes, whose: Sequence[int]) -> list[str]:

@@ -3,7 +3,7 @@ return rows.
 """
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -11,10 +11,9 @@ import numpy as np
 
 from shapepose_fg.body.fitting.fitter import BodyFitter, check_fitter
 from shapepose_fg.body.fitting.fitters import make_fitter
-from shapepose_fg.body.fitting.weights import fingerprint
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.shapes import SubjectShapes
-from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.core.arrays import Index
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.frame_times import FrameTimes, check_cuts, spans_of
@@ -32,13 +31,7 @@ from shapepose_fg.pipeline.execution import Execution
 from shapepose_fg.pipeline.keyframes import keyframes
 from shapepose_fg.pipeline.offsets import Sample, kept_noise, kept_offsets
 from shapepose_fg.pipeline.offsets import estimate_offsets as estimate_offsets
-from shapepose_fg.pipeline.person_shapes import (
-    ShapeEvidence,
-    WindowBodies,
-    combined,
-    evidence,
-    with_shape,
-)
+from shapepose_fg.pipeline.person_shapes import WindowBodies, bodies_with_shapes
 from shapepose_fg.pipeline.runs.assembly import Assembly
 from shapepose_fg.pipeline.runs.parts import Parts
 from shapepose_fg.pipeline.setup import Setup
@@ -284,33 +277,22 @@ def _with_person_shapes(
     pool: Pool[Setup],
 ) -> Assembly:
     """The result with one shape per person, and bodies with these shapes."""
-    parts, found = range(len(result.parts)), {number: ShapeEvidence() for number in result.parts_of}
-    for of_part in pool.map(_evidence, map(result.bodies, parts)):
-        for number, each in of_part.items():
-            found[number].add(each)
-    known = SubjectShapes.empty(fingerprint(model)) if known is None else known
-    shapes = combined(found, known, model)
-    betas = dict(zip(found, shapes.betas, strict=True))
-    jobs = ((result.bodies(n), betas, floor) for n in parts)
-    for n, columns in enumerate(pool.map(_with_shape, jobs)):
+
+    def parts() -> Iterator[WindowBodies]:
+        return map(result.bodies, range(len(result.parts)))
+
+    def mapped(work: Any, items: Any) -> Iterator[Any]:
+        return pool.map(_on_bodies, ((work, each) for each in items))
+
+    shapes, bodies = bodies_with_shapes(parts, result.parts_of, model, known, floor, mapped)
+    for n, columns in enumerate(bodies):
         result.keep_bodies(n, columns)
     return replace(result, shapes=shapes)
 
 
-def _evidence(setup: Setup, rows: WindowBodies) -> dict[int, ShapeEvidence]:
-    """Evidence on shapes, in any process."""
-    assert setup.fitter.model is not None
-    return evidence(rows, setup.fitter.model, setup.config.body.model_sigma_m)
-
-
-def _with_shape(
-    setup: Setup, job: tuple[WindowBodies, Mapping[int, Array], Floor | None]
-) -> dict[str, Array]:
-    """Bodies with people's shapes, in any process."""
-    rows, betas, floor = job
-    own = np.array([betas[number] for number in rows.person.tolist()]).reshape(-1, 10)
-    assert setup.fitter.model is not None
-    return with_shape(rows, own, setup.fitter.model, setup.config.body.model_sigma_m, floor)
+def _on_bodies(setup: Setup, job: tuple[Callable[[Any, float, Any], Any], Any]) -> Any:
+    """A function of the body model on a part's bodies, in any process."""
+    return job[0](setup.fitter.model, setup.config.body.model_sigma_m, job[1])
 
 
 def _names(tracks: Assembly, setup: Setup, cuts_s: Sequence[float]) -> dict[int, int]:

@@ -11,8 +11,6 @@ import numpy as np
 from factors.keys import MAX_FRAME, MAX_PERSON
 from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.body.fitting.fitters import make_fitter
-from shapepose_fg.body.model.body_model import BodyModel
-from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.core.arrays import Index, Mask, Whole
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.errors import InputError
@@ -25,7 +23,7 @@ from shapepose_fg.estimation.noise_law import NoiseLaw
 from shapepose_fg.estimation.user_factors import ExtraFactors
 from shapepose_fg.estimation.window_solution import PersonGraph, WindowSolution
 from shapepose_fg.io.config import ANOTHER_VERSION, config_from
-from shapepose_fg.io.solved_setup import CAMERAS, cameras_of
+from shapepose_fg.io.solved_setup import CAMERAS, cameras_of, model_of
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.keyframes import looked_at, with_rows_like
 from shapepose_fg.pipeline.person_shapes import with_person_shapes
@@ -57,11 +55,8 @@ class Solver:
                 f"{run_file}: configuration is missing; reconstruct the recording again"
             )
         config = config_from(configuration, PipelineConfig, run_file, cure=ANOTHER_VERSION)
-        told, body = people.run.get("keypoint_offsets"), people.run.get("body")
-        offsets = None if told is None else KeypointOffsets.read(told, run_file)
-        model = BodyModel.default() if body is None else BodyModel.load(Path(str(body)))
+        model = model_of(people.run, run_file=run_file)
         fitter = make_fitter(config.body, model.with_keypoints(tuple(people.joint_names.tolist())))
-        fitter = fitter if offsets is None else fitter.with_keypoint_offsets(offsets)
         return cls(rig, config, fitter, NoiseLaw.read(people.run, run_file))
 
     @classmethod

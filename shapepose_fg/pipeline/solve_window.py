@@ -77,13 +77,16 @@ def solve_window(
     began = time.perf_counter()
     motion = MotionModel.load(config.joints, config.motion, config.law)
 
+    drafted: Draft | None = None
     if assigning is not None and len(observations) > 0:
-        observations, views = _assigned(observations, views, fitter, config, assigning, motion)
+        observations, views, drafted = _assigned(
+            observations, views, fitter, config, assigning, motion
+        )
     assigned = time.perf_counter()
 
     functions = functions_of(extra_factors)
     if config.refine.with_body and fitter.model is not None:
-        solution = solve_bodies(observations, views, fitter, config, motion, functions)
+        solution = solve_bodies(observations, views, fitter, config, motion, functions, drafted)
     else:
         solution = alternate(observations, views, fitter, config, functions)
     solution.seconds.update(
@@ -99,9 +102,9 @@ def _assigned(
     config: EstimatorConfig,
     assigning: Assigning,
     motion: MotionModel,
-) -> tuple[Observations, Views]:
-    """The rows with the detections near people's initial joints and bodies, iterated; and their
-    views.
+) -> tuple[Observations, Views, Draft | None]:
+    """The rows with the detections near people's initial joints and bodies, iterated; their views;
+    and the last initial estimates.
 
     Over time, a further round is for frames near those in which a detection changed.
     """
@@ -114,8 +117,9 @@ def _assigned(
         here = [each.frame for each in compress(frames, around)]
         near = np.flatnonzero(np.isin(observations.frame, here))
         before, seen_by = observations.rows(near), views.rows(near)
-        drafted = draft(before, seen_by, fitter, config, drafted)
-        places, covariance = drafted.places, drafted.covariance
+        found = draft(before, seen_by, fitter, config, drafted)
+        drafted = found if drafted is None else drafted.updated(found)
+        places, covariance = found.places, found.covariance
         least = n / max(assigning.rounds - 1, 1) * LEAST_PROBABILITY
         if assigning.over_time:
             times_s, least = before.time_s.mean(axis=1), None
@@ -134,4 +138,4 @@ def _assigned(
                 break
             marked = np.isin([each.frame for each in frames], now.frame[other.any(axis=(1, 2))])
             asked = near_in_time(marked[:, None], frame_s, _CHANGED_S)[:, 0]
-    return observations, views
+    return observations, views, drafted

@@ -112,7 +112,7 @@ class Processes(Executor):
             count, initializer=_begin, initargs=given, env=_ENVIRONMENT
         )
         with _ctrl_c_blocked(), naming_lost_work():
-            self._pool.submit(_nothing)  # the first job starts all processes
+            self._pool.submit(nothing)  # the first job starts all processes
 
     def submit(self, fn: Callable[..., Result], /, *args: Any, **kwargs: Any) -> Future[Result]:
         """Submit `fn(*args, **kwargs)` to one of the processes."""
@@ -204,5 +204,5 @@ def _call(shared: Any, work: Callable[[Any, Item], Result], item: Item) -> Resul
     return work(shared, item)
 
 
-def _nothing() -> None:
-    """The job that starts the processes."""
+def nothing() -> None:
+    """The job that starts the processes; also an initialiser."""

@@ -140,6 +140,28 @@ def test_only_rows_whose_detections_change_are_fitted_again(fitter):
     assert counting.rows == []
 
 
+def test_a_window_begins_with_the_bodies_of_its_drafts(fitter):
+    """Of ten rows three get a neighbour's leg after the draft: only these are fitted. A draft of
+    some frames takes the place of what these frames had.
+    """
+    rows, truth = with_a_neighbour_s_leg(True)
+    clean = replace(rows, xy=np.moveaxis(SCENE.rig.project(truth)[0], 0, 2))
+    views, others, kept = Views.of(SCENE.rig), [2, 5, 8], [0, 1, 3, 4, 6, 7, 9]
+    before = draft.draft(clean, views, fitter, EstimatorConfig())
+    xy = clean.xy.copy()
+    xy[others] = rows.xy[others]
+    now, counting = replace(clean, xy=xy), Counting(fitter)
+    targets = before.fitted
+    body = draft.first_bodies(now, targets, counting, before)
+    assert counting.rows == [len(others)] and body.ok.all()
+    np.testing.assert_array_equal(body.joints[kept], before.body.joints[kept])
+    again = before.updated(draft.draft(now.rows(others), views, fitter, EstimatorConfig()))
+    assert sorted(again.observations.frame) == sorted(FRAMES)
+    counting = Counting(fitter)
+    draft.first_bodies(now, targets, counting, again)
+    assert counting.rows == []
+
+
 def test_a_detection_that_is_improbable_loses_its_hold_on_the_draft(fitter):
     """The neighbour's leg, once it is known to be the neighbour's."""
     rows, truth = with_a_neighbour_s_leg(True)

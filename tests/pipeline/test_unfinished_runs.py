@@ -115,7 +115,7 @@ def test_a_run_that_is_stopped_again_and_again_ends_the_same(scene, recording, w
     """
     stops, result = 0, None
     while result is None:
-        kept = Interrupted(tmp_path / "parts", 3 + stops, behind=stops % 3 == 1)
+        kept = Interrupted(tmp_path / "parts", 4 + stops, behind=stops % 3 == 1)
         try:
             result = reconstruct_parts(kept, Task(recording, scene.rig, CONFIG, cuts=CUTS))
         except Stopped:
@@ -140,7 +140,7 @@ def test_what_is_in_memory_and_what_is_in_the_files_is_the_same(dance, tmp_path)
 def test_without_time_it_goes_on_too(scene, recording, tmp_path):
     config = PipelineConfig(temporal=False, batch_frames=4, offsets=OffsetConfig(source="none"))
     frames = range(4, 12)
-    kept = Interrupted(tmp_path / "parts", 3, behind=False)
+    kept = Interrupted(tmp_path / "parts", 4, behind=False)
     with pytest.raises(Stopped):
         reconstruct_parts(kept, Task(recording, scene.rig, config, frames))
     counts = []
@@ -409,7 +409,7 @@ def test_a_folder_of_somebody_else_is_left_alone(tmp_path):
 
 @pytest.mark.slow
 def test_a_damaged_part_is_named(scene, recording, tmp_path):
-    kept = Interrupted(tmp_path / "parts", 3, behind=False)
+    kept = Interrupted(tmp_path / "parts", 4, behind=False)
     with pytest.raises(Stopped):
         reconstruct_parts(kept, Task(recording, scene.rig, CONFIG, cuts=CUTS))
     assert kept.names("followed") == ["followed-000000"]

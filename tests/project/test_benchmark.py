@@ -61,7 +61,18 @@ def test_a_command_that_fails_is_shown_with_what_it_said(script, tmp_path):
 
 @pytest.mark.slow
 def test_two_commits_are_timed_alternately(script, monkeypatch, capsys, tmp_path):
-    """No recording in the folder: the built-in scene is taken."""
+    """No recording in the folder: the built-in scene is taken. Each checkout is run once, and what
+    that took is told again for the later rounds.
+    """
+    taken, spent, spend = [], {}, script.spend
+
+    def once(tree, options, output):
+        taken.append("here" if tree == script.HERE else "against")
+        if tree not in spent:
+            spent[tree] = spend(tree, options, output)
+        return spent[tree]
+
+    monkeypatch.setattr(script, "spend", once)
     git = subprocess.run(
         ["git", "-C", str(script.HERE), "rev-parse", "HEAD"], capture_output=True, text=True
     )
@@ -74,12 +85,13 @@ def test_two_commits_are_timed_alternately(script, monkeypatch, capsys, tmp_path
         "--cases",
         "one frame",
         "--rounds",
-        "1",
+        "2",
         "--data",
         str(tmp_path),
     ]
     monkeypatch.setattr(sys, "argv", ["benchmark.py", *options, "--frames", "2"])
     script.main()
+    assert taken == ["against", "here"] * 3, "a round warms up"
     printed = capsys.readouterr().out
     for part in (
         "cores",

@@ -1,13 +1,15 @@
 """recordings.toml: reads the recordings of an archive, and the options of each."""
 
+import json
 import re
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from shapepose_fg.cli.reconstruct.request import Request
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.joint_names import layouts_called
+from shapepose_fg.core.run_summary import plain
 from shapepose_fg.core.storage.files import is_inside, read_toml
 from shapepose_fg.core.validation import describe
 from shapepose_fg.io.config import config_from
@@ -147,11 +149,6 @@ def _in_turn(entries: list[Entry], path: Path) -> list[Entry]:
 
 def asked(request: Request) -> dict[str, Any]:
     """The options as plain values, which are equal for equal requests."""
-    default, found = Request(), {}
-    for name in (field.name for field in fields(request)):
-        value = getattr(request, name)
-        if value != getattr(default, name):
-            found[name] = (
-                str(value) if isinstance(value, Path) else list(value) if name == "cuts" else value
-            )
-    return found
+    usual = vars(Request())
+    given = {name: value for name, value in vars(request).items() if value != usual[name]}
+    return json.loads(json.dumps(given, default=plain))

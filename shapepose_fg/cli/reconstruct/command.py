@@ -10,7 +10,7 @@ import typer
 
 from shapepose_fg.cli.options import RESULT, TIME, RunOptions, grouped, option
 from shapepose_fg.cli.reconstruct.request import Request, prepare
-from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.errors import naming
 
 
 @grouped
@@ -28,14 +28,10 @@ def reconstruct(
 ) -> None:
     """Reconstruct the people of a recording: 3D joints with covariances, and bodies."""
     running.check()
-    try:
+    with naming(f"--cuts {cuts}", words="must be increasing frame numbers, such as 300,600"):
         frames = (
             () if cuts is None else tuple(int(word) for word in re.split(r"[,\s]+", cuts.strip()))
         )
-    except ValueError:
-        raise InputError(
-            f"--cuts {cuts}: must be increasing frame numbers, such as 300,600"
-        ) from None
     known = prepare(replace(request, cuts=frames), output)
     from shapepose_fg.cli.reconstruct.run import carry_out
     from shapepose_fg.pipeline.execution import Execution

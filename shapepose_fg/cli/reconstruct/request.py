@@ -21,7 +21,7 @@ from shapepose_fg.cli.options import (
     refuse_missing,
 )
 from shapepose_fg.cli.terminal import note
-from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.result_files import CLOCKS, MOMENTS, OBSERVATIONS, PEOPLE
 from shapepose_fg.core.result_files import RUN as RUN_FILE
 
@@ -178,13 +178,9 @@ class Prepared:
         """The cuts; InputError if they are invalid for a recording of `count` frames."""
         from shapepose_fg.core.frame_times import check_cuts
 
-        try:
+        words = f"must be increasing frame numbers between 1 and {count - 1}, such as 300,600"
+        with naming(f"--cuts {','.join(map(str, self.request.cuts))}", words=words):
             return check_cuts(self.request.cuts, count)
-        except ValueError:
-            raise InputError(
-                f"--cuts {','.join(map(str, self.request.cuts))}: must be increasing frame "
-                f"numbers between 1 and {count - 1}, such as 300,600"
-            ) from None
 
 
 def prepare(request: Request, output: Path | None, tell: Callable[..., None] = note) -> Prepared:

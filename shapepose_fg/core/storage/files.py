@@ -14,7 +14,7 @@ from pathlib import Path
 from secrets import token_hex
 from typing import Any, BinaryIO
 
-from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.errors import InputError, naming
 
 SMALL, MIDDLE, BIG, LARGE = 2**20, 2**26, 2**28, 2**32
 """Maximum sizes of files, bytes: settings and small tables; cameras, or detections of one frame;
@@ -174,24 +174,18 @@ def read_json(path: Path, *, most: int = LARGE) -> Any:
 
 def parse_json(text: str, path: Path | str) -> Any:
     """Parse the JSON `text` of the file at `path`, with the checks that `read_json` makes."""
-    try:
-        value = json.loads(text, object_pairs_hook=lambda pairs: unique_keys(pairs, path))
-    except json.JSONDecodeError as error:
-        cut = error.msg.startswith("Unterminated") or _BROKEN_OFF.fullmatch(text, error.pos)
-        ends = " (the file ends too early)" if cut else ""
-        raise InputError(
-            f"{path}: line {error.lineno} column {error.colno} is not JSON: {error.msg}{ends}; "
-            "correct it or write the file again"
-        ) from None
-    except InputError:
-        raise
-    except (
-        ValueError,
-        RecursionError,
-    ) as error:  # such as an integer of 5,000 digits, or 10,000 open brackets
-        raise InputError(
-            f"{path}: cannot be read as JSON ({error}); write the file again"
-        ) from None
+    # Others than a JSONDecodeError: an integer of 5,000 digits, or 10,000 open brackets.
+    words = "cannot be read as JSON ({})"
+    with naming(path, "write the file again", words, ValueError, RecursionError):
+        try:
+            value = json.loads(text, object_pairs_hook=lambda pairs: unique_keys(pairs, path))
+        except json.JSONDecodeError as error:
+            cut = error.msg.startswith("Unterminated") or _BROKEN_OFF.fullmatch(text, error.pos)
+            ends = " (the file ends too early)" if cut else ""
+            raise InputError(
+                f"{path}: line {error.lineno} column {error.colno} is not JSON: {error.msg}{ends}; "
+                "correct it or write the file again"
+            ) from None
     return bounded(value, path, numbers=has_long_number(text))
 
 
@@ -221,14 +215,10 @@ def parse_toml(path: Path, text: str) -> dict[str, Any]:
             raise InputError(
                 f"{path}: line {number} has over {_MOST_DOTS} dots; split it into several lines"
             )
-    try:
+    # A ValueError that is no syntax error: an integer of 5,000 digits.
+    cure, words = "correct it or write the file again", "cannot be read as TOML ({})"
+    with naming(path, cure, words, ValueError, RecursionError):
         return bounded(tomllib.loads(text), path)
-    except InputError:
-        raise
-    except (ValueError, RecursionError) as error:  # an integer of 5,000 digits is no syntax error
-        raise InputError(
-            f"{path}: cannot be read as TOML ({error}); correct it or write the file again"
-        ) from None
 
 
 def bounded(value: Any, path: Path | str, *, numbers: bool = True) -> Any:

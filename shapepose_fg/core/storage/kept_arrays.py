@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from shapepose_fg.core.errors import InputError, naming
+from shapepose_fg.core.errors import naming
 from shapepose_fg.core.storage.files import LARGE, inside, open_regular, write_content
 from shapepose_fg.core.storage.schema import Column, checked_columns
 
@@ -158,7 +158,9 @@ class InFolder(KeptArrays):
         InputError if it is damaged, now or when it is read.
         """
         file = self._file(name)
-        try:
+        words = "a part of an interrupted run cannot be read ({})"
+        kinds = OSError, SafetensorError, KeyError, TypeError, ValueError, RecursionError
+        with naming(file, ANEW, words, *kinds):
             status = file.stat() if file.exists() else None
             stamp = () if status is None else (status.st_ino, status.st_size, status.st_mtime_ns)
             if self._checked.get((name, None)) != stamp:
@@ -175,13 +177,6 @@ class InFolder(KeptArrays):
                     raise ValueError("its content has changed, or it belongs to another run")
                 self._checked[name, None] = self._checked[name, key] = stamp
                 yield content
-        except InputError:
-            raise
-        except (OSError, SafetensorError, KeyError, TypeError, ValueError, RecursionError) as error:
-            reason = str(error) or type(error).__name__
-            raise InputError(
-                f"{file}: a part of an interrupted run cannot be read ({reason}); {ANEW}"
-            ) from None
 
 
 def _digest(key: str, array: NDArray[Any]) -> str:

@@ -6,7 +6,7 @@ import math
 import os
 import zipfile
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, BinaryIO
@@ -16,7 +16,7 @@ from numpy.lib import format as npy
 from numpy.typing import DTypeLike, NDArray
 
 from shapepose_fg.core.arrays import Index
-from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.storage.files import BIG, PIECE, open_regular
 
 MOST_PACKED = 50
@@ -207,19 +207,10 @@ class NpzFile(ExitStack):
             )
         return self._open[name]
 
-    @contextmanager
-    def _telling(self) -> Iterator[None]:
+    def _telling(self) -> AbstractContextManager[None]:
         """Convert any error of zipfile, zlib or NumPy about the file to an InputError."""
-        try:
-            yield
-        except InputError:
-            raise
-        except Exception as error:
-            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise InputError(
-                f"{self.file}: cannot be read as an .npz file without pickled objects "
-                f"({reason}); {self._cure}"
-            ) from None
+        words = "cannot be read as an .npz file without pickled objects ({})"
+        return naming(self.file, self._cure, words, Exception)
 
 
 def read_npy_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:

@@ -10,7 +10,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from shapepose_fg.core.arrays import Array
-from shapepose_fg.core.errors import InputError, optional
+from shapepose_fg.core.errors import InputError, naming, optional
 from shapepose_fg.core.storage.files import BIG, SMALL, open_regular
 from shapepose_fg.core.storage.npz import MOST_PACKED, read_npy_header
 from shapepose_fg.io.camera_names import MOST_FRAME
@@ -124,12 +124,9 @@ def cameras_of_freemocap(path: Path) -> list[str]:
 
 def _header(path: Path, stream: Any) -> tuple[tuple[int, ...], np.dtype[Any], bool, int]:
     """Shape, type and memory order of the array in an .npy file, and the offset of its values."""
-    try:
+    # NumPy evaluates the header as a Python literal, which raises many kinds of errors.
+    with naming(path, "", f"this is not a NumPy array, but {what_it_is(path)}", Exception):
         shape, fortran, dtype = read_npy_header(stream)
-    except (
-        Exception
-    ):  # NumPy evaluates the header as a Python literal, which raises many kinds of errors
-        raise InputError(f"{path}: this is not a NumPy array, but {what_it_is(path)}") from None
     if dtype.hasobject:
         raise InputError(f"{path}: holds Python objects, which could run code; save it as numbers")
     if len(shape) != 4 or shape[3] not in (2, 3) or dtype.kind != "f":
@@ -146,24 +143,11 @@ def read_hdf5(path: Path) -> CameraPeople:
     with open_regular(path) as stream:
         if stream.read(8) != b"\x89HDF\r\n\x1a\n":
             raise InputError(f"{path}: this is not an HDF5 file, but {what_it_is(path)}")
-    try:
-        with h5py.File(path, "r") as file:
-            table = _dataset(h5py, file, _TABLE)
-            return _sleap(path, h5py, file) if table is None else _deeplabcut(path, table)
-    except (
-        OSError,
-        RuntimeError,
-        KeyError,
-        ValueError,
-        TypeError,
-        OverflowError,
-        IndexError,
-    ) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(
-            f"{path}: damaged HDF5 ({' '.join(str(error).split())[:100]}); export it again"
-        ) from None
+    kinds = OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError, IndexError
+    words = "damaged HDF5 ({:.100})"
+    with naming(path, "export it again", words, *kinds), h5py.File(path, "r") as file:
+        table = _dataset(h5py, file, _TABLE)
+        return _sleap(path, h5py, file) if table is None else _deeplabcut(path, table)
 
 
 def _deeplabcut(path: Path, table: Any) -> CameraPeople:

@@ -16,6 +16,7 @@ from shapepose_fg.core.storage.files import ROWS_AT_ONCE, open_regular, text_pie
 from shapepose_fg.core.validation import is_number
 from shapepose_fg.io.camera_names import MOST_FRAME, last_number, match_names
 from shapepose_fg.io.detections.people import CameraPeople, PeopleBlock
+from shapepose_fg.io.number_table import refuse_first
 
 _DEEPLABCUT, _CALISCOPE = "DeepLabCut's CSV", "Caliscope's CSV"
 _RERUN = "write the detections again, in pixels"
@@ -65,12 +66,12 @@ def read_deeplabcut(path: Path) -> CameraPeople:
 
     blocks, first, last = list[PeopleBlock](), 0, -1
     while len(some := list(islice(rows, ROWS_AT_ONCE))) > 0:
-        numbers = np.array([[_frame(path, line, row[0])] for line, row in some], dtype=np.intp)[
-            :, 0
-        ]
-        if (np.diff(numbers, prepend=last) <= 0).any():
-            line = some[int(np.argmax(np.diff(numbers, prepend=last) <= 0))][0]
-            raise InputError(f"{path}: line {line}: frame numbers must increase; {_RERUN}")
+        lines, numbers = (
+            np.array(each, dtype=np.intp)
+            for each in zip(*((n, _frame(path, n, row[0])) for n, row in some), strict=True)
+        )
+        late = np.diff(numbers, prepend=last) <= 0
+        refuse_first(path, lines, late, ": frame numbers must increase", _RERUN)
         first, last = int(numbers[0]) if last < 0 else first, int(numbers[-1])
         values = np.array([_numbers(path, line, row, width) for line, row in some])
         blocks.append(PeopleBlock.dense(numbers, taken(values, picked)))
@@ -152,11 +153,8 @@ def _points(path: Path) -> Array:
             axis=1
         )
         bad |= (values[:, :3] < 0).any(axis=1) | (values[:, 0] >= MOST_FRAME)
-        if bad.any():
-            line = some[int(np.argmax(bad))][0]
-            raise InputError(
-                f"{path}: line {line} must hold whole numbers and pixels; export it again"
-            )
+        lines = np.array([line for line, _ in some], dtype=np.intp)
+        refuse_first(path, lines, bad, " must hold whole numbers and pixels", "export it again")
         parts.append(values)
     table = np.concatenate(parts) if parts else np.zeros((0, 5))
     if table[:, 2].max(initial=0) > BLAZEPOSE and not (table[:, 2] == 0).any():

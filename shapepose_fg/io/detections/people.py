@@ -3,24 +3,25 @@ converted to candidates.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.core.storage.kept_arrays import KeptArrays
 from shapepose_fg.io.detection_table import BLOCK_FRAMES
-from shapepose_fg.io.detections.view_streams import ViewCandidates, ViewStream
+from shapepose_fg.io.detections.view_streams import ViewCandidates, ViewStream, in_blocks
 
 OVERSHOOT = 1.1
 """Largest score that is clipped to 1 without a note: upsampled heat maps overshoot slightly."""
 
 
 @dataclass(frozen=True)
-class PeopleBlock:
+class PeopleBlock(Rows):
     """People of consecutive frames, with their keypoints in the detector's order."""
 
     frame: Index
@@ -209,23 +210,11 @@ def candidates_of(
     lower of their scores.
     """
     count = last - first + 1
-
-    def blocks() -> Iterator[ViewCandidates]:
-        """Blocks of `BLOCK_FRAMES` frames, from blocks of people of any length."""
-        waiting = PeopleBlock(np.zeros(0, dtype=np.intp), np.zeros((0, skeleton.keypoint_count, 3)))
-        given = people.blocks(last_time=True)
-        for start in range(0, count, BLOCK_FRAMES):
-            end = first + min(start + BLOCK_FRAMES, count)
-            parts = [waiting] if len(waiting.frame) > 0 else []
-            while (len(parts) == 0 or parts[-1].frame[-1] < end) and (part := next(given, None)):
-                parts.append(part)
-            frame = np.concatenate([part.frame for part in parts] or [waiting.frame])
-            keypoints = np.concatenate([part.keypoints for part in parts] or [waiting.keypoints])
-            own = int(np.searchsorted(frame, end))
-            yield joints_of_people(frame[:own] - first, keypoints[:own], rule, skeleton)
-            waiting = PeopleBlock(frame[own:], keypoints[own:])
-
-    return ViewStream(people.camera.source, count, blocks(), first)
+    given = (replace(each, frame=each.frame - first) for each in people.blocks(last_time=True))
+    nothing = PeopleBlock(np.zeros(0, dtype=np.intp), np.zeros((0, skeleton.keypoint_count, 3)))
+    cut = in_blocks(given, count, PeopleBlock.concatenate, PeopleBlock.rows, nothing)
+    blocks = (joints_of_people(each.frame, each.keypoints, rule, skeleton) for each in cut)
+    return ViewStream(people.camera.source, count, blocks, first)
 
 
 def joints_of_people(

@@ -1,10 +1,12 @@
 """Detections of one camera in blocks of frames, and their combination to a table of all cameras."""
 
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import zip_longest
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -145,24 +147,33 @@ def _part(view: ViewStream, lead: int, count: int) -> ViewStream:
     """The `count` frames of a view after its first `lead` ones. If `lead` is negative, `-lead`
     empty frames come first. All blocks of the view are read.
     """
+    shifted = (replace(block, frame=block.frame - lead) for block in view.blocks)
+    inside = (each.only((each.frame >= 0) & (each.frame < count)) for each in shifted)
+    blocks = in_blocks(inside, count, _joined, ViewCandidates.only, _NOTHING)
+    return replace(view, frame_count=count, first_number=view.first_number + lead, blocks=blocks)
 
-    def blocks() -> Iterator[ViewCandidates]:
-        waiting, number = _NOTHING, 0
-        for n, block in enumerate(view.blocks, 1):
-            shifted = replace(block, frame=block.frame - lead)
-            waiting = _joined(
-                [waiting, shifted.only((shifted.frame >= 0) & (shifted.frame < count))]
-            )
-            end = (number + 1) * BLOCK_FRAMES
-            if end <= min(n * BLOCK_FRAMES - lead, count):
-                yield waiting.only(waiting.frame < end)
-                waiting, number = waiting.only(waiting.frame >= end), number + 1
-        while number * BLOCK_FRAMES < count:
-            end = (number + 1) * BLOCK_FRAMES
-            yield waiting.only(waiting.frame < end)
-            waiting, number = waiting.only(waiting.frame >= end), number + 1
 
-    return replace(view, frame_count=count, first_number=view.first_number + lead, blocks=blocks())
+def in_blocks(
+    given: Iterator[Any],
+    count: int,
+    joined: Callable[[list[Any]], Any],
+    only: Callable[[Any, Mask], Any],
+    nothing: Any,
+) -> Iterator[Any]:
+    """Rows of `count` frames, sorted by their `frame` (N,), in blocks of `BLOCK_FRAMES` frames.
+
+    They are `given` in blocks of any length, all of which are read; `joined` and `only` join blocks
+    and select rows by a mask, and `nothing` is a block without rows.
+    """
+    waiting = nothing
+    for end in range(BLOCK_FRAMES, count + BLOCK_FRAMES, BLOCK_FRAMES):
+        parts = [waiting]
+        while not np.any(parts[-1].frame[-1:] >= end) and (part := next(given, None)) is not None:
+            parts.append(part)
+        every = joined(parts)
+        yield only(every, every.frame < end)
+        waiting = only(every, every.frame >= end)
+    deque(given, maxlen=0)
 
 
 def _joined(parts: Sequence[ViewCandidates]) -> ViewCandidates:

@@ -3,7 +3,7 @@
 import math
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
@@ -187,17 +187,12 @@ def read_frame(file: Path, frame: str, name: str) -> Trajectory:
         return frames.trajectory(wanted or known[0], name)
 
 
-@contextmanager
-def _whole(file: Path, cure: str) -> Iterator[None]:
+def _whole(file: Path, cure: str) -> AbstractContextManager[None]:
     """Context manager: InputError if a message lacks a field, or has a value of another kind there.
     The library may parse a damaged definition differently from `check_definition`.
     """
-    try:
-        yield
-    except (AttributeError, TypeError) as error:
-        raise InputError(
-            f"{file}: a message does not fit its definition ({error}); {cure}"
-        ) from None
+    words = "a message does not fit its definition ({})"
+    return naming(file, cure, words, AttributeError, TypeError)
 
 
 def _decoded(

@@ -1,13 +1,11 @@
 """Converts entries of run.json to words; invalid entries are refused."""
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from shapepose_fg.core.run_summary import RunEntries, covered_frames, has_identities, plain
-from shapepose_fg.core.validation import validated
+from shapepose_fg.core.run_summary import covered_frames, entries_of, has_identities
 from shapepose_fg.estimation.noise_law import NoiseLaw
 from shapepose_fg.pipeline.config import PipelineConfig
 
@@ -44,14 +42,6 @@ def told_by(run: Run) -> dict[str, Any]:
         "versions": [(name, _text(value)) for name, value in entries.versions.items()],
         "inputs": [(name, _text(value)) for name, value in entries.inputs.items()],
     }
-
-
-def entries_of(run: Run) -> RunEntries:
-    """The entries of a run that are shown, as run.json has them; InputError if one of them is
-    invalid.
-    """
-    written = json.loads(json.dumps(dict(run), default=plain))
-    return validated(RunEntries, written, "run.json", "restore it or delete the entry")
 
 
 def _changed_settings(configuration: Run) -> list[tuple[str, str, str]]:
