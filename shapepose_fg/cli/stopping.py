@@ -42,11 +42,16 @@ def stoppable() -> Iterator[None]:
         return
     stopped = False
 
-    def stop(number: int, _: FrameType | None) -> None:
+    def stop(number: int, frame: FrameType | None) -> None:
         nonlocal stopped
-        if not stopped:
-            stopped = True
+        if stopped:
+            return
+        stopped = True
+        while frame is not None and frame.f_code is not lost.__code__:
+            frame = frame.f_back
+        if frame is None:
             raise Stopped(number)
+        send_later(number)  # an exception of `lost` would be lost, too
 
     def again(number: int) -> None:
         nonlocal stopped
@@ -57,6 +62,11 @@ def stoppable() -> Iterator[None]:
     later: list[threading.Timer] = []
     missed: list[int] = []
 
+    def send_later(number: int) -> None:
+        missed.append(number)
+        later.append(threading.Timer(0.01, again, [number]))
+        later[-1].start()
+
     def settle() -> None:
         for timer in later:
             timer.cancel()
@@ -65,9 +75,7 @@ def stoppable() -> Iterator[None]:
     def lost(unraisable: "sys.UnraisableHookArgs") -> None:
         if not isinstance(unraisable.exc_value, Stopped):
             return report(unraisable)
-        missed.append(unraisable.exc_value.number)
-        later.append(threading.Timer(0.01, again, [unraisable.exc_value.number]))
-        later[-1].start()
+        send_later(unraisable.exc_value.number)
 
     report, sys.unraisablehook = sys.unraisablehook, lost
     before = {number: signal.getsignal(number) for number in _SIGNALS}
