@@ -70,7 +70,7 @@ class Ended(BaseException):
 class Stopping(InFolder):
     """Parts in a folder; the run is stopped behind so many writes."""
 
-    writes = 5
+    writes = 6
 
     def keep(self, name, arrays, about=None) -> None:
         super().keep(name, arrays, about)
