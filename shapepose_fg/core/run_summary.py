@@ -25,9 +25,16 @@ class _Time(BaseModel, strict=True):
 _Span = Annotated[list[int], Field(min_length=2, max_length=2)]
 
 
+class _Problem(BaseModel, strict=True):
+    person: int
+    frame: int
+    joint: str = ""
+    reason: str = ""
+
+
 class _People(BaseModel, strict=True):
     dropped: dict[str, int] = {}
-    problems: list[dict[str, Any]] = []
+    problems: list[_Problem] = []
 
 
 class _Spell(BaseModel, strict=True):

@@ -387,10 +387,11 @@ def _findings(
 
 def _problem(people: Reconstruction, told: RunEntries, row: int, joint: int) -> str:
     """The problem with a joint as run.json states it; empty where there was none."""
-    here = {"person": people.person[row], "frame": people.frame[row]}
-    here |= {"joint": people.joint_names[joint]}
-    mine = (each for each in told.people.problems if here.items() <= each.items())
-    return str(next(mine, {}).get("reason", ""))
+    here = int(people.person[row]), int(people.frame[row]), str(people.joint_names[joint])
+    problems = told.people.problems
+    return next(
+        (each.reason for each in problems if (each.person, each.frame, each.joint) == here), ""
+    )
 
 
 def _checked(people: Reconstruction, told: RunEntries, row: int) -> list[Finding]:

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from shapepose_fg.body.model.smpl_file import SMPL_PARENTS
 from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.decompositions import rotation_angle
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.storage.npz import read_npz
 from shapepose_fg.simulation.limbs import ARMS
@@ -144,12 +145,10 @@ def _bridged(rotations: Array, pelvis: Array, fps: float) -> tuple[Array, Array]
     """Interpolate all joints over frames in which any joint jumps."""
     if len(pelvis) < 3:
         return rotations, pelvis
-    trace = np.einsum("tjab,tjab->tj", rotations[:-1], rotations[1:])  # of R^T R': 1 + 2 cos
+    turned = rotation_angle(rotations[:-1].mT @ rotations[1:])
     # Angular speed, rad/s, above which a marker has jumped; joints of walkers and dancers
     # are slower.
-    jumps = np.flatnonzero(
-        (np.arccos(np.clip((trace - 1) / 2, -1, 1)) > np.radians(900.0) / fps).any(axis=1)
-    )
+    jumps = np.flatnonzero((turned > np.radians(900.0) / fps).any(axis=1))
     if len(jumps) == 0:
         return rotations, pelvis
     bad = np.zeros(len(pelvis), dtype=bool)

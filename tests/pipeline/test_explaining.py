@@ -292,6 +292,9 @@ def test_who_is_not_there_is_said(people, scene):
         "occurs twice in frame": lambda people: with_both(people, frame=np.full(len(people), 5)),
         "persons must be at most": lambda people: with_both(people, person=people.person + 10**6),
         "people.problems must be": lambda people: people.with_run(people={"problems": 3}),
+        r"people.problems\[0\].frame must be": lambda people: people.with_run(
+            people={"problems": [{"person": 0, "frame": "5", "joint": "LElbow", "reason": "odd"}]}
+        ),
         "setup.left_out": lambda people: people.with_run(
             setup={"left_out": [{"camera": {}, "frames": [0, 9]}]}
         ),

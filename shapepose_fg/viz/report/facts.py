@@ -22,7 +22,8 @@ def told_by(run: Run) -> dict[str, Any]:
         "warnings": entries.setup.warnings,
         "notes": entries.notes,
         "problems": [
-            ", ".join(f"{key} {it}" for key, it in each.items()) for each in entries.people.problems
+            ", ".join(f"{key} {it}" for key, it in each.model_dump(exclude_unset=True).items())
+            for each in entries.people.problems
         ],
         "dropped": [
             (reason, count, _frames_words(entries.dropped_frames.get(reason, [])))
