@@ -1,6 +1,7 @@
 """People in single frames: the model of `body_window.py` without motion, for all rows at once."""
 
 from copy import copy
+from dataclasses import replace
 
 import numpy as np
 
@@ -98,6 +99,7 @@ class BodyFrames(BodyWindow):
         H[:, range(H.shape[1]), range(H.shape[1])] += np.repeat([1.0, HELD], [10, H.shape[1] - 10])
         whole = np.asarray(np.linalg.inv(H), dtype=np.float64)
         poses, across = whole[:, 10:, 10:], whole[:, 10:, :10]
+        self.last = replace(self.last, system=np.empty((len(self), 0, 0)))
         return Marginals(self, state, poses, np.zeros_like(poses), whole[:, :10, :10], across)
 
     def _total(self, state: BodyState, cost: Array) -> tuple[Array, Array]:

@@ -127,6 +127,7 @@ def solve_bodies(
             people.append(BodyGraph(each.window, each.state, track, frames, float(factor), own))
             spread.append(each.of_bodies)
             found.put(people[-1], each)
+        del marginals, each  # memory that the next person needs
 
     # Uncertainty: unseen joints deviate from their bodies by more, above all those that cameras
     # should see; cameras' poses and sides may be wrong.

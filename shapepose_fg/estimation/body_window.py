@@ -100,7 +100,8 @@ class Around(Rows):
     cost: float | Array
     """E, in squared standard deviations; of single frames (T,)."""
     system: Array
-    """(T, M, P) normal equations of each row, joints eliminated (`body/kernels/solving.py`)."""
+    """(T, M, P) normal equations of each row, joints eliminated (`body/kernels/solving.py`); (T, 0,
+    0) when covariances are known, since they are most of a window's memory."""
     pull: Array
     """(T, N) half the gradient of the motion."""
     bodies: Array
@@ -430,9 +431,9 @@ class BodyWindow:
         # Imported here: the first kernels load it anyway, commands without a window do not.
         from scipy.linalg import get_lapack_funcs
 
-        here = self.last
-        kept, front = self._eliminated(state.root, here, 0.0)
-        T, N = here.pull.shape
+        kept, front = self._eliminated(state.root, self.last, 0.0)
+        T, N = self.last.pull.shape
+        self.last = replace(self.last, system=np.empty((T, 0, 0)))
         n = (kept.shape[1] - 11 - N) // N
         shape = np.asarray(
             np.linalg.inv(_symmetric(front[-10:, -10:]) + np.eye(10)), dtype=np.float64
@@ -459,10 +460,11 @@ class BodyWindow:
             )
             after[:N, :N] = own
             arrows = np.concatenate((arrow[t], arrows[:-N])) if n > 1 else arrow[t]
-        steps[:-1] += arrow[1:] @ shape @ arrow[:-1].mT
-        return Marginals(
-            self, state, poses + arrow @ shape @ arrow.mT, steps, shape, -arrow @ shape
-        )
+        del kept, L, ahead  # twice as much memory as the covariances
+        across = arrow @ shape
+        poses += across @ arrow.mT
+        steps[:-1] += across[1:] @ arrow[:-1].mT
+        return Marginals(self, state, poses, steps, shape, -across)
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,8 @@ each of them with it.
 """
 
 from collections import deque
-from itertools import chain, repeat
+from collections.abc import Iterator
+from itertools import repeat
 
 import gtsam
 import numpy as np
@@ -19,40 +20,44 @@ def gtsam_step(window: BodyWindow, state: BodyState) -> tuple[Array, Array]:
     (T, 10), and of the poses (T, N), the root's in tangents of the world. LinAlgError if the system
     is singular.
     """
-    T, N = window.last.pull.shape
-    keys, betas = body_keys(0, np.arange(T)), np.atleast_2d(state.betas)
-    shapes = [shape_key(n) for n in range(len(betas))]
+    poses = body_keys(0, np.arange(len(window))).tolist()
+    shapes = [shape_key(n) for n in range(len(np.atleast_2d(state.betas)))]
     graph = gtsam.GaussianFactorGraph()
-    H, pull = frame_systems(window, state)
-    pull[:, 10:] -= window.last.pull
-    at = np.arange(10, 10 + N)
-    H[:, at, at] += HELD
-    motion = list[gtsam.HessianFactor]()
-    if window.links is not None:
-        H[:, at, at] += window.links.diagonal[:T]
-        none, still = np.zeros((N, N)), np.zeros(N)
-        for k in range(1, min(T, 1 + window.links.beyond.shape[-1])):
-            couplings = map(np.diag, window.links.beyond[: T - k, :, k - 1])
-            motion += map(
-                gtsam.HessianFactor, keys[:-k].tolist(), keys[k:].tolist(), repeat(none),
-                couplings, repeat(still), repeat(none), repeat(still), repeat(0.0),
-            )  # fmt: skip
-    frames = map(
-        gtsam.HessianFactor, keys.tolist(), shapes * (T // len(shapes)), H[:, 10:, 10:],
-        H[:, 10:, :10],
-        pull[:, 10:], H[:, :10, :10], pull[:, :10], repeat(0.0),
-    )  # fmt: skip
-    unit = gtsam.noiseModel.Unit.Create(10)
-    priors = map(gtsam.JacobianFactor, shapes, repeat(np.eye(10)), -betas, repeat(unit))
-    deque(map(graph.push_back, chain(frames, priors, motion)), maxlen=0)
+    deque(map(graph.push_back, _factors(window, state, poses, shapes)), maxlen=0)
     try:
-        found = graph.optimize(gtsam.Ordering([*keys.tolist(), *shapes]))
+        found = graph.optimize(gtsam.Ordering([*poses, *shapes]))
     except RuntimeError as error:  # gtsam.IndeterminantLinearSystemException
         raise np.linalg.LinAlgError(str(error)) from None
-    of_shape, of_pose = (
-        np.array([found.at(key) for key in each]) for each in (shapes, keys.tolist())
-    )
+    of_shape, of_pose = (np.array([found.at(key) for key in each]) for each in (shapes, poses))
     return of_shape.reshape(state.betas.shape), of_pose
+
+
+def _factors(
+    window: BodyWindow, state: BodyState, poses: list[int], shapes: list[int]
+) -> Iterator[gtsam.GaussianFactor]:
+    """The factors: one for each frame, the shape's priors, and those of motion."""
+    H, pull = frame_systems(window, state)
+    pull[:, 10:] -= window.last.pull
+    T, N = window.last.pull.shape
+    at = np.arange(10, 10 + N)
+    H[:, at, at] += HELD
+    if window.links is not None:
+        H[:, at, at] += window.links.diagonal[:T]
+    yield from map(
+        gtsam.HessianFactor, poses, shapes * (T // len(shapes)), H[:, 10:, 10:], H[:, 10:, :10],
+        pull[:, 10:], H[:, :10, :10], pull[:, :10], repeat(0.0),
+    )  # fmt: skip
+    unit, betas = gtsam.noiseModel.Unit.Create(10), np.atleast_2d(state.betas)
+    yield from map(gtsam.JacobianFactor, shapes, repeat(np.eye(10)), -betas, repeat(unit))
+    if window.links is None:
+        return
+    none, still = np.zeros((N, N)), np.zeros(N)
+    for k in range(1, min(T, 1 + window.links.beyond.shape[-1])):
+        couplings = map(np.diag, window.links.beyond[: T - k, :, k - 1])
+        yield from map(
+            gtsam.HessianFactor, poses[:-k], poses[k:], repeat(none), couplings, repeat(still),
+            repeat(none), repeat(still), repeat(0.0),
+        )  # fmt: skip
 
 
 def frame_systems(
