@@ -22,12 +22,12 @@ from shapepose_fg.calibration.people import MIN_DEPTH_M, Footage, People
 from shapepose_fg.calibration.refinement import dilution
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Camera, Rig, Views
-from shapepose_fg.core.decompositions import nearest_rotation, rigid
+from shapepose_fg.core.decompositions import nearest_rotation, rigid, rotation_angle, symmetric_root
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.trajectory import Trajectory
 from shapepose_fg.estimation.trajectory_graph import ANYWHERE_M, correlated
-from shapepose_fg.setup_check.fit import POSE, Q, by_parameters, seen_by
+from shapepose_fg.setup_check.fit import POSE, Q, by_parameters, placing, seen_by
 from shapepose_fg.setup_check.matching import Sightings, follow, median_of
 
 _STEP_S, _LONGEST_S = 0.2, 180.0
@@ -158,11 +158,11 @@ def _moved_by(people: People, found: Adjusted) -> Array:
     by_camera = by_parameters(xy, at, by_place, views)
     by_camera[..., POSE] *= -1  # poses are those of the cameras in the world
     weight = np.where(people.seen, 1 / people.sigma_px, 0.0)[..., None, None]
-    by_point, by_camera = weight * (by_place @ views.cTw[:, :, :3]), weight * by_camera
-    inverse = np.linalg.pinv(np.einsum("pjvri,pjvrk->pjik", by_point, by_point), hermitian=True)
+    by_point = weight * (by_place @ views.cTw[:, :, :3])
     errors = errors.reshape(len(errors), *found.covariance.shape[:2])[..., :Q]
-    missed = np.einsum("pjvrq,mvq->mpjvr", by_camera, errors)
-    return -np.einsum("pjik,pjvrk,mpjvr->pjim", inverse, by_point, missed, optimize=True)
+    missed = np.einsum("pjvrq,mvq->pjvrm", weight * by_camera, errors)
+    every = (*points.shape[:2], -1)
+    return -placing(by_point.reshape(*every, 3)) @ missed.reshape(*every, len(errors))
 
 
 @dataclass(frozen=True)
@@ -335,7 +335,7 @@ class Filmed:
         """Whether two starts are different poses or times of the camera."""
         middle = len(self.own_s) // 2
         a, b = (self._placed(each)[middle, :3, :3] for each in (one, other))
-        turn = np.degrees(Rotation.from_matrix(a.T @ b).magnitude())
+        turn = np.degrees(rotation_angle(a.T @ b))
         return bool(abs(one.offset_s - other.offset_s) > _OTHER_S or turn > _OTHER_DEG)
 
     def _placed(self, start: Start) -> Array:
@@ -603,8 +603,7 @@ class _Fit:
         """
         alike = np.einsum("njc,nkc->jk", away, away)
         size = np.sqrt(np.diag(alike)) + _TINY
-        values, vectors = np.linalg.eigh(alike / size / size[:, None])
-        J = np.einsum("njcp,jk->nkcp", J, vectors * np.sqrt(np.maximum(values, 0.0)))
+        J = np.einsum("njcp,jk->nkcp", J, symmetric_root(alike / size / size[:, None]))
         total = np.zeros((J.shape[-1],) * 2)
         for track in np.unique(self.placed.track).tolist():
             rows = self.placed.track == track

@@ -10,9 +10,10 @@ from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Camera, Rig, Views
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.frame_times import FrameTimes
+from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.estimation.gated_views import ObservationConfig
+from shapepose_fg.estimation.gated_views import ObservationConfig, observation_sigmas
 from shapepose_fg.estimation.trajectory_graph import WEAKEST_M
 from shapepose_fg.setup_check.evidence import left_out, observed, triangulate
 from shapepose_fg.setup_check.matching import GATE, Pairs, Sightings, size_of
@@ -27,7 +28,6 @@ _MOST_SIGHTINGS = 5_000
 because errors within a second are correlated."""
 MIN_DEPTH_M = 0.3
 """Minimum depth of a used joint, m."""
-_NOISE = ObservationConfig()
 
 
 @dataclass(frozen=True)
@@ -97,12 +97,10 @@ class Footage:
         xy, confidence, size = observed(groups, sightings)
         placed = triangulate(xy, confidence, size, views)
         near = (placed.depth > MIN_DEPTH_M) & (placed.miss_px < GATE * size[:, None])
-        weight = _NOISE.weight(confidence) / _NOISE.scatter(self.joints)[:, None] ** 2
-        at = np.where(near, placed.depth, np.nan)
-        sigma = np.hypot(
-            _NOISE.floor_rad * rig.focal_px, _NOISE.sigma_m * rig.focal_px / at
-        ) / np.sqrt(weight)
-        placeable = _well_placed(placed.points, sigma * at / rig.focal_px, rig)
+        rows = Observations(np.nan_to_num(xy), confidence, placed.points)
+        sigma = observation_sigmas(rows, placed.points, views, ObservationConfig(), self.joints)
+        sigma = np.where(near, sigma, np.nan)
+        placeable = _well_placed(placed.points, sigma * placed.depth / rig.focal_px, rig)
         points = np.where(placeable[..., None], placed.points, np.nan)
         return People(groups.frame, xy, np.where(placeable[..., None], sigma, np.nan), points)
 
