@@ -55,8 +55,7 @@ LEVELS = (
     "pipeline.explaining",
     "live",
     "simulation viz.bodies detection2d",
-    "viz.overlay setup_check",
-    "calibration",
+    "viz.overlay cameras",
     "io.export",
     "live.outputs viz.report",
     "evaluation",
@@ -194,7 +193,7 @@ NOT_UNIQUE = {"eig", "eigh", "svd", "qr", "schur", "multivariate_normal"}
 choose."""
 WITHOUT_CHOICE = {
     "shapepose_fg.core.decompositions": "removes it",
-    "shapepose_fg.calibration.moving_camera": "makes errors whose outer products are summed",
+    "shapepose_fg.cameras.moving": "makes errors whose outer products are summed",
     "factors.camera_of": "gives signs: depth and focal lengths are positive",
     "factors.lasting": "makes symmetric roots and projectors",
     "shapepose_fg.evaluation.score": "gives rotations, which have no sign",
