@@ -38,7 +38,7 @@ def explain(
     from shapepose_fg.core.reconstruction import Reconstruction
     from shapepose_fg.core.result_files import results_folder
     from shapepose_fg.io.detections.reading import read_detections
-    from shapepose_fg.io.solved_setup import cameras_of
+    from shapepose_fg.io.result_cameras import cameras_of
     from shapepose_fg.pipeline.explaining import explain
 
     if (frame is None) == (time is None):

@@ -146,7 +146,7 @@ def _tracks_table(results: Path) -> "RenderableType":
 
 def _body_of(run: "Mapping[str, Any]") -> "SmplArrays | None":
     """The body model of a result; None if its file is missing."""
-    from shapepose_fg.io.solved_setup import body_of
+    from shapepose_fg.body.model.result_body import body_of
 
     try:
         return body_of(run)
@@ -198,7 +198,7 @@ def _solver(folder: Path) -> "Solve | None":
     Without identities every row is solved separately.
     """
     from shapepose_fg.core.reconstruction import Reconstruction
-    from shapepose_fg.io.solved_setup import CAMERAS
+    from shapepose_fg.core.rig_file import CAMERAS
 
     if not all((folder / name).is_file() for name in ("run.json", "observations.npz", CAMERAS)):
         return None

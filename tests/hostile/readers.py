@@ -34,8 +34,8 @@ from shapepose_fg.io.export.registry import FORMATS
 from shapepose_fg.io.footage.placement import read_used_footage
 from shapepose_fg.io.pose2sim_project import read_pose2sim_project
 from shapepose_fg.io.recording import read_moments, write_moments
+from shapepose_fg.io.result_cameras import cameras_of
 from shapepose_fg.io.skeleton_file import read_skeleton
-from shapepose_fg.io.solved_setup import cameras_of
 from shapepose_fg.io.timestamps import read_timestamps
 from shapepose_fg.io.trajectories import read_trajectory
 from shapepose_fg.pipeline.explaining import explain

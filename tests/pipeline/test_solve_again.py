@@ -16,8 +16,8 @@ from shapepose_fg.cli.main import main
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.observation_table import Gate
 from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.rig_file import CAMERAS
 from shapepose_fg.io.calibration import write_rig
-from shapepose_fg.io.solved_setup import CAMERAS
 from shapepose_fg.pipeline import setup, solve_again
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
 from shapepose_fg.pipeline.solve_again import Solver, solve_rows
