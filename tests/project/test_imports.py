@@ -21,8 +21,8 @@ LEVELS = (
     "tracking",
     "io",
     "detection2d evaluation pipeline setup_check",
-    "calibration live viz",
-    "simulation",
+    "calibration live results simulation",
+    "viz",
     "cli",
     "shapepose_fg __main__",
 )

@@ -32,7 +32,6 @@ from shapepose_fg.core.storage.kept_arrays import ANEW, InFolder
 from shapepose_fg.core.storage.output_folder import only_run_in, prepare_output
 from shapepose_fg.core.trust import Trusted, trust_in, without_poses
 from shapepose_fg.io.calibration import write_rig
-from shapepose_fg.io.corrections import refuse_corrected
 from shapepose_fg.io.detection_table import DetectionTable
 from shapepose_fg.io.footage.placement import FOOTAGE
 from shapepose_fg.io.recording import read_recording, write_moments
@@ -42,6 +41,7 @@ from shapepose_fg.pipeline.pipeline import Task, reconstruct_parts
 from shapepose_fg.pipeline.runs import manifest
 from shapepose_fg.pipeline.runs.assembly import Assembly
 from shapepose_fg.pipeline.trajectories import kept_rig
+from shapepose_fg.results.corrections import refuse_corrected
 from shapepose_fg.setup_check.report import SetupReport, result_check
 from shapepose_fg.viz.report.writing import MOST_ROWS, REPORT, th, write_report
 

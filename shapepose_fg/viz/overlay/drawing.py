@@ -15,11 +15,11 @@ from shapepose_fg.core.camera import Camera
 from shapepose_fg.core.drawing import bones_of, colour_of, vertex_normals
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import Known, Reconstruction
+from shapepose_fg.core.rendering import NEAR_M, shaded
 from shapepose_fg.core.storage.files import write_atomically
 from shapepose_fg.io.footage.footage import Picture
 from shapepose_fg.io.footage.placement import Placement
-from shapepose_fg.viz.bodies import joined
-from shapepose_fg.viz.rendering import NEAR_M, shaded
+from shapepose_fg.viz.overlay.bodies import joined
 
 Colour = tuple[int, int, int]
 """Blue, green, red, 0 to 255."""

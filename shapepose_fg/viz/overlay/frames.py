@@ -17,8 +17,8 @@ from shapepose_fg.core.observation_table import Gate
 from shapepose_fg.core.reconstruction import OpenedReconstruction, Reconstruction
 from shapepose_fg.io.footage.footage import Footage, Picture
 from shapepose_fg.io.footage.placement import CameraFootage
-from shapepose_fg.viz.bodies import surfaces
 from shapepose_fg.viz.overlay import drawing
+from shapepose_fg.viz.overlay.bodies import surfaces
 
 if TYPE_CHECKING:
     from shapepose_fg.body.model.body_model import BodyModel

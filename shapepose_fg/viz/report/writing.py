@@ -16,7 +16,7 @@ from shapepose_fg.core.run_summary import has_identities
 from shapepose_fg.core.storage.files import write_atomically
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.export.take import Take
-from shapepose_fg.tracking.listing import list_tracks
+from shapepose_fg.results.track_summary import list_tracks
 from shapepose_fg.viz.report.figures import Curve, angle_curves
 from shapepose_fg.viz.report.page import page_text
 from shapepose_fg.viz.report.scene import Scene, scene_of

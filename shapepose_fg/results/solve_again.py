@@ -24,8 +24,8 @@ from shapepose_fg.estimation.motion_densities import MotionModel
 from shapepose_fg.estimation.noise_law import NoiseLaw
 from shapepose_fg.estimation.user_factors import ExtraFactors
 from shapepose_fg.estimation.window_solution import PersonGraph, WindowSolution
+from shapepose_fg.io.calibration.reading import cameras_of
 from shapepose_fg.io.config import ANOTHER_VERSION, config_from
-from shapepose_fg.io.result_cameras import cameras_of
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.keyframes import looked_at, with_rows_like
 from shapepose_fg.pipeline.person_shapes import with_person_shapes
