@@ -151,6 +151,7 @@ def test_an_unknown_focal_length_is_found_too(walk, filmed):
     assert start.focal == pytest.approx(1.06, abs=0.015)
 
 
+@pytest.mark.slow
 def test_an_unknown_principal_point_is_found_and_does_not_turn_the_camera(walk, filmed, one_start):
     """Found as a rotation of the camera instead, it would be off by 1.6 degrees."""
     wrong = replace(filmed, rays=filmed.rays + np.array([0.02, -0.02, 0.0]))
@@ -161,6 +162,7 @@ def test_an_unknown_principal_point_is_found_and_does_not_turn_the_camera(walk, 
     np.testing.assert_allclose(camera.K[:2, 2] - K[:2, 2], [20, -20], atol=6)
 
 
+@pytest.mark.slow
 def test_an_unknown_distortion_is_found_and_does_not_move_the_camera(walk, filmed, one_start):
     """People look 1 to 3 % larger through such a lens."""
     square = (filmed.rays[..., :2] ** 2).sum(axis=-1, keepdims=True)
@@ -172,6 +174,7 @@ def test_an_unknown_distortion_is_found_and_does_not_move_the_camera(walk, filme
     assert np.sqrt((away**2).mean()) < start.within_m
 
 
+@pytest.mark.slow
 def test_the_prior_on_the_unit_stays_where_it_was_given(walk, filmed, one_start):
     """People look 4 % larger than the log says: refined again, the start stays."""
     log = replace(filmed.trajectory, drift=0.002)

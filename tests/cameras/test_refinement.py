@@ -286,6 +286,7 @@ def test_the_command_writes_cameras_and_says_what_changed(
         assert code == 2 and said in " ".join(error.split())
 
 
+@pytest.mark.slow
 def test_a_distortion_is_found_from_a_wrong_one(rig, people):
     lens = np.array([-0.2, 0.05, 0.0, 0.0, 0.0])
     true, given = (

@@ -54,15 +54,17 @@ def some_cameras(recording, rig, views):
     )
 
 
-def test_nothing_is_said_where_nothing_is_wrong(recording, room):
+def test_nothing_is_said_where_nothing_is_wrong_and_a_turned_camera_is_named(recording, room):
     diagnosis = diagnose(recording, room)
     assert diagnosis.findings == ()
     # Bones of the three are 0.94, 0.99 and 1.04 times those of a figure of 1.7 m; ratios of bones
     # vary by 10 %.
     assert diagnosis.build.stature == pytest.approx(1.7, abs=0.17)
+    np.testing.assert_allclose(diagnosis.build.up, [0, 0, 1], atol=0.03)
     odd = diagnose(recording, turned(room, 2, 5.0, np.array([0.0, 1.0, 0.0])))
     assert len(diagnosis.look.evidence.anchors) < len(odd.look.evidence.anchors) / 2
-    np.testing.assert_allclose(diagnosis.build.up, [0, 0, 1], atol=0.03)
+    assert [(each.kind, each.cameras) for each in odd.findings] == [(Kind.TURNED, (2,))]
+    assert odd.findings[0].amount == pytest.approx(5, rel=0.05, abs=0.35)
 
 
 @pytest.mark.slow
@@ -72,7 +74,7 @@ def test_nothing_is_said_of_fewer_cameras(recording, room, views):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("degrees", [1, 5, 180])
+@pytest.mark.parametrize("degrees", [1, 180])
 def test_a_turned_camera_is_named_with_its_angle(recording, room, degrees):
     found = only_finding(recording, turned(room, 2, degrees, np.array([0.3, 1.0, 0.2])))
     # A degree is hardly told from a shift of the principal point, and the sentence says both.
