@@ -7,20 +7,15 @@ import numpy as np
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.compiled import kernel
 from shapepose_fg.proposal.candidates import PairPoints
-from shapepose_fg.proposal.people_2d import group_people
+from shapepose_fg.proposal.growth import GrowthConfig
+from shapepose_fg.proposal.people_2d import LEAST_COMMON, group_people
 from shapepose_fg.proposal.possible_people import Frame, PossiblePeople, connected, settled, sizes
 
-_LEAST_JOINTS = 3
-"""Minimum number of connected joints at which rays of two 2D people intersect: two hips may do so
-by chance."""
 _LEAST_SHARE = 0.25
 """Minimum share of the joints seen by both views with intersecting rays; below it, halves of two
 people are mixed."""
-_LEAST_AFFINITY = 0.2
-"""Minimum affinity that groups detections: unrelated pairs are mostly 0, true ones above 0.4 (as
-`growth.doubt`)."""
-_SAME_M = 0.2
-"""Distance, m, below which joints of two hypotheses agree."""
+SAME_M = 0.2
+"""Distance, m, below which joints of two hypotheses are of one person: a pelvis is 20 cm deep."""
 _SAME_SHARE = 0.8
 """Share of the smaller hypothesis's joints that must agree for the two to be duplicates."""
 _PASSES = 3
@@ -37,7 +32,7 @@ def pooled(points: PairPoints, free: Mask, frame: Frame) -> PossiblePeople:
     group = _groups(free, frame)
     places, owners = _meeting(points, group, frame)
     part = connected(places, frame)
-    hypothesis, first = np.nonzero(sizes(part) >= _LEAST_JOINTS)
+    hypothesis, first = np.nonzero(sizes(part) >= LEAST_COMMON)
     places = np.where((part[hypothesis] == first[:, None])[..., None], places[hypothesis], np.nan)
     owners, detections = owners[hypothesis], frame.detections
     confidence = np.zeros((group.max(initial=-1) + 1, places.shape[1]))
@@ -62,11 +57,11 @@ def _groups(free: Mask, frame: Frame) -> Index:
     joints.
     """
     detections = frame.detections
-    tied = free[detections.pairs].all(axis=1) & (detections.affinity >= _LEAST_AFFINITY)
+    tied = free[detections.pairs].all(axis=1) & (detections.affinity >= GrowthConfig.doubt)
     tied = replace(detections, pairs=detections.pairs[tied], affinity=detections.affinity[tied])
     group = np.full(len(detections), -1, dtype=np.intp)
     for number, members in enumerate(
-        each for each in group_people(tied) if len(each) >= _LEAST_JOINTS
+        each for each in group_people(tied) if len(each) >= LEAST_COMMON
     ):
         group[members] = number
     return group
@@ -87,7 +82,7 @@ def _meeting(points: PairPoints, group: Index, frame: Frame) -> tuple[Array, Ind
     has[group[group >= 0], frame.detections.joint[group >= 0]] = True
     shared = (has[owners[:, 0]] & has[owners[:, 1]]).sum(axis=1)
     met = np.bincount(place, minlength=len(pair))
-    enough = (met >= _LEAST_JOINTS) & (met >= _LEAST_SHARE * shared)
+    enough = (met >= LEAST_COMMON) & (met >= _LEAST_SHARE * shared)
     return places[enough], owners[enough]
 
 
@@ -108,7 +103,7 @@ def _sieve(places, order, stays):
     """Fill in the indices that stay, going through `order`, as far as the array reaches; returns
     their number.
     """
-    count, least = 0, _SAME_M * _SAME_M
+    count, least = 0, SAME_M * SAME_M
     for h in order:
         alone = True
         for n in range(count):
