@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     from shapepose_fg.io.detections import read_detections as read_detections
     from shapepose_fg.live.online import OnlineReconstructor as OnlineReconstructor
     from shapepose_fg.pipeline.execution import Execution as Execution
-    from shapepose_fg.pipeline.explaining import explain as explain
     from shapepose_fg.pipeline.pipeline import PipelineConfig as PipelineConfig
     from shapepose_fg.pipeline.pipeline import reconstruct as reconstruct
     from shapepose_fg.pipeline.pipeline import refine_trajectories as refine_trajectories
+    from shapepose_fg.results.explain import explain as explain
 
 _HOMES = {
     "Execution": "shapepose_fg.pipeline.execution",
@@ -30,7 +30,7 @@ _HOMES = {
     "OnlineReconstructor": "shapepose_fg.live.online",
     "PipelineConfig": "shapepose_fg.pipeline.pipeline",
     "Reconstruction": "shapepose_fg.core.reconstruction",
-    "explain": "shapepose_fg.pipeline.explaining",
+    "explain": "shapepose_fg.results.explain",
     "read_config": "shapepose_fg.io.config",
     "read_detections": "shapepose_fg.io.detections",
     "read_rig": "shapepose_fg.io.calibration",

@@ -8,7 +8,7 @@ from drawing import save
 from factors import isotropic
 from shapepose_fg import reconstruct
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.pipeline.solve_again import window_solutions
+from shapepose_fg.results.solve_again import window_solutions
 from shapepose_fg.simulation import built_in_scene, simulate
 
 WRIST, TOUCHED = BODY_25.index("RWrist"), 6

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from shapepose_fg.body.fitting.priors import NUM_ANGLES, PosePrior
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
+from shapepose_fg.body.model.result_body import model_of
 from shapepose_fg.body.model.rotation import exp_so3, right_jacobian_inverse
 from shapepose_fg.body.model.smpl_file import NUM_BETAS
 from shapepose_fg.core.arrays import Array
@@ -24,8 +25,7 @@ from shapepose_fg.core.camera import Axis
 from shapepose_fg.core.errors import InputError, optional
 from shapepose_fg.core.reconstruction import BODY, Known, Reconstruction, with_body
 from shapepose_fg.core.skeleton import SMPL_24
-from shapepose_fg.io.export.take import opensim_axes
-from shapepose_fg.io.solved_setup import model_of
+from shapepose_fg.core.world_axes import opensim_axes
 
 _ISB = np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]])
 """Axes forward, up and right (columns) in the frame of the body model."""

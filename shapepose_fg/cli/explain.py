@@ -10,7 +10,7 @@ from shapepose_fg.core.errors import InputError
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-    from shapepose_fg.pipeline.explanation import Explanation
+    from shapepose_fg.results.explanation import Explanation
 
 
 @grouped
@@ -37,9 +37,9 @@ def explain(
     """
     from shapepose_fg.core.reconstruction import Reconstruction
     from shapepose_fg.core.result_files import results_folder
+    from shapepose_fg.io.calibration.reading import cameras_of
     from shapepose_fg.io.detections.reading import read_detections
-    from shapepose_fg.io.solved_setup import cameras_of
-    from shapepose_fg.pipeline.explaining import explain
+    from shapepose_fg.results.explain import explain
 
     if (frame is None) == (time is None):
         raise InputError("--frame and --time: give one of them")

@@ -75,7 +75,7 @@ def overlay(
     if drawn.stills is not None and frames is not None:
         raise InputError("--stills and --frames: both select frames; give one of them")
     from shapepose_fg.core.reconstruction import Reconstruction
-    from shapepose_fg.io.solved_setup import cameras_of
+    from shapepose_fg.io.calibration.reading import cameras_of
     from shapepose_fg.viz.overlay.frames import Overlay, write_overlay
 
     folder = results_folder(results)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from shapepose_fg.body.model.smpl_file import SmplArrays
     from shapepose_fg.core.reconstruction import Reconstruction
-    from shapepose_fg.tracking.edits import Solve
+    from shapepose_fg.results.edits import Solve
 
 _ACTIONS = {
     "list": (),
@@ -79,7 +79,7 @@ def tracks(
 
 def _print_as_json(results: Path) -> None:
     from shapepose_fg.core.reconstruction import Reconstruction
-    from shapepose_fg.tracking.listing import list_saved_tracks
+    from shapepose_fg.results.track_summary import list_saved_tracks
 
     with Reconstruction.open(results) as opened:
         listed = [asdict(track) for track in list_saved_tracks(opened, _body_of(opened.run))]
@@ -92,7 +92,7 @@ def _print_as_json(results: Path) -> None:
 
 def _undo(results: Path) -> None:
     """Take the last correction back."""
-    from shapepose_fg.io.corrections import take_back
+    from shapepose_fg.results.corrections import take_back
 
     folder = results_folder(results)
     edit, _ = take_back(folder, _solver(folder))
@@ -106,8 +106,8 @@ def _tracks_table(results: Path) -> "RenderableType":
 
     from shapepose_fg.core.frame_times import rate_words
     from shapepose_fg.core.reconstruction import Reconstruction
-    from shapepose_fg.io.corrections import read_corrections
-    from shapepose_fg.tracking.listing import list_saved_tracks
+    from shapepose_fg.results.corrections import read_corrections
+    from shapepose_fg.results.track_summary import list_saved_tracks
 
     with Reconstruction.open(results) as opened:
         run, rows = opened.run, len(opened)
@@ -146,7 +146,7 @@ def _tracks_table(results: Path) -> "RenderableType":
 
 def _body_of(run: "Mapping[str, Any]") -> "SmplArrays | None":
     """The body model of a result; None if its file is missing."""
-    from shapepose_fg.io.solved_setup import body_of
+    from shapepose_fg.body.model.result_body import body_of
 
     try:
         return body_of(run)
@@ -157,8 +157,8 @@ def _body_of(run: "Mapping[str, Any]") -> "SmplArrays | None":
 def _correct(results: Path, action: str, new: int | None, **numbers: int) -> None:
     """Apply one correction, and print its effect."""
     from shapepose_fg.core.reconstruction import Reconstruction
-    from shapepose_fg.io.corrections import correct
-    from shapepose_fg.tracking.edits import Action, Edit, free_number
+    from shapepose_fg.results.corrections import correct
+    from shapepose_fg.results.edits import Action, Edit, free_number
 
     folder = results_folder(results)
     if action == "split" and new is None:
@@ -198,7 +198,7 @@ def _solver(folder: Path) -> "Solve | None":
     Without identities every row is solved separately.
     """
     from shapepose_fg.core.reconstruction import Reconstruction
-    from shapepose_fg.io.solved_setup import CAMERAS
+    from shapepose_fg.core.rig_file import CAMERAS
 
     if not all((folder / name).is_file() for name in ("run.json", "observations.npz", CAMERAS)):
         return None
@@ -213,7 +213,7 @@ def _solver(folder: Path) -> "Solve | None":
             )
 
     def solve(rows: "Reconstruction") -> "Reconstruction":
-        from shapepose_fg.pipeline.solve_again import Solver, solve_rows
+        from shapepose_fg.results.solve_again import Solver, solve_rows
 
         return solve_rows(rows, Solver.read(folder, rows))
 

@@ -7,6 +7,7 @@ this module and `factors` call `eigh`, `svd` and `qr`.
 """
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from shapepose_fg.core.arrays import Array
 
@@ -82,3 +83,12 @@ def basis_across(axis: Array) -> Array:
     return np.array(
         [[1.0 + sign * x * x * a, sign * x * y * a, -sign * x], [x * y * a, sign + y * y * a, -y]]
     )
+
+
+def comparable(values: ArrayLike) -> Array:
+    """Values rounded for comparisons, so that those that differ only by the processor's rounding
+    become equal.
+
+    Periodic or symmetric motions give many ties, of which the first is then chosen.
+    """
+    return np.round(np.asarray(values, dtype=np.float64), 9)

@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.body.model.body_model import BodyParameters
+from shapepose_fg.body.model.result_body import model_of
 from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.evaluation.metrics import covariance_calibration, match_people, metrics_of
 from shapepose_fg.evaluation.track_metrics import TrackFrame, track_metrics
-from shapepose_fg.io.solved_setup import model_of
 
 WRISTS = [BODY_25.index("RWrist"), BODY_25.index("LWrist")]
 UNMATCHED = np.iinfo(np.int64).min

@@ -21,10 +21,10 @@ from shapepose_fg.core.run_summary import covered_frames, has_identities
 from shapepose_fg.core.skeleton import SMPL_24
 from shapepose_fg.core.storage.files import MIDDLE, read_bytes, read_json
 from shapepose_fg.core.storage.npz import NpzFile, read_npz
+from shapepose_fg.core.world_axes import z_up
 from shapepose_fg.evaluation.metrics import PlainPeople
 from shapepose_fg.evaluation.shelf import SHELF_JOINTS, read_shelf_ground_truth
 from shapepose_fg.io.export.motion_files import OPEN_BODY
-from shapepose_fg.io.export.take import z_up
 
 _PANOPTIC = (
     "Neck Nose MidHip LShoulder LElbow LWrist LHip LKnee LAnkle RShoulder RElbow RWrist RHip "

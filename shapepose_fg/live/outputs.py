@@ -19,11 +19,11 @@ from typing import Any
 
 import numpy as np
 
+from shapepose_fg.body.model.result_body import body_of
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.reconstruction import BODY, Reconstruction
 from shapepose_fg.io.ros.mcap_files import McapWriter
 from shapepose_fg.io.ros.messages import COVARIANCES
-from shapepose_fg.io.solved_setup import body_of
 from shapepose_fg.live.sockets import MOST_CLIENTS, accept, listen
 
 Publish = Callable[[str, Reconstruction], None]

@@ -12,8 +12,8 @@ from annotated_types import Interval
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.bounds import Metres, MetresOrNone, RepeatsOrNone, Settings, Share
 from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.greedy_matching import match_best_first
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.proposal.assignment import match_best_first
 from shapepose_fg.proposal.candidates import Candidates
 
 

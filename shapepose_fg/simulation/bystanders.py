@@ -8,7 +8,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.core.arrays import Array
-from shapepose_fg.simulation.choices import comparable
+from shapepose_fg.core.decompositions import comparable
 from shapepose_fg.simulation.limbs import turned_about
 from shapepose_fg.simulation.mocap import Clip, Mocap, blend
 from shapepose_fg.simulation.motion import along, left_of

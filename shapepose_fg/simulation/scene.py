@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Camera, Rig
+from shapepose_fg.core.rendering import look_at
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.simulation.motion import Build, Motion, close_motion
-from shapepose_fg.viz.rendering import look_at
 
 if TYPE_CHECKING:  # not needed by visibility workers
     from shapepose_fg.body.model.body_model import BodyModel, BodyParameters

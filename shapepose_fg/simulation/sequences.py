@@ -14,6 +14,7 @@ import numpy as np
 
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.decompositions import comparable
 from shapepose_fg.core.skeleton import smpl_joints
 from shapepose_fg.simulation.bystanders import (
     stand,
@@ -22,7 +23,6 @@ from shapepose_fg.simulation.bystanders import (
     walking_clips,
     way_through,
 )
-from shapepose_fg.simulation.choices import comparable
 from shapepose_fg.simulation.limbs import turned_about
 from shapepose_fg.simulation.mocap import Clip, Mocap
 from shapepose_fg.simulation.motion import Motion

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from shapepose_fg.core.arrays import Array, Index, Mask, Real
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.drawing import thinned
+from shapepose_fg.core.rendering import first_surface_at, scaled
 from shapepose_fg.core.skeleton import BODY_25, SMPL_24
 from shapepose_fg.pipeline.workers import workers as worker_processes
-from shapepose_fg.viz.rendering import first_surface_at, scaled
 
 if TYPE_CHECKING:
     from shapepose_fg.body.model.body_model import BodyModel

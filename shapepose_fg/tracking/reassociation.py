@@ -9,7 +9,6 @@ from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.detections import Input
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.proposal.assignment import lesser
 from shapepose_fg.proposal.nearby import FrameArrays
 from shapepose_fg.proposal.pairs_of_people import SAME_M
 from shapepose_fg.proposal.possible_people import Frame, PossiblePeople, gaps
@@ -88,6 +87,13 @@ def who_goes(
     """(P,) whether to remove: the least probable person below `least`, and the less probable of
     duplicates.
     """
-    doubles = ((core_distance(joints, joints, skeleton) < double_m) & lesser(sure)).any(axis=1)
+    doubles = ((core_distance(joints, joints, skeleton) < double_m) & _smaller(sure)).any(axis=1)
     # Detections that one person releases may help another.
     return doubles | ((sure < least) & (sure == sure.min()))
+
+
+def _smaller(value: Array) -> Mask:
+    """(P, P) whether one has a smaller `value` (P,) than another; on a tie, the later one has."""
+    return (value[:, None] < value) | (
+        (value[:, None] == value) & np.tri(len(value), k=-1, dtype=bool)
+    )

@@ -1,6 +1,7 @@
 """Three people who walk and wave before four cameras; what may be wrong with these."""
 
 import pickle
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -164,23 +165,44 @@ def merged(rig: Rig, parts: list[np.ndarray]) -> Recording:
     return Recording(seen[0].skeleton, frames)
 
 
-@pytest.fixture
-def as_detected(rig, late, tmp_path, monkeypatch) -> Path:
-    """What `detect` leaves of phones that were started and stopped by hand: detections under their
-    own numbers, and times that say which frames each has.
+@pytest.fixture(scope="session")
+def late_files(rig, late, tmp_path_factory) -> Path:
+    """The folder of `late` and its cameras: rig.json, calibration.json and detection/."""
+    folder = tmp_path_factory.mktemp("late")
+    write_rig(rig, folder / "rig.json")
+    write_association(late, rig, folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def detected_files(rig, late, tmp_path_factory) -> Path:
+    """The folder that `detect` leaves of phones that were started and stopped by hand: detections
+    under their own numbers, and times that say which frames each has.
     """
-    monkeypatch.chdir(tmp_path)
+    folder = tmp_path_factory.mktemp("detected")
     shown = np.arange(300)[:, None] < [300, 250, 300, 220]
     own = Recording(
         BODY_25, [frame.only(has[frame.view]) for frame, has in zip(late, shown, strict=True)]
     )
-    write_rig(rig, tmp_path / "rig.json")
-    write_association(own, rig, tmp_path)
+    write_rig(rig, folder / "rig.json")
+    write_association(own, rig, folder)
     time_s = np.repeat(np.arange(300)[:, None] / FPS, 4, axis=1)
-    write_timestamps(
-        tmp_path / "detection" / "times.csv", rig.names, np.where(shown, time_s, np.nan)
-    )
-    return tmp_path
+    write_timestamps(folder / "detection" / "times.csv", rig.names, np.where(shown, time_s, np.nan))
+    return folder
+
+
+@pytest.fixture
+def in_late_files(late_files, tmp_path, monkeypatch) -> None:
+    """The working directory is a copy of `late_files`."""
+    shutil.copytree(late_files, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def in_detected_files(detected_files, tmp_path, monkeypatch) -> None:
+    """The working directory is a copy of `detected_files`."""
+    shutil.copytree(detected_files, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
 
 
 COMMON = round((10.78 - 4.0) * FPS)

@@ -17,6 +17,7 @@ from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.decompositions import nearest_rotation, rigid
 from shapepose_fg.core.detections import Detections, Recording
+from shapepose_fg.core.rendering import look_at
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.core.trajectory import Trajectory
 from shapepose_fg.simulation.bystanders import walk_along, walking_clips, way_through
@@ -25,7 +26,6 @@ from shapepose_fg.simulation.mocap import Mocap
 from shapepose_fg.simulation.performance import Performance, together
 from shapepose_fg.simulation.scene import UP, Scene
 from shapepose_fg.simulation.visibility import Skin, see
-from shapepose_fg.viz.rendering import look_at
 
 SECONDS, FPS = 60.0, 60.0
 """Duration of a recording, s, and rate of the simulated motion, Hz."""

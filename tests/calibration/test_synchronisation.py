@@ -17,8 +17,6 @@ from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.detections import Recording
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import Reconstruction
-from shapepose_fg.io.calibration import write_rig
-from shapepose_fg.io.write_detections import write_association
 from shapepose_fg.setup_check.matching import Sightings
 from tests.calibration.conftest import COMMON, FPS, LATE_S, filmed, merged, moving
 
@@ -127,12 +125,9 @@ def test_a_camera_that_sees_nobody_or_single_frames_is_named(rig, late, every):
 
 @pytest.mark.slow
 def test_the_command_writes_what_reconstruct_takes(
-    rig, late, two_people, tmp_path, capsys, monkeypatch, once
+    in_late_files, two_people, tmp_path, capsys, monkeypatch, once
 ):
     monkeypatch.setattr(synchronisation, "synchronise", once(synchronise))
-    monkeypatch.chdir(tmp_path)
-    write_rig(rig, tmp_path / "rig.json")
-    write_association(late, rig, tmp_path)
     base = [
         "synchronise",
         "--calibration",
@@ -202,7 +197,7 @@ def test_the_command_writes_what_reconstruct_takes(
     ],
 )
 def test_files_of_unequal_length_keep_all_common_footage(
-    as_detected, command, capsys, monkeypatch, once
+    in_detected_files, command, capsys, monkeypatch, once
 ):
     """Any line that is printed next is typed as it is."""
     monkeypatch.setattr(synchronisation, "synchronise", once(synchronise))

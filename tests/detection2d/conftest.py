@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from shapepose_fg.core.camera import Camera, Rig
+from shapepose_fg.core.rendering import look_at
 from shapepose_fg.detection2d.heat_maps import HeatMapNetwork, layouts
 from shapepose_fg.detection2d.onnx_network import OnnxNetwork
-from shapepose_fg.viz.rendering import look_at
 
 Sides = Sequence[int | str]
 """The shape of an input or output; names are sides of any length."""

@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 
 from shapepose_fg.core.camera import Camera
+from shapepose_fg.core.rendering import look_at
 from shapepose_fg.detection2d.upright import UprightView, roll_of
-from shapepose_fg.viz.rendering import look_at
 
 UP = np.array([0.0, 0.0, 1.0])
 

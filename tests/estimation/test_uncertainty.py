@@ -26,9 +26,9 @@ from shapepose_fg.estimation.uncertainty import (
     squared_radius,
     surface_distance,
 )
-from shapepose_fg.pipeline.solve_again import window_solutions
+from shapepose_fg.results.solve_again import window_solutions
 from shapepose_fg.simulation import built_in_scene, simulate
-from shapepose_fg.viz.bodies import surfaces
+from shapepose_fg.viz.overlay.frames import surfaces
 
 WRIST, ELBOW = BODY_25.index("RWrist"), BODY_25.index("RElbow")
 

@@ -13,7 +13,7 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.window_solution import PersonGraph
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
-from shapepose_fg.pipeline.solve_again import window_solutions
+from shapepose_fg.results.solve_again import window_solutions
 from shapepose_fg.simulation import built_in_scene, simulate
 
 WRIST, OTHER_WRIST = BODY_25.index("RWrist"), BODY_25.index("LWrist")

@@ -9,12 +9,15 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+from unittest.mock import patch
 
 from shapepose_fg.cli.main import main
+from shapepose_fg.core.storage.kept_arrays import InFolder
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.simulation.files import write_simulated
 from shapepose_fg.tracking import identities
@@ -64,11 +67,17 @@ class Killing:
         ]
         command += ["--config", str(folder / "settings.toml"), "--fps", "30"]
         command += ["--no-report", "--no-check"]
-        process = _begun([*command, "--workers", "1", "--output", str(folder / "whole")])
-        kept = max(_kept_so_far(process, folder / "whole"))
-        if (said := _ended(process)) != "":
+        names, keep = set[str](), InFolder.keep
+
+        def listed(self: InFolder, name: str, *more: Any) -> None:
+            names.add(name)
+            keep(self, name, *more)
+
+        with patch.object(InFolder, "keep", listed):
+            said = _ended_here([*command, "--workers", "1", "--output", str(folder / "whole")])
+        if said != "":
             raise AssertionError(said)
-        return cls(command, (folder / "whole" / "people.npz").read_bytes(), kept)
+        return cls(command, (folder / "whole" / "people.npz").read_bytes(), _sets(names))
 
     def once(self, number: int, out: Path) -> str:
         """Kill a run into `out` and go on with it: what came of it. AssertionError for what may
@@ -121,8 +130,13 @@ def _kept_so_far(process: subprocess.Popen[str], out: Path) -> Iterator[int]:
     """
     while process.poll() is None:
         names = {file.name for file in (out / "parts").glob("*")}
-        yield sum(name.startswith(("part-", "bodies-")) for name in names) if names else -1
+        yield _sets(names) if names else -1
         time.sleep(0.01)
+
+
+def _sets(names: Iterable[str]) -> int:
+    """How many of these are windows and bodies."""
+    return sum(name.startswith(("part-", "bodies-")) for name in names)
 
 
 def _begun(words: list[str]) -> subprocess.Popen[str]:

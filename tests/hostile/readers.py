@@ -27,22 +27,22 @@ from shapepose_fg.estimation.motion_densities import MotionConfig, MotionModel
 from shapepose_fg.evaluation.shelf import read_shelf_ground_truth
 from shapepose_fg.evaluation.truth import read_people
 from shapepose_fg.io.calibration import read_rig, write_rig
+from shapepose_fg.io.calibration.reading import cameras_of
 from shapepose_fg.io.config import read_config, toml_text
-from shapepose_fg.io.corrections import correct, read_corrections, take_back
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.io.export.registry import FORMATS
 from shapepose_fg.io.footage.placement import read_used_footage
 from shapepose_fg.io.pose2sim_project import read_pose2sim_project
 from shapepose_fg.io.recording import read_moments, write_moments
 from shapepose_fg.io.skeleton_file import read_skeleton
-from shapepose_fg.io.solved_setup import cameras_of
 from shapepose_fg.io.timestamps import read_timestamps
 from shapepose_fg.io.trajectories import read_trajectory
-from shapepose_fg.pipeline.explaining import explain
 from shapepose_fg.pipeline.pipeline import PipelineConfig
-from shapepose_fg.pipeline.solve_again import Solver
-from shapepose_fg.tracking.edits import Action, Edit
-from shapepose_fg.tracking.listing import list_saved_tracks
+from shapepose_fg.results.corrections import correct, read_corrections, take_back
+from shapepose_fg.results.edits import Action, Edit
+from shapepose_fg.results.explain import explain
+from shapepose_fg.results.solve_again import Solver
+from shapepose_fg.results.track_summary import list_saved_tracks
 from shapepose_fg.viz.report.writing import report_of
 from tests.conftest import read_body
 from tests.core import test_reconstruction as results

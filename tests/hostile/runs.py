@@ -27,7 +27,6 @@ from shapepose_fg.core.skeleton import COCO_17
 from shapepose_fg.core.storage.kept_arrays import ANEW, InFolder
 from shapepose_fg.estimation.detector_offsets import OffsetConfig
 from shapepose_fg.io.calibration import write_rig
-from shapepose_fg.io.corrections import CORRECTIONS, correct, read_corrections, take_back
 from shapepose_fg.io.detection_table import DetectionTable
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.io.export.registry import FORMATS, export_result
@@ -43,9 +42,10 @@ from shapepose_fg.pipeline.setup import Setup
 from shapepose_fg.pipeline.solved_windows import SolvedWindows
 from shapepose_fg.pipeline.windows import WindowConfig
 from shapepose_fg.proposal.thinning import ThinnedFrames
+from shapepose_fg.results.corrections import CORRECTIONS, correct, read_corrections, take_back
+from shapepose_fg.results.edits import Action, Edit
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.tracking import identities
-from shapepose_fg.tracking.edits import Action, Edit
 from shapepose_fg.tracking.identities import FollowingConfig
 from tests.core import test_reconstruction as results
 from tests.estimation.test_windows import NobodyFitter

@@ -21,7 +21,7 @@ from shapepose_fg.pipeline.keyframes import (
     with_rows_between,
 )
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
-from shapepose_fg.pipeline.solve_again import Solver, solve_rows
+from shapepose_fg.results.solve_again import Solver, solve_rows
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.simulation.files import truth_of
 

@@ -243,9 +243,15 @@ def test_a_guide_is_typed_in_an_empty_folder(page, tmp_path, monkeypatch, capsys
             type_commands(block, capsys)
 
 
+FRAMES = 16
+"""Frames of recordings that pages simulate, here: all commands take them as they take more."""
+
+
 def type_commands(block: str, capsys) -> None:
     """Run the program's commands in a shell block; each must end well."""
-    for command in commands_in(block):
+    for command in commands_in(
+        re.sub(r"(shapepose-fg simulate .*--frames) :\d+", rf"\1 :{FRAMES}", block)
+    ):
         with pytest.raises(SystemExit) as end:
             main(shlex.split(command)[1:])
         assert end.value.code in (0, None), f"{command}: {capsys.readouterr()}"

@@ -7,10 +7,14 @@ from pathlib import Path
 import cv2
 import pytest
 
+from shapepose_fg import simulation
+
 FOLDER = Path(__file__).parents[2] / "docs" / "examples"
 SCRIPTS = sorted(FOLDER.glob("[0-9][0-9]_*.py"))
 SLOW = ("02", "03", "05", "06", "08", "11", "12")
 """Those that take seconds, and use little that the others do not."""
+FRAMES = 14
+"""Most frames that a script simulates here: all calls and the picture are those of more frames."""
 
 pytest.importorskip("matplotlib", reason="examples draw with Matplotlib, of the extra dev")
 
@@ -24,6 +28,17 @@ def empty_folder(tmp_path, monkeypatch) -> Path:
     return tmp_path
 
 
+@pytest.fixture
+def short_scenes(monkeypatch) -> None:
+    """Simulated scenes of `FRAMES` frames at most."""
+    whole = simulation.built_in_scene
+
+    def shorter(*given: object, frames: int = FRAMES, **more: object) -> simulation.Scene:
+        return whole(*given, frames=min(frames, FRAMES), **more)
+
+    monkeypatch.setattr(simulation, "built_in_scene", shorter)
+
+
 @pytest.mark.parametrize(
     "script",
     [
@@ -31,6 +46,7 @@ def empty_folder(tmp_path, monkeypatch) -> Path:
         for each in SCRIPTS
     ],
 )
+@pytest.mark.usefixtures("short_scenes")
 def test_an_example_draws_where_it_is_told(script, empty_folder, monkeypatch):
     picture = empty_folder / "drawn.png"
     monkeypatch.setattr("sys.argv", [str(script), str(picture)])

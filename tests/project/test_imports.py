@@ -13,65 +13,21 @@ import pytest
 ROOT = Path(__file__).parents[2]
 
 LEVELS = (
-    "factors core.arrays core.errors core.rows",
-    "core.storage.files core.decompositions core.validation",
-    "core.kept_kernels core.bounds",
-    "core.compiling",
-    "core.compiled",
-    "core.skeleton core.kernel_geometry core.assignment core.lens core.trajectory core.frame_times",
-    "core.joint_names",
-    "core.camera",
-    "core.drawing",
-    "core.storage.npz",
-    "core.storage.schema",
-    "core.storage.output_folder core.storage.kept_arrays core.shapes core.provenance"
-    " core.run_summary core.rig_file viz.rendering pipeline.workers cli.terminal cli.stopping",
-    "core.result_files",
-    "body.kernels",
-    "body.model",
-    "body.fitting body.shapes",
-    "body.offsets body.joint_order",
-    "core.detections core.frame_sets",
-    "core.trust",
-    "core.observations core.notes core.repeated_pictures",
-    "core.observation_table",
-    "core.reconstruction",
-    "proposal",
+    "factors",
+    "core",
+    "body",
+    "biomechanics proposal",
     "estimation",
     "tracking",
-    "pipeline.solve_window pipeline.keyframes",
-    "pipeline.config pipeline.cluster pipeline.person_shapes",
-    "pipeline.windows",
-    "pipeline.runs",
-    "pipeline.setup pipeline.execution",
-    "pipeline.offsets pipeline.solved_windows",
-    "pipeline.trajectories",
-    "pipeline.pipeline",
     "io",
-    "io.export.take",
-    "biomechanics",
-    "pipeline.solve_again",
-    "pipeline.explanation",
-    "pipeline.explaining",
-    "live",
-    "simulation viz.bodies detection2d",
-    "viz.overlay setup_check",
-    "calibration",
-    "io.export",
-    "live.outputs viz.report",
-    "evaluation",
-    "cli.options",
-    "cli.pictures cli.found_cameras cli.setup_table",
-    "cli.reconstruct",
-    "cli.batch",
-    "cli.tracks cli.detect cli.overlay cli.export cli.report cli.view cli.setup "
-    "cli.simulate cli.train_fitter cli.batch.command cli.refine cli.synchronise cli.live "
-    "cli.calibrate cli.explain cli.evaluate",
-    "cli.compile cli.demo",
-    "cli.main",
-    "__main__",
+    "detection2d evaluation pipeline setup_check",
+    "calibration live results simulation",
+    "viz",
+    "cli",
+    "shapepose_fg __main__",
 )
-"""Each level imports only from those before it; a package may import its own modules too."""
+"""Folders; each level imports only from those before it. Folders of one level import nothing from
+each other. `shapepose_fg` is the package's own front."""
 
 LEVEL_OF = {name: level for level, names in enumerate(LEVELS) for name in names.split()}
 
@@ -106,74 +62,56 @@ def imports(tree: ast.AST) -> set[str]:
     return found
 
 
-def imported_on_import(tree: ast.Module) -> set[str]:
-    """Modules that importing the file imports: not those in functions, nor those for the type
-    checker alone.
-    """
-    waiting, found = list(tree.body), set()
-    while waiting:
-        node = waiting.pop()
-        if isinstance(node, ast.Import | ast.ImportFrom):
-            found |= imports(node)
-        elif isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING"):
-            waiting += node.orelse
-        elif isinstance(node, ast.If | ast.Try | ast.With):
-            waiting += [
-                child for child in ast.iter_child_nodes(node) if isinstance(child, ast.stmt)
-            ]
-    return found
-
-
-def room(module: str) -> str:
-    """The name in `LEVELS` that a module belongs to: `body.model` for
+def folder(module: str) -> str:
+    """The name in `LEVELS` that a module belongs to: `body` for
     shapepose_fg.body.model.rotation.
     """
-    first, *rest = module.split(".")
-    if first != "shapepose_fg" or len(rest) == 0:
-        return first
-    names = [".".join(rest[:n]) for n in range(len(rest), 0, -1)]
-    return next((name for name in names if name in LEVEL_OF), rest[0])
+    first, _, rest = module.partition(".")
+    return rest.partition(".")[0] if first == "shapepose_fg" and rest else first
 
 
 def ours(names: set[str]) -> set[str]:
     return {name for name in names if name.split(".")[0] in ("factors", "shapepose_fg")}
 
 
-FOLDERS = {f"shapepose_fg{name}" for name in ("", ".body", ".cli", ".core", ".core.storage")}
-FOLDERS |= {"shapepose_fg.pipeline", "shapepose_fg.viz"}
-
-
 @pytest.fixture(scope="module")
 def library() -> dict[str, ast.Module]:
-    """All modules but folders whose files have levels of their own."""
-    return {name: tree for name, tree in modules("shapepose_fg") if name not in FOLDERS}
+    """All modules of the package."""
+    return dict(modules("shapepose_fg"))
 
 
-def test_a_module_imports_only_from_levels_before_its_own(library):
+def test_a_folder_imports_only_from_levels_before_its_own(library):
     for module, tree in library.items():
-        check_levels(module, tree)
+        here = folder(module)
+        assert here in LEVEL_OF, f"{here} is new: give it a place in LEVELS"
+        for there in {folder(other) for other in ours(imports(tree))} - {here}:
+            assert LEVEL_OF[there] < LEVEL_OF[here], f"{module} must not import from {there}"
+    assert {folder(module) for module in library} | {"factors"} == set(LEVEL_OF)
 
 
-def check_levels(module: str, tree: ast.Module) -> None:
-    here = room(module)
-    assert here in LEVEL_OF, f"{module} is new: give it a place in LEVELS"
-    for other in ours(imports(tree)):
-        assert other != "shapepose_fg", (
-            f"{module}: import from the module itself, not from the package's front"
-        )
-        if room(other) != here:
-            assert LEVEL_OF[room(other)] < LEVEL_OF[here], f"{module} must not import {other}"
+def test_inside_a_folder_nothing_imports_in_a_circle(library):
+    """Neither modules nor sub-folders."""
+    within = {name: imports(tree) & set(library) for name, tree in library.items()}
+    for parent in {name.rpartition(".")[0] for name in library} - {""}:
+        order = list(TopologicalSorter(graph_of(parent, within)).static_order())
+        if parent == "shapepose_fg.pipeline":
+            assert order.index(f"{parent}.config") < order.index(f"{parent}.pipeline")
 
 
-def test_every_place_in_the_table_is_taken(library):
-    assert {room(module) for module in library} | {"factors"} == set(LEVEL_OF)
+def graph_of(parent: str, within: dict[str, set[str]]) -> dict[str, set[str]]:
+    """What the modules and sub-folders of a folder, its `__init__` among them, import from each
+    other.
+    """
 
+    def child(module: str) -> str:
+        return ".".join(module.split(".")[: parent.count(".") + 2])
 
-def test_modules_import_each_other_in_no_circle(library):
-    known = set(library)
-    graph = {module: (imports(tree) & known) - {module} for module, tree in library.items()}
-    order = list(TopologicalSorter(graph).static_order())  # CycleError names the circle
-    assert order.index("shapepose_fg.core.camera") < order.index("shapepose_fg.pipeline.pipeline")
+    graph: dict[str, set[str]] = {}
+    for module, others in within.items():
+        if f"{module}.".startswith(f"{parent}."):
+            inside = {child(other) for other in others if f"{other}.".startswith(f"{parent}.")}
+            graph.setdefault(child(module), set()).update(inside - {child(module)})
+    return graph
 
 
 def test_factors_know_gtsam_and_numpy_only():

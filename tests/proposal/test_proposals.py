@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.greedy_matching import match_best_first
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.proposal.assignment import match_best_first
 from shapepose_fg.proposal.association import associate
 from shapepose_fg.proposal.candidates import CandidateConfig, Candidates, triangulate_pairs, vote
 from shapepose_fg.proposal.growth import GrowthConfig, Links, grow, link

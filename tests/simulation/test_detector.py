@@ -10,6 +10,7 @@ from scipy.special import ndtr, ndtri
 
 from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.detections import Detections
+from shapepose_fg.core.rendering import look_at
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.simulation import DetectorConfig, Scene, built_in_scene, simulate
 from shapepose_fg.simulation.detector import Detector
@@ -20,7 +21,6 @@ from shapepose_fg.simulation.detector_statistics import (
     measured,
 )
 from shapepose_fg.simulation.visibility import FACE, Visibility, facing
-from shapepose_fg.viz.rendering import look_at
 
 LIMBS = np.array(BODY_25.limbs)
 MIRROR = np.array(BODY_25.mirror)

@@ -98,7 +98,6 @@ def test_each_split_uses_its_own_takes_only(real_mocap: Mocap):
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_dancers_are_the_pairs_and_nobody_else(real: dict[tuple[str, Split], Scene]):
     for (name, split), scene in real.items():
         dancing = 2 * SEQUENCES[name].pairs
@@ -117,7 +116,6 @@ def test_dancers_are_the_pairs_and_nobody_else(real: dict[tuple[str, Split], Sce
         assert len(scene.clips) == len(scene.cuts) + 1
 
 
-@pytest.mark.slow
 @pytest.mark.slow
 def test_pairs_are_close_and_others_keep_their_distance(real: dict[tuple[str, Split], Scene]):
     together = []
@@ -156,7 +154,6 @@ def test_people_stay_in_the_room_and_nobody_jumps(real: dict[tuple[str, Split], 
         )  # they do move
 
 
-@pytest.mark.slow
 @pytest.mark.slow
 def test_feet_are_on_the_floor(real: dict[tuple[str, Split], Scene]):
     for scene in real.values():

@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 
 from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.drawing import thinned
+from shapepose_fg.core.rendering import look_at
 from shapepose_fg.core.skeleton import BODY_25, SMPL_24
 from shapepose_fg.simulation import Scene, built_in_scene
 from shapepose_fg.simulation.visibility import (
@@ -17,7 +18,6 @@ from shapepose_fg.simulation.visibility import (
     VisibilityConfig,
     see,
 )
-from shapepose_fg.viz.rendering import look_at
 
 X, Y, Z = np.eye(3)
 K = np.array([[900.0, 0, 640], [0, 900.0, 360], [0, 0, 1]])

@@ -33,12 +33,12 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.result_files import PEOPLE
 from shapepose_fg.core.storage.files import files_below, inside, open_regular
 from shapepose_fg.core.storage.output_folder import prepare_output
-from shapepose_fg.io.corrections import refuse_corrected
 from shapepose_fg.io.detections.reading import find_places
 from shapepose_fg.io.skeleton_file import find_skeleton
 from shapepose_fg.pipeline.execution import Execution
 from shapepose_fg.pipeline.runs.manifest import PARTS
 from shapepose_fg.pipeline.workers import Processes
+from shapepose_fg.results.corrections import refuse_corrected
 
 _LEAST, _USUAL = 0.1, 2.0
 """Bytes of results per byte of detections: minimum, for many cameras and for files with hands and

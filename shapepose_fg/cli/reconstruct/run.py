@@ -25,23 +25,23 @@ from shapepose_fg.core.errors import InputError, failure, naming
 from shapepose_fg.core.provenance import ReadInputs, checksums, program_digest, versions
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.result_files import CLOCKS, MOMENTS, PEOPLE, set_aside
+from shapepose_fg.core.rig_file import CAMERAS
 from shapepose_fg.core.run_summary import plain
 from shapepose_fg.core.storage.files import inside, read_text, write_content
 from shapepose_fg.core.storage.kept_arrays import ANEW, InFolder
 from shapepose_fg.core.storage.output_folder import only_run_in, prepare_output
 from shapepose_fg.core.trust import Trusted, trust_in, without_poses
 from shapepose_fg.io.calibration import write_rig
-from shapepose_fg.io.corrections import refuse_corrected
 from shapepose_fg.io.detection_table import DetectionTable
 from shapepose_fg.io.footage.placement import FOOTAGE
 from shapepose_fg.io.recording import read_recording, write_moments
-from shapepose_fg.io.solved_setup import CAMERAS
 from shapepose_fg.io.timestamps import write_timestamps
 from shapepose_fg.pipeline.execution import Execution
 from shapepose_fg.pipeline.pipeline import Task, reconstruct_parts
 from shapepose_fg.pipeline.runs import manifest
 from shapepose_fg.pipeline.runs.assembly import Assembly
 from shapepose_fg.pipeline.trajectories import kept_rig
+from shapepose_fg.results.corrections import refuse_corrected
 from shapepose_fg.setup_check.report import SetupReport, result_check
 from shapepose_fg.viz.report.writing import MOST_ROWS, REPORT, th, write_report
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from shapepose_fg.core.camera import Axis, Rig, choose
 from shapepose_fg.core.errors import InputError, naming
+from shapepose_fg.core.rig_file import CAMERAS
 from shapepose_fg.core.validation import describe
 from shapepose_fg.io.calibration.colmap import COLMAP
 from shapepose_fg.io.calibration.content import Content, load
@@ -92,6 +93,18 @@ def read_rig(
         return with_first_poses(
             Rig(finished, up, trajectories=trajectories, notes=notes, unwanted=tuple(unwanted))
         )
+
+
+def cameras_of(folder: Path) -> Rig:
+    """The cameras of the result in `folder`; InputError with the cure if there are none."""
+    file = folder / CAMERAS
+    if not file.exists():
+        raise InputError(
+            f"{file}: this file with the cameras of the result is missing; write it with "
+            "`people.save(folder, rig)` or `write_rig(rig, file)`, or copy the calibration to "
+            "this path"
+        )
+    return read_rig(file)
 
 
 def recognised(content: Content) -> tuple[Format, WrittenRig] | None:

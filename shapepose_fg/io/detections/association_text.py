@@ -13,13 +13,13 @@ import numpy as np
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Camera
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.greedy_matching import match_best_first
 from shapepose_fg.core.skeleton import BODY_25, COCO_18, Skeleton
 from shapepose_fg.core.storage.files import SMALL, text_pieces
 from shapepose_fg.core.validation import is_number
 from shapepose_fg.io.detection_table import BLOCK_FRAMES
 from shapepose_fg.io.detections.people import OVERSHOOT
 from shapepose_fg.io.detections.view_streams import ViewCandidates, ViewStream
-from shapepose_fg.proposal.assignment import match_best_first
 
 _SPACE = " \n\t"
 """Characters at which pieces of text end, so that no number, multi-byte character or line end is

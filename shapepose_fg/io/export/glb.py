@@ -11,9 +11,9 @@ from shapepose_fg.body.model.smpl_file import SMPL_PARENTS, SmplArrays
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.drawing import colour_of, vertex_normals
 from shapepose_fg.core.skeleton import SMPL_24
+from shapepose_fg.core.world_axes import y_up
 from shapepose_fg.io.export.registry import Job, Written
 from shapepose_fg.io.export.skinned import BONES, Motion, everybody
-from shapepose_fg.io.export.take import y_up
 
 _SET = 4
 """Number of bone influences of a vertex in one set. Every program reads the first set, Blender all

@@ -18,9 +18,10 @@ from shapepose_fg.core.camera import Axis
 from shapepose_fg.core.errors import InputError, optional
 from shapepose_fg.core.reconstruction import Known, Reconstruction, sigma_m
 from shapepose_fg.core.skeleton import MID_HIP, SMPL_24
+from shapepose_fg.core.world_axes import opensim_axes
 from shapepose_fg.io.export.registry import Job, MarkerSet, Written
 from shapepose_fg.io.export.skinned import motion_of
-from shapepose_fg.io.export.take import Take, opensim_axes
+from shapepose_fg.io.export.take import Take
 from shapepose_fg.io.pose2sim_project import Pose2SimProject
 
 _MOST = 65_535

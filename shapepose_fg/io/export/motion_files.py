@@ -15,9 +15,9 @@ from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.skeleton import SMPL_24
 from shapepose_fg.core.storage.files import write_atomically
 from shapepose_fg.core.storage.npz import write_npz
+from shapepose_fg.core.world_axes import y_up, z_up
 from shapepose_fg.io.export.registry import Job, Written
 from shapepose_fg.io.export.skinned import BONES, Motion, RestBody, all_segments
-from shapepose_fg.io.export.take import y_up, z_up
 
 _SHARED = SMPL_24.index("left_hand")
 """Number of joints, from the pelvis on, that SMPL and SMPL-H have in common."""

@@ -14,9 +14,10 @@ import numpy as np
 from shapepose_fg.biomechanics.joint_angles import OPENSIM, joint_angles
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.core.skeleton import SKELETONS
+from shapepose_fg.core.world_axes import opensim_axes
 from shapepose_fg.io.export.markers import Markers, markers_of, write_trc
 from shapepose_fg.io.export.registry import Job, MarkerSet, Written
-from shapepose_fg.io.export.take import Take, opensim_axes
+from shapepose_fg.io.export.take import Take
 
 MODEL = "Model_Pose2Sim_simple.osim"
 """Pose2Sim's model of the whole body."""

@@ -11,17 +11,18 @@ from typing import Any
 import numpy as np
 
 from shapepose_fg.body.model.body_model import BodyModel
+from shapepose_fg.body.model.result_body import body_of, model_of
 from shapepose_fg.body.model.smpl_file import SmplArrays
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Axis
 from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.reconstruction import OpenedReconstruction, Reconstruction
 from shapepose_fg.core.result_files import results_folder
+from shapepose_fg.core.rig_file import CAMERAS
 from shapepose_fg.core.run_summary import covered_frames
 from shapepose_fg.core.storage.files import write_content
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.export.take import Take
-from shapepose_fg.io.solved_setup import CAMERAS, body_of, model_of
 
 
 class MarkerSet(StrEnum):

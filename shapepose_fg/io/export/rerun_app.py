@@ -23,9 +23,10 @@ from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Axis, Rig
 from shapepose_fg.core.errors import InputError, optional
 from shapepose_fg.core.storage.files import write_atomically
+from shapepose_fg.core.world_axes import y_up
 from shapepose_fg.io.export.registry import Job, Written
 from shapepose_fg.io.export.rerun_log import camera_path, log_take, person_path
-from shapepose_fg.io.export.take import Take, y_up
+from shapepose_fg.io.export.take import Take
 
 APPLICATION = "shapepose-fg"
 

@@ -15,11 +15,10 @@ from shapepose_fg.core.camera import Camera
 from shapepose_fg.core.drawing import bones_of, colour_of, vertex_normals
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import Known, Reconstruction
+from shapepose_fg.core.rendering import NEAR_M, shaded
 from shapepose_fg.core.storage.files import write_atomically
 from shapepose_fg.io.footage.footage import Picture
 from shapepose_fg.io.footage.placement import Placement
-from shapepose_fg.viz.bodies import joined
-from shapepose_fg.viz.rendering import NEAR_M, shaded
 
 Colour = tuple[int, int, int]
 """Blue, green, red, 0 to 255."""
@@ -97,7 +96,7 @@ def draw_bodies(
     """
     if len(vertices) == 0:
         return picture
-    points, corners = joined(vertices, faces)
+    points, corners = _joined(vertices, faces)
     normals = vertex_normals(points, corners)
     light = 0.35 + 0.65 * np.clip(-(normals @ view.camera.wTc[:3, 2]), 0.0, 1.0)
     own = np.repeat(np.array(colours, dtype=np.float64) / 255, vertices.shape[1], axis=0)
@@ -226,3 +225,14 @@ def write_picture(path: Path, picture: Picture) -> None:
     if not done:
         raise InputError(f"{path}: pictures cannot be written in this format; use .png or .jpg")
     write_atomically(path, lambda stream: stream.write(content.tobytes()))
+
+
+def _joined(vertices: Real, faces: Whole) -> tuple[Array, Index]:
+    """Merge bodies (P, Nv, 3) with common `faces` (F, 3) to one mesh: vertices (P Nv, 3) and faces
+    (P F, 3).
+    """
+    people, count = vertices.shape[:2]
+    every = faces[None] + count * np.arange(people)[:, None, None]
+    return vertices.reshape(people * count, 3).astype(np.float64), every.reshape(
+        people * len(faces), 3
+    )

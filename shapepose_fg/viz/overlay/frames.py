@@ -11,13 +11,19 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
+from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.observation_table import Gate
-from shapepose_fg.core.reconstruction import OpenedReconstruction, Reconstruction
+from shapepose_fg.core.reconstruction import (
+    BODY,
+    OpenedReconstruction,
+    Reconstruction,
+    Status,
+    with_body,
+)
 from shapepose_fg.io.footage.footage import Footage, Picture
 from shapepose_fg.io.footage.placement import CameraFootage
-from shapepose_fg.viz.bodies import surfaces
 from shapepose_fg.viz.overlay import drawing
 
 if TYPE_CHECKING:
@@ -189,3 +195,14 @@ def grid(pictures: Sequence[Picture], columns: int) -> Picture:
     return np.vstack(
         [np.pad(row, ((0, 0), (0, n), (0, 0)), constant_values=30) for row, n in pairs]
     )
+
+
+def surfaces(people: Reconstruction, body: "BodyModel") -> tuple[Array, Index]:
+    """Vertices (P, Nv, 3), metres, of the rows with a body, and the indices (P,) of these rows."""
+    from shapepose_fg.body.model.body_model import BodyParameters
+
+    columns = [getattr(people, name) for name in BODY]
+    rows = np.flatnonzero((people.status == str(Status.OK)) & with_body(*columns))
+    if len(rows) == 0:
+        return np.zeros((0, body.num_vertices, 3)), rows
+    return body.vertices(BodyParameters(*(column[rows] for column in columns))), rows

@@ -12,7 +12,7 @@ import numpy as np
 from shapepose_fg.core.drawing import PALETTE
 from shapepose_fg.core.observation_table import Gate
 from shapepose_fg.core.reconstruction import Reconstruction
-from shapepose_fg.tracking.listing import TrackSummary
+from shapepose_fg.results.track_summary import TrackSummary
 from shapepose_fg.viz.report.facts import told_by
 from shapepose_fg.viz.report.figures import KINDS, Curve, camera_figures, known_counts, overall
 from shapepose_fg.viz.report.scene import Scene

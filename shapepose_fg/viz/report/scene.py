@@ -14,8 +14,9 @@ from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Camera
 from shapepose_fg.core.drawing import PALETTE, bones_of, thinned
 from shapepose_fg.core.reconstruction import Known, sigma_m
+from shapepose_fg.core.world_axes import z_up
 from shapepose_fg.io.export.skinned import BONES, motion_of
-from shapepose_fg.io.export.take import Take, z_up
+from shapepose_fg.io.export.take import Take
 
 _MISSING = -32768
 """Code of an unknown coordinate."""

@@ -4,18 +4,19 @@ from pathlib import Path
 
 import numpy as np
 
+from shapepose_fg.body.model.result_body import body_of, model_of
 from shapepose_fg.body.model.smpl_file import SmplArrays
 from shapepose_fg.core.camera import Axis, Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import ASSUMED_FPS
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.result_files import results_folder
+from shapepose_fg.core.rig_file import CAMERAS
 from shapepose_fg.core.run_summary import has_identities
 from shapepose_fg.core.storage.files import write_atomically
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.export.take import Take
-from shapepose_fg.io.solved_setup import CAMERAS, body_of, model_of
-from shapepose_fg.tracking.listing import list_tracks
+from shapepose_fg.results.track_summary import list_tracks
 from shapepose_fg.viz.report.figures import Curve, angle_curves
 from shapepose_fg.viz.report.page import page_text
 from shapepose_fg.viz.report.scene import Scene, scene_of

@@ -11,12 +11,13 @@ from scipy.spatial.transform import Rotation
 
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.core.skeleton import SMPL_24
+from shapepose_fg.core.world_axes import y_up
 from shapepose_fg.io.export.glb import influences, write_glb
 from shapepose_fg.io.export.motion_files import write_amass, write_bvh
 from shapepose_fg.io.export.registry import Job, read_take
 from shapepose_fg.io.export.rerun_app import write_rrd
 from shapepose_fg.io.export.skinned import motion_of
-from shapepose_fg.io.export.take import Take, y_up
+from shapepose_fg.io.export.take import Take
 
 from .conftest import AWAY, BARE, FIRST, FPS, FRAMES
 

@@ -8,8 +8,9 @@ import pytest
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import Known, Reconstruction
 from shapepose_fg.core.skeleton import BODY_25
+from shapepose_fg.core.world_axes import opensim_axes, y_up, z_up
 from shapepose_fg.io.export.registry import read_take
-from shapepose_fg.io.export.take import Take, opensim_axes, y_up, z_up
+from shapepose_fg.io.export.take import Take
 
 from .conftest import AWAY, FIRST, FPS, FRAMES, GUESSED
 

@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from shapepose_fg.body.model.result_body import model_of
 from shapepose_fg.cli.main import main
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.observation_table import Gate
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.io.solved_setup import model_of
 from shapepose_fg.pipeline.pipeline import PipelineConfig
 from shapepose_fg.simulation import built_in_scene
 from shapepose_fg.simulation.files import truth_of
@@ -126,7 +126,7 @@ def test_the_scene_holds_every_joint_to_a_millimetre(page, result):
 
 @pytest.mark.parametrize("up", ["x", "-x", "y", "-y", "-z"])
 def test_people_stand_upright_whatever_axis_is_up(result, tmp_path, up):
-    from shapepose_fg.io.export.take import z_up
+    from shapepose_fg.core.world_axes import z_up
 
     turned = replace(result, joints=result.joints @ z_up(up))
     page = Page(write_report(tmp_path, turned, None))

@@ -1,4 +1,4 @@
-"""The cameras and the body model with which a saved result was solved."""
+"""The body model with which a saved result was solved."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -7,22 +7,7 @@ from typing import Any
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.keypoint_offsets import KeypointOffsets
 from shapepose_fg.body.model.smpl_file import SmplArrays, read_smpl_file
-from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.core.rig_file import CAMERAS as CAMERAS
-from shapepose_fg.io.calibration import read_rig
-
-
-def cameras_of(folder: Path) -> Rig:
-    """The cameras of the result in `folder`; InputError with the cure if there are none."""
-    file = folder / CAMERAS
-    if not file.exists():
-        raise InputError(
-            f"{file}: this file with the cameras of the result is missing; write it with "
-            "`people.save(folder, rig)` or `write_rig(rig, file)`, or copy the calibration to "
-            "this path"
-        )
-    return read_rig(file)
 
 
 def body_of(run: Mapping[str, Any], given: Path | None = None) -> SmplArrays:

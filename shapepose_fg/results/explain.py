@@ -20,7 +20,7 @@ from shapepose_fg.estimation.gated_views import inverses, observation_sigmas
 from shapepose_fg.estimation.user_factors import ExtraFactors, functions_of, name_of
 from shapepose_fg.estimation.window_solution import PersonGraph
 from shapepose_fg.pipeline.config import PipelineConfig
-from shapepose_fg.pipeline.explanation import (
+from shapepose_fg.results.explanation import (
     GATES,
     Cause,
     Explanation,
@@ -28,7 +28,7 @@ from shapepose_fg.pipeline.explanation import (
     Finding,
     ViewReason,
 )
-from shapepose_fg.pipeline.solve_again import Solver, solved_around
+from shapepose_fg.results.solve_again import Solver, solved_around
 
 OFF_SIGMA = 3.0
 """Distance of a detection from the prediction by all else, in standard deviations, above which it

@@ -10,7 +10,7 @@ import pytest
 from shapepose_fg.core.observation_table import ObservationTable
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.tracking.edits import (
+from shapepose_fg.results.edits import (
     Action,
     Edit,
     Edited,

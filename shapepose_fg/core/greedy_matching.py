@@ -2,15 +2,8 @@
 
 import numpy as np
 
-from shapepose_fg.core.arrays import Array, Index, Mask, Real, Whole
+from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.compiled import kernel
-
-
-def lesser(value: Real | Whole) -> Mask:
-    """(P, P) whether one has a smaller `value` (P,) than another; on a tie, the later one has."""
-    return (value[:, None] < value) | (
-        (value[:, None] == value) & np.tri(len(value), k=-1, dtype=bool)
-    )
 
 
 def match_best_first(left: Index, right: Index, score: Array) -> Index:

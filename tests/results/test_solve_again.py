@@ -16,15 +16,16 @@ from shapepose_fg.cli.main import main
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.observation_table import Gate
 from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.rig_file import CAMERAS
 from shapepose_fg.io.calibration import write_rig
-from shapepose_fg.io.solved_setup import CAMERAS
-from shapepose_fg.pipeline import setup, solve_again
+from shapepose_fg.pipeline import setup
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
-from shapepose_fg.pipeline.solve_again import Solver, solve_rows
 from shapepose_fg.pipeline.windows import WindowConfig
+from shapepose_fg.results import solve_again
+from shapepose_fg.results.edits import Action, Edit, apply, solve_anew
+from shapepose_fg.results.solve_again import Solver, solve_rows
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.simulation.scene import Scene
-from shapepose_fg.tracking.edits import Action, Edit, apply, solve_anew
 
 FRAMES = 12
 CONFIG = PipelineConfig(batch_frames=8)

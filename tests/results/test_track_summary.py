@@ -8,7 +8,7 @@ import pytest
 from shapepose_fg.body.shapes import statures_m
 from shapepose_fg.core.reconstruction import Known, Reconstruction
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.tracking.listing import list_tracks
+from shapepose_fg.results.track_summary import list_tracks
 from tests.conftest import read_body
 
 

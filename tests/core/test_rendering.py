@@ -5,7 +5,7 @@ import pytest
 
 from shapepose_fg.core.camera import Camera
 from shapepose_fg.core.drawing import vertex_normals
-from shapepose_fg.viz.rendering import (
+from shapepose_fg.core.rendering import (
     first_surface_at,
     look_at,
     scaled,

@@ -14,10 +14,10 @@ from shapepose_fg.cli.main import main
 from shapepose_fg.core.detections import Recording
 from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.rig_file import CAMERAS
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.io.solved_setup import CAMERAS
-from shapepose_fg.pipeline.explanation import Cause, Explanation
-from shapepose_fg.pipeline.solve_again import Solver, solve_rows
+from shapepose_fg.results.explanation import Cause, Explanation
+from shapepose_fg.results.solve_again import Solver, solve_rows
 from shapepose_fg.setup_check.report import check_setup
 from shapepose_fg.simulation import built_in_scene, simulate
 

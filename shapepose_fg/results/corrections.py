@@ -18,7 +18,7 @@ from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.result_files import OBSERVATIONS, PEOPLE, RUN
 from shapepose_fg.core.storage.files import inside, read_json, write_content
 from shapepose_fg.core.validation import validated
-from shapepose_fg.tracking.edits import Edit, Edited, Solve, apply, solve_anew, undo
+from shapepose_fg.results.edits import Edit, Edited, Solve, apply, solve_anew, undo
 
 CORRECTIONS, UNCORRECTED = "corrections.json", "uncorrected"
 """File with the list of corrections, and folder of the uncorrected result."""

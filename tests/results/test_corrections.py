@@ -13,10 +13,10 @@ import pytest
 from shapepose_fg.cli.main import main
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import Reconstruction
-from shapepose_fg.io.corrections import correct, read_corrections, refuse_corrected, take_back
+from shapepose_fg.results.corrections import correct, read_corrections, refuse_corrected, take_back
+from shapepose_fg.results.edits import Action, Edit
 from shapepose_fg.simulation import built_in_scene
 from shapepose_fg.simulation.files import truth_of
-from shapepose_fg.tracking.edits import Action, Edit
 
 
 @pytest.fixture
@@ -100,7 +100,7 @@ def test_a_first_correction_that_was_stopped_half_way_is_told(folder, monkeypatc
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("shapepose_fg.io.corrections.write_content", stop)
+        patch.setattr("shapepose_fg.results.corrections.write_content", stop)
         with pytest.raises(KeyboardInterrupt):
             correct(folder, Edit(Action.DROP, 2))
     assert set(Reconstruction.load(folder).person.tolist()) == {0, 1}

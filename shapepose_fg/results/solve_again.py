@@ -11,19 +11,21 @@ import numpy as np
 from factors.keys import MAX_FRAME, MAX_PERSON
 from shapepose_fg.body.fitting.fitter import BodyFitter
 from shapepose_fg.body.fitting.fitters import make_fitter
+from shapepose_fg.body.model.result_body import model_of
 from shapepose_fg.core.arrays import Index, Mask, Whole
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import LEAST_STEP_S, segments
 from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.rig_file import CAMERAS
 from shapepose_fg.core.run_summary import covered_frames
 from shapepose_fg.estimation.floor import Floor
 from shapepose_fg.estimation.motion_densities import MotionModel
 from shapepose_fg.estimation.noise_law import NoiseLaw
 from shapepose_fg.estimation.user_factors import ExtraFactors
 from shapepose_fg.estimation.window_solution import PersonGraph, WindowSolution
+from shapepose_fg.io.calibration.reading import cameras_of
 from shapepose_fg.io.config import ANOTHER_VERSION, config_from
-from shapepose_fg.io.solved_setup import CAMERAS, cameras_of, model_of
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.keyframes import looked_at, with_rows_like
 from shapepose_fg.pipeline.person_shapes import with_person_shapes
