@@ -11,9 +11,6 @@ from shapepose_fg.proposal.growth import GrowthConfig
 from shapepose_fg.proposal.people_2d import LEAST_COMMON, group_people
 from shapepose_fg.proposal.possible_people import Frame, PossiblePeople, connected, settled, sizes
 
-_LEAST_SHARE = 0.25
-"""Minimum share of the joints seen by both views with intersecting rays; below it, halves of two
-people are mixed."""
 SAME_M = 0.2
 """Distance, m, below which joints of two hypotheses are of one person: a pelvis is 20 cm deep."""
 _SAME_SHARE = 0.8
@@ -68,9 +65,7 @@ def _groups(free: Mask, frame: Frame) -> Index:
 
 
 def _meeting(points: PairPoints, group: Index, frame: Frame) -> tuple[Array, Index]:
-    """Joints (M, J, 3) at which rays of two 2D people intersect in sufficient number, and the two
-    people (M, 2).
-    """
+    """Joints (M, J, 3) at which rays of two 2D people intersect, and the two people (M, 2)."""
     count, joints = group.max(initial=-1) + 1, len(frame.skeleton)
     ends = np.sort(group[points.pair], axis=1)
     both = (ends >= 0).all(axis=1)
@@ -78,12 +73,7 @@ def _meeting(points: PairPoints, group: Index, frame: Frame) -> tuple[Array, Ind
     owners = np.stack(np.divmod(pair, max(count, 1)), axis=1)
     places = np.full((len(pair), joints, 3), np.nan)
     places[place, points.joint[both]] = points.xyz[both]
-    has = np.zeros((count, joints), dtype=bool)
-    has[group[group >= 0], frame.detections.joint[group >= 0]] = True
-    shared = (has[owners[:, 0]] & has[owners[:, 1]]).sum(axis=1)
-    met = np.bincount(place, minlength=len(pair))
-    enough = (met >= LEAST_COMMON) & (met >= _LEAST_SHARE * shared)
-    return places[enough], owners[enough]
+    return places, owners
 
 
 def _different(places: Array, weight: Array) -> Index:

@@ -84,11 +84,11 @@ def test_a_difference_counts_if_it_exceeds_the_spread(script):
 
 @pytest.mark.slow
 def test_values_are_measured_in_turn(script, monkeypatch, capsys):
-    """Of a number without which nobody is found."""
-    constant = "proposal.selection._PRIOR"
-    monkeypatch.setattr(sys, "argv", ["x", constant, "-99", "--seconds", "0.2"])
+    """The second value leaves no detection any weight, so that nobody is found."""
+    constant = "tracking.track_selection._SURE_AFFINITY"
+    monkeypatch.setattr(sys, "argv", ["x", constant, "inf", "--seconds", "0.2"])
     monkeypatch.setattr(script, "__file__", str(ROOT / "scripts/vary_number.py"))
     script.main()
     usual, none = (line.split() for line in capsys.readouterr().out.splitlines()[1:3])
     assert usual[0] == "x1" and float(usual[1]) > 80
-    assert none[0] == "-99" and float(none[1]) == 0
+    assert none[0] == "inf" and float(none[1]) == 0
