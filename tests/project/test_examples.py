@@ -11,7 +11,7 @@ from shapepose_fg import simulation
 
 FOLDER = Path(__file__).parents[2] / "docs" / "examples"
 SCRIPTS = sorted(FOLDER.glob("[0-9][0-9]_*.py"))
-SLOW = ("02", "03", "05", "06", "08", "11", "12")
+SLOW = ("01", "02", "03", "05", "06", "08", "11", "12")
 """Those that take seconds, and use little that the others do not."""
 FRAMES = 14
 """Most frames that a script simulates here: all calls and the picture are those of more frames."""

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.skeleton import SMPL_24
 from shapepose_fg.simulation.training.motions import (
     SPLITS,
     SUBJECT_CAP,
@@ -179,3 +181,22 @@ def test_shapes_are_checked_and_frames_must_be_finite(cmu):
         Motions(**(fields | {"poses": some.poses * np.float32(np.nan)}))
     with pytest.raises(ValueError, match="split must be one of"):
         some.of("dev")  # type: ignore[arg-type]
+
+
+@pytest.mark.slow
+def test_the_prior_predicts_hidden_joints_of_people_it_never_saw(cmu):
+    prior, motions = PosePrior.default(), cmu.of("test")
+    motions = motions.rows(
+        ~np.isin(motions.subject, ["60", "61"])
+    )  # salsa would be three frames in four
+    poses = motions.poses[::10, 1:].reshape(-1, 69).astype(float)
+    for joint, gain in (("left_knee", 0.75), ("right_elbow", 0.9)):
+        asked = 3 * (SMPL_24.index(joint) - 1) + np.arange(3)
+        given = np.setdiff1d(np.arange(69), asked)
+        guess = (
+            prior.mean[asked]
+            + (poses[:, given] - prior.mean[given]) @ prior.regression(given, asked).T
+        )
+        by_rest = np.linalg.norm(poses[:, asked] - guess, axis=1).mean()
+        by_mean = np.linalg.norm(poses[:, asked] - prior.mean[asked], axis=1).mean()
+        assert by_rest < gain * by_mean
