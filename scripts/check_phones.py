@@ -3,7 +3,7 @@
     python scripts/check_phones.py --rooms 6:18
     python scripts/check_phones.py --rooms 6:18 --logs
 
-The rooms are those of tests/calibration/filmed_by_phones.py; people walk as in the recorded motions
+The rooms are those of tests/cameras/filmed_by_phones.py; people walk as in the recorded motions
 of `--data FOLDER` (or SHAPEPOSE_DATA). The command is told 65 degrees, --focal and one distance, or
 with `--logs` the lenses that the phones have logged. It prints the rows of the table in
 docs/evaluation/cameras.md: errors, and in brackets two standard deviations; the numbers of fixed
@@ -37,7 +37,7 @@ from shapepose_fg.io.footage.placement import (
 from shapepose_fg.io.timestamps import write_timestamps
 from shapepose_fg.io.write_detections import write_association
 from shapepose_fg.simulation.mocap import Mocap
-from tests.calibration.filmed_by_phones import errors, film, odometry, similarity
+from tests.cameras.filmed_by_phones import errors, film, odometry, similarity
 
 HEAD = "| room | people | worst rotation | worst position | inside | scale | carried phone |"
 LAYOUTS = ("four phones in the corners", "four upright phones", "three phones on one side")

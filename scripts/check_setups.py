@@ -21,11 +21,11 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
+from shapepose_fg.cameras.check.findings import Finding, Kind
+from shapepose_fg.cameras.check.report import check_setup
 from shapepose_fg.core.detections import Recording
-from shapepose_fg.setup_check.findings import Finding, Kind
-from shapepose_fg.setup_check.report import check_setup
 from shapepose_fg.simulation import Scene, built_in_scene, simulate
-from tests.setup_check.spoiled_setups import (
+from tests.cameras.check.spoiled_setups import (
     Spoiled,
     biased,
     delayed,

@@ -1,4 +1,4 @@
-"""Measure a detector's lasting biases (`shapepose_fg/setup_check/biases.py`) on a recording with
+"""Measure a detector's lasting biases (`shapepose_fg/cameras/check/biases.py`) on a recording with
 well-calibrated cameras.
 
     python scripts/measure_biases.py calibration.json detections [--up z]
@@ -12,11 +12,11 @@ import argparse
 from itertools import product
 from pathlib import Path
 
+from shapepose_fg.cameras.check.biases import COMMON
+from shapepose_fg.cameras.check.evidence import Look, gather
+from shapepose_fg.cameras.check.small_errors import Problem
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
-from shapepose_fg.setup_check.biases import COMMON
-from shapepose_fg.setup_check.evidence import Look, gather
-from shapepose_fg.setup_check.small_errors import Problem
 
 LEVELS = (0.0025, 0.005, 0.01, 0.02, 0.04)
 RATIOS = (0.3, 1.0, 3.0)

@@ -36,9 +36,9 @@ from shapepose_fg.cli.terminal import note, progress, show, show_json, table
 from shapepose_fg.core.errors import InputError
 
 if TYPE_CHECKING:
-    from shapepose_fg.calibration.adjustment import Freedom
-    from shapepose_fg.calibration.from_people import Calibrated
-    from shapepose_fg.calibration.moving_camera import Start
+    from shapepose_fg.cameras.bundle import Freedom
+    from shapepose_fg.cameras.calibrate.from_people import Calibrated
+    from shapepose_fg.cameras.moving import Start
     from shapepose_fg.core.arrays import Array
     from shapepose_fg.core.camera import Rig
     from shapepose_fg.io.detection_table import DetectionTable
@@ -150,10 +150,10 @@ def calibrate(
     views, near and far, not along one line, and move their arms. Exit code 1 if this does not
     determine the cameras; then nothing is written.
     """
-    from shapepose_fg.calibration.adjustment import Freedom
-    from shapepose_fg.calibration.from_people import Undetermined, calibrate
-    from shapepose_fg.calibration.levelling import Measured
-    from shapepose_fg.calibration.unsynchronised import calibrate_unsynchronised
+    from shapepose_fg.cameras.bundle import Freedom
+    from shapepose_fg.cameras.calibrate.from_people import Undetermined, calibrate
+    from shapepose_fg.cameras.calibrate.levelling import Measured
+    from shapepose_fg.cameras.calibrate.unsynchronised import calibrate_unsynchronised
     from shapepose_fg.core.frame_times import rate_of
     from shapepose_fg.io.calibration import with_trajectories, write_pose2sim, write_rig
     from shapepose_fg.io.recording import own_times
@@ -278,7 +278,7 @@ def _with_moving(
 
     `time_s` (T, W) are the times of the fixed cameras' frames.
     """
-    from shapepose_fg.calibration.moving_camera import Filmed, Placed
+    from shapepose_fg.cameras.moving import Filmed, Placed
     from shapepose_fg.core.camera import Rig
     from shapepose_fg.io.calibration import with_first_poses
     from shapepose_fg.io.recording import own_times
@@ -340,7 +340,7 @@ def _figures(found: "Calibrated", focal: bool) -> tuple[list[str], list[tuple[st
 
 def _world(found: "Calibrated", stature: float | None, distances: list[str]) -> list[str]:
     """Scale, up axis, fit, and how far to trust them, one line each."""
-    from shapepose_fg.setup_check.fit import MOVE, TURN
+    from shapepose_fg.cameras.parameters import MOVE, TURN
 
     world = found.world
     if distances:

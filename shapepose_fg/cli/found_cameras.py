@@ -15,7 +15,7 @@ from shapepose_fg.cli.terminal import note, progress, show, table
 from shapepose_fg.core.errors import InputError
 
 if TYPE_CHECKING:
-    from shapepose_fg.calibration.synchronisation import Synchronised
+    from shapepose_fg.cameras.synchronise import Synchronised
     from shapepose_fg.core.arrays import Array
     from shapepose_fg.core.camera import Rig
     from shapepose_fg.io.detections.people import DeclaredJoints
@@ -54,7 +54,7 @@ def found_clocks(
     Their rate is `fps`, by default that of times.csv beside the detections; InputError if there is
     none.
     """
-    from shapepose_fg.calibration.synchronisation import synchronise
+    from shapepose_fg.cameras.synchronise import synchronise
     from shapepose_fg.core.frame_times import rate_of
     from shapepose_fg.io.recording import own_times, read_recording
 

@@ -23,7 +23,7 @@ from shapepose_fg.cli.terminal import note, progress, show, show_json, table
 from shapepose_fg.core.errors import InputError
 
 if TYPE_CHECKING:
-    from shapepose_fg.calibration.refinement import Refinement
+    from shapepose_fg.cameras.refine import Refinement
 
 _CAMERAS = "Prior uncertainty"
 
@@ -72,8 +72,8 @@ def refine_calibration(
     The refined rig is tested on held-out frames. If it does not fit them better, the given rig is
     written.
     """
-    from shapepose_fg.calibration.adjustment import Freedom
-    from shapepose_fg.calibration.refinement import refine
+    from shapepose_fg.cameras.bundle import Freedom
+    from shapepose_fg.cameras.refine import refine
     from shapepose_fg.io.calibration import check_target, write_like
 
     seen = given.located()

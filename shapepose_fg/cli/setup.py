@@ -31,10 +31,10 @@ def check_calibration(
     Exit code 1 if something looks wrong, otherwise 0. Of videos and pictures, only the sizes are
     compared.
     """
+    from shapepose_fg.cameras.check.diagnosis import detected_sizes, other_sizes
+    from shapepose_fg.cameras.check.report import check_setup
     from shapepose_fg.cli.setup_table import setup_report
     from shapepose_fg.io.footage.placement import FOOTAGE
-    from shapepose_fg.setup_check.diagnosis import detected_sizes, other_sizes
-    from shapepose_fg.setup_check.report import check_setup
 
     seen = given.located()
     rig = seen.still_rig("check-calibration")

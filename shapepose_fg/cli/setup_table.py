@@ -8,8 +8,8 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from shapepose_fg.cameras.check.report import CameraFigures, CameraUse, PairFigures, SetupReport
 from shapepose_fg.cli.terminal import table
-from shapepose_fg.setup_check.report import CameraFigures, CameraUse, PairFigures, SetupReport
 
 _WIDE = 12
 """Maximum length of a camera's name; of longer names only the end is shown, which usually differs

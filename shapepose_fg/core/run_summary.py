@@ -65,7 +65,7 @@ class _Distances(BaseModel, strict=True):
 
 
 class CameraEntry(BaseModel, strict=True):
-    """The entry of run.json about the detections of a camera, as `setup_check.report.CameraUse`
+    """The entry of run.json about the detections of a camera, as `cameras.check.report.CameraUse`
     writes it.
     """
 

@@ -46,7 +46,7 @@ class Trusted(DerivedFrames):
     """A recording with the information for `reconstruct` which cameras are left out or doubted."""
 
     trust: Trust
-    """For example `setup_check.report.check_setup(detections, rig).trust`."""
+    """For example `cameras.check.report.check_setup(detections, rig).trust`."""
 
 
 def trust_in(detections: DetectionSequence) -> Trust:

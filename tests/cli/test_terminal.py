@@ -8,10 +8,10 @@ import pytest
 from rich.progress import TextColumn
 from rich.table import Table
 
+from shapepose_fg.cameras.check.report import CameraUse, Distances
 from shapepose_fg.cli.main import main
 from shapepose_fg.cli.setup_table import use_table
 from shapepose_fg.cli.terminal import bars, note, progress, show, table, use_any_streams
-from shapepose_fg.setup_check.report import CameraUse, Distances
 
 
 @pytest.mark.parametrize("name", ["cam[left]", "a[/b]", ":cat:", "[red]"])

@@ -15,10 +15,10 @@ import numba
 import pytest
 
 import shapepose_fg
+from shapepose_fg.cameras.check.report import check_setup
 from shapepose_fg.core.compiled import KERNELS, Kernel, signature
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.pipeline.pipeline import reconstruct
-from shapepose_fg.setup_check.report import check_setup
 from shapepose_fg.simulation import built_in_scene, simulate
 
 ROOT = Path(shapepose_fg.__file__).parents[1]

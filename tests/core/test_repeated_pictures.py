@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from shapepose_fg.cameras.check.findings import Kind
+from shapepose_fg.cameras.check.report import check_setup
 from shapepose_fg.core.detections import Detections, Recording
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.repeated_pictures import WithoutRepeats, repeated_views
 from shapepose_fg.pipeline.pipeline import PipelineConfig, reconstruct
-from shapepose_fg.setup_check.findings import Kind
-from shapepose_fg.setup_check.report import check_setup
 from shapepose_fg.simulation import built_in_scene, simulate
 
 FRAMES, STOPS = 48, 24

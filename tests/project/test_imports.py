@@ -20,8 +20,8 @@ LEVELS = (
     "estimation",
     "tracking",
     "io",
-    "detection2d evaluation pipeline setup_check",
-    "calibration live results simulation",
+    "cameras detection2d evaluation pipeline",
+    "live results simulation",
     "viz",
     "cli",
     "shapepose_fg __main__",
@@ -132,7 +132,7 @@ NOT_UNIQUE = {"eig", "eigh", "svd", "qr", "schur", "multivariate_normal"}
 choose."""
 WITHOUT_CHOICE = {
     "shapepose_fg.core.decompositions": "removes it",
-    "shapepose_fg.calibration.moving_camera": "makes errors whose outer products are summed",
+    "shapepose_fg.cameras.moving": "makes errors whose outer products are summed",
     "factors.camera_of": "gives signs: depth and focal lengths are positive",
     "factors.lasting": "makes symmetric roots and projectors",
     "shapepose_fg.evaluation.score": "gives rotations, which have no sign",

@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from shapepose_fg import InputError, explain, reconstruct, write_rig
+from shapepose_fg.cameras.check.report import check_setup
 from shapepose_fg.cli.main import main
 from shapepose_fg.core.detections import Recording
 from shapepose_fg.core.observation_table import Gate, ObservationTable
@@ -18,7 +19,6 @@ from shapepose_fg.core.rig_file import CAMERAS
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.results.explanation import Cause, Explanation
 from shapepose_fg.results.solve_again import Solver, solve_rows
-from shapepose_fg.setup_check.report import check_setup
 from shapepose_fg.simulation import built_in_scene, simulate
 
 ELBOW, SPOILED = 6, range(3, 8)

@@ -15,6 +15,7 @@ from shapepose_fg.body.fitting.fitters import make_fitter
 from shapepose_fg.body.fitting.weights import fingerprint
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.shapes import SubjectShapes
+from shapepose_fg.cameras.check.report import SetupReport, result_check
 from shapepose_fg.cli.found_cameras import MOST_S, found_clocks, show_clocks
 from shapepose_fg.cli.reconstruct.request import OUTPUTS, Prepared
 from shapepose_fg.cli.reconstruct.summary import check_setup, show_check, summary_table
@@ -42,7 +43,6 @@ from shapepose_fg.pipeline.runs import manifest
 from shapepose_fg.pipeline.runs.assembly import Assembly
 from shapepose_fg.pipeline.trajectories import kept_rig
 from shapepose_fg.results.corrections import refuse_corrected
-from shapepose_fg.setup_check.report import SetupReport, result_check
 from shapepose_fg.viz.report.writing import MOST_ROWS, REPORT, th, write_report
 
 

@@ -5,6 +5,9 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
+from shapepose_fg.cameras.check.diagnosis import detected_sizes, other_sizes
+from shapepose_fg.cameras.check.report import ResultCheck, SetupReport, unseen
+from shapepose_fg.cameras.check.report import check_setup as check_detections
 from shapepose_fg.cli.reconstruct.request import Prepared
 from shapepose_fg.cli.setup_table import use_table
 from shapepose_fg.cli.terminal import note, show, warn
@@ -15,9 +18,6 @@ from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.io.footage.placement import FOOTAGE
 from shapepose_fg.pipeline.pipeline import Task
 from shapepose_fg.pipeline.runs.assembly import Assembly
-from shapepose_fg.setup_check.diagnosis import detected_sizes, other_sizes
-from shapepose_fg.setup_check.report import ResultCheck, SetupReport, unseen
-from shapepose_fg.setup_check.report import check_setup as check_detections
 
 _SURE = 0.9
 """People with a probability below this are listed."""

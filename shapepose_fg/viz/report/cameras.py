@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from shapepose_fg.cameras.sightings import followed
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.reconstruction import Known, Reconstruction, Status
@@ -15,7 +16,6 @@ from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.core.storage.files import write_atomically
 from shapepose_fg.core.world_axes import z_up
 from shapepose_fg.io.export.take import Take
-from shapepose_fg.setup_check.matching import followed
 from shapepose_fg.viz.report.figures import Residual
 from shapepose_fg.viz.report.page import filled
 from shapepose_fg.viz.report.scene import Scene, camera_of, scene_of

@@ -1,1 +1,0 @@
-"""Calibration from people: poses of the cameras, and their time offsets."""

@@ -1,0 +1,1 @@
+"""Cameras from people: checked, calibrated, refined, synchronised, and found while they move."""

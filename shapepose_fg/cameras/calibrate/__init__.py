@@ -1,0 +1,1 @@
+"""Poses of cameras from people, with or without their start times."""

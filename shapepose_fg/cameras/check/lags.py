@@ -1,0 +1,65 @@
+"""Time offset of each camera against the others, of which it says whether it is significant."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from shapepose_fg.cameras.check.evidence import Look
+from shapepose_fg.cameras.offsets.scan import LEAST_MISS, scan
+from shapepose_fg.cameras.sightings import GATE
+
+_CLEAR = 0.25
+"""Minimum gain of a time offset. Sound cameras have up to 0.2, late ones 0.3 to 1."""
+
+
+@dataclass(frozen=True)
+class Lag:
+    """Time offset of a camera."""
+
+    frames: int = 0
+    """The camera shows at t + frames what the others show at frame t; positive is late."""
+    gain: float = 0.0
+    """Decrease of the mean residual by the offset, relative to the depth of its minimum under the
+    median of all offsets."""
+
+    def exceeds(self, share: float) -> bool:
+        """Whether the offset exceeds a `share` of what makes it significant."""
+        return self.gain > share * _CLEAR
+
+    @property
+    def is_offset(self) -> bool:
+        """Whether the offset is significant."""
+        return self.exceeds(1.0)
+
+
+def lags(look: Look) -> list[Lag]:
+    """Time offset of each camera against the others; none in a short recording."""
+    # Minimum number of frames for time offsets. In fewer, people hardly move enough to separate a
+    # small time offset from chance.
+    if len(np.unique(look.evidence.sightings.frame)) < 40:
+        return [Lag()] * look.view_count
+    return [lag_of(look, view) for view in range(look.view_count)]
+
+
+def lag_of(look: Look, view: int, most: int | None = None) -> Lag:
+    """Time offset of a camera against the others, up to `most` frames, with the smallest mean
+    residual.
+    """
+    most = look.evidence.most_lag if most is None else min(most, look.evidence.most_lag)
+    offsets, seen, around = np.arange(-most, most + 1), look.shifted, look.evidence.around
+    rows = seen.rows((seen.view == view) | np.isin(seen.frame, around))
+    # Distance of people above which they count as missed by a camera, as a share of the size; other
+    # people come that near seldom.
+    of_pairs = [
+        scan(rows, look.views, other, view, offsets, np.ptp(around) / 4, GATE / 3)
+        for other in np.unique(rows.view).tolist()
+        if other != view
+    ]
+    known = np.isfinite(np.reshape(of_pairs, (-1, len(offsets))))
+    count = known.sum(axis=0)
+    if count[most] == 0:
+        return Lag()
+    curve = np.where(known, of_pairs, 0.0).sum(axis=0) / np.where(count > 0, count, np.nan)
+    best = int(np.nanargmin(curve))
+    depth = float(np.nanmedian(curve) - curve[best])
+    return Lag(int(offsets[best]), float(curve[most] - curve[best]) / max(depth, LEAST_MISS))

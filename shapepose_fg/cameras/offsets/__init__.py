@@ -1,0 +1,1 @@
+"""Time offsets between cameras, from people."""
