@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from factors import CONSTANT_VELOCITY
 from shapepose_fg.body.fitting.evidence import LEAST_JOINTS
 from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, FitStatus, JointTargets
 from shapepose_fg.core.arrays import Array, Mask
@@ -35,7 +36,6 @@ from shapepose_fg.estimation.gated_views import (
 from shapepose_fg.estimation.in_time import near_in_time, velocities, waited_s
 from shapepose_fg.estimation.mirrored_sides import mirrored_spread
 from shapepose_fg.estimation.missed_detections import (
-    SPEED_M_S,
     elsewhere_variance,
     limbs_that_hide,
 )
@@ -136,7 +136,7 @@ def solve_bodies(
     elsewhere = elsewhere_variance(found.joints, observations.frame, strong, views, limbs)
     for person, of_bodies in zip(people, spread, strict=True):
         seen = np.asarray(strong[person.rows].any(axis=-1))
-        moved = np.square(SPEED_M_S * waited_s(seen, person.times_s))
+        moved = np.square(CONSTANT_VELOCITY.start[0] * waited_s(seen, person.times_s))
         moved = np.minimum(elsewhere[person.rows], moved)
         person.window.widen_unseen(of_bodies, moved / person.widen)  # a length, whatever the graph
         found.covariance[person.rows] = person.widen * person.window.of_joints(of_bodies)

@@ -17,6 +17,7 @@ import numpy as np
 from factors import DEFAULT_WIDTH_SIGMA, Motion
 from shapepose_fg.body.fitting.chains import Links, linked
 from shapepose_fg.body.fitting.energy import BodyEnergy, EnergyTargets, Held, nothing
+from shapepose_fg.body.fitting.evidence import WELL_SEEN_M
 from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.kernels.solving import eliminated, put_back
@@ -46,8 +47,6 @@ DEVIATION_M = 0.007
 POSE_LASTS_S = 1.0
 """A pose is as good as independent of the one before after so long, seconds: the pose prior counts
 once in it."""
-_PLACED_M = 0.05
-"""Standard deviation by the views, m, up to which a foot is held in place where it stands."""
 _AVERAGED = 0.15
 """Ratio of the covariance of a seen foot's velocity to that from the views of its two frames alone,
 because a window averages over frames and joints: 0.11 to 0.25 in the median of each person in
@@ -211,7 +210,7 @@ class BodyWindow:
         (`take`).
         """
         velocity = velocities(self.joints(state), self.times_s)[:, feet]
-        seen = np.asarray(self.last.evidence.sigma_m[:, feet] < _PLACED_M)
+        seen = np.asarray(self.last.evidence.sigma_m[:, feet] < WELL_SEEN_M)
         of_views = inverses(self.last.evidence.information[:, feet] + HELD * np.eye(3))
         first, last, lasts = moments(self.times_s)
         covariance = _AVERAGED * (of_views[first] + of_views[last])

@@ -9,6 +9,7 @@ import numpy as np
 from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.decompositions import principal_axes
+from shapepose_fg.estimation.in_time import SPEED_S
 
 FEET = ("Ankle", "Heel", "BigToe", "SmallToe")
 """Joints that may stand, independently on either side: toes stand while the heel rises."""
@@ -25,10 +26,6 @@ NEXT = np.array([[0.0, 0.99, 0.01], [0.42, 0.0, 0.58], [0.01, 0.99, 0.0]])
 """Transition probabilities between the states."""
 CORRELATION_S = np.array([0.06, 0.1, 0.5])
 """Correlation time of the speed within each state, seconds."""
-LOOK_S = 0.05
-"""Frames within this time count as one observation of the speed. Errors of velocities are
-correlated for longer, but their covariances are too wide. Among 0.03, 0.05 and 0.1 s this has the
-least error over all speeds in simulated recordings of 4 and 6 cameras (crowd 777, salsa 31)."""
 ALIKE_S = 0.25
 """Frames within this time count as one look of the views at a standing foot, seconds: detectors'
 errors last."""
@@ -101,11 +98,11 @@ def smoothed(log: Array, times_s: Array) -> Array:
     """(T, F, K) probability of each state in each frame, given all frames (forward-backward
     algorithm).
 
-    `log` (T, F, K) are log-densities of the observations. A frame is weighted by its share of an
-    observation.
+    `log` (T, F, K) are log-densities of the observations. Frames within `SPEED_S`, over which
+    velocities are measured, count as one.
     """
     dt = np.diff(times_s)
-    share = np.minimum(np.gradient(times_s) / LOOK_S, 1.0)[:, None, None]
+    share = np.minimum(np.gradient(times_s) / SPEED_S, 1.0)[:, None, None]
     seen = np.exp(np.maximum(log - log.max(axis=2, keepdims=True), -600.0) * share)
     stays = np.exp(-dt[:, None] / LASTS_S)
     turn = stays[..., None] * np.eye(len(FIRST)) + (1 - stays)[..., None] * NEXT

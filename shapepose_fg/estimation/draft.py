@@ -5,7 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from shapepose_fg.body.fitting.evidence import LEAST_JOINTS
-from shapepose_fg.body.fitting.fitter import BodyFit, BodyFitter, FitStatus, JointTargets
+from shapepose_fg.body.fitting.fitter import (
+    BodyConfig,
+    BodyFit,
+    BodyFitter,
+    FitStatus,
+    JointTargets,
+)
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
@@ -19,8 +25,9 @@ from shapepose_fg.estimation.gated_views import (
     triangulate,
 )
 
-MODEL_SIGMA_M = 0.02
-"""Standard deviation of a detector's joints from the body's, metres."""
+MODEL_SIGMA_M = BodyConfig.model_sigma_m
+"""Standard deviation of a detector's joints from the body's, metres. The body of an initial
+estimate is fitted again if a target moves by more: on Shelf a quarter of all fits remain."""
 DISAGREE = 6.0
 """Disagreement of a joint's views with the body, in standard deviations, at which they are wrong.
 With 4 more correct than wrong joints were rejected in simulated crowds."""
@@ -30,10 +37,6 @@ reprojection distance, as a length at the joint's depth, at which a detection's 
 On `tune`, frame by frame, MPJPE is 35 mm, and 44 if the body is fitted once, to detections within
 `rho_2d_m` of the triangulated joints. With priors that are stiff while the kernel is wide F1 rose
 by 1.5 points there, but raised arms sank on real footage."""
-
-MOVED_M = 0.02
-"""Motion of a target, m, above which the body of an initial estimate is fitted again, similar to a
-detector's deviation from the body; or a changed weight. On Shelf a quarter of all fits remain."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +101,7 @@ def draft(
         around = np.where(around.ok[:, None, None], around.joints, X[asked])
         evidence = linearise(given, sigmas[asked], around, seen_by, config.observations, reach_m)
         targets = joint_targets(evidence, enough[asked])
-        moved = changed_targets(fitted.rows(asked), targets, MOVED_M, 2.0)
+        moved = changed_targets(fitted.rows(asked), targets, MODEL_SIGMA_M, 2.0)
         if len(moved) == 0:
             continue
         again = fitter.fit(targets.rows(moved))

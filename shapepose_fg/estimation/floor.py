@@ -10,8 +10,7 @@ from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.decompositions import basis_across
 
 LOOK_S = 1.5
-"""Time for which a standing foot counts as one look, s: the correlation time of errors
-(`BodyConfig.correlation_s`)."""
+"""Time for which a standing foot counts as one look, s: errors of joints last as long."""
 LEAST_LOOKS = 6
 """Minimum number of looks for a floor: two feet of one person over five seconds, or of three people
 at once."""

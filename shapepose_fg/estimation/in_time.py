@@ -13,8 +13,10 @@ _AROUND_S = 0.3
 effect."""
 _HOP_S = 0.045
 """Minimum duration of a displacement for a speed, s; over less, noise dominates."""
-_KNOWN_M = 0.1
-"""Maximum standard deviation along an axis of a point used for motion, m."""
+KNOWN_M = 0.1
+"""Maximum standard deviation of a point whose place counts as known, m."""
+WALK_M_S = 1.5
+"""Speed of a walker, m/s: people walk at 1.4 m/s."""
 
 
 def motion_of(points: Array, variance: Array, times_s: Array) -> tuple[Array, Array]:
@@ -24,10 +26,10 @@ def motion_of(points: Array, variance: Array, times_s: Array) -> tuple[Array, Ar
     The speed is the path length per second, so that a limb swinging back and forth is fast. The
     density is computed from second differences, minus the contribution of noise with `variance` (T,
     J) along an axis, m². Both are temporal medians, robust to a few wrong points, over points known
-    to `_KNOWN_M`; 0 without any.
+    to `KNOWN_M`; 0 without any.
     """
     at, joint = np.arange(len(times_s))[:, None], np.arange(points.shape[1])
-    known = np.asarray(np.isfinite(points).all(axis=2) & (variance < _KNOWN_M**2))
+    known = np.asarray(np.isfinite(points).all(axis=2) & (variance < KNOWN_M**2))
     velocity, hops, noise = [], [], [variance]
     for end in _hop_ends(known, times_s):
         hop = np.where(known & (end != at), times_s[end] - times_s[:, None], np.nan)

@@ -20,8 +20,6 @@ ELSEWHERE_M = 0.25
 """Standard deviation per axis of such a joint, metres: within reach of its neighbour. Also an
 assumption: in simulated crowds with three and four cameras and a detector that knows every pose,
 the log score gives this no weight; the evidence is a stretched arm on real footage."""
-SPEED_M_S = 2.0
-"""Speed of a joint since a view last detected it, m/s: `factors.CONSTANT_VELOCITY.start`."""
 _BEHIND_M = 0.05
 """Minimum depth behind a limb for occlusion, m."""
 ARMS_AND_LEGS = {

@@ -15,9 +15,6 @@ from shapepose_fg.core.storage.files import read_json
 from shapepose_fg.estimation.in_time import motion_of
 
 FORMAT = "shapepose-fg motion model 1"
-LOST_M = 0.1
-"""Standard deviation of a joint by its views, in the worst direction, above which the joint is
-lost, metres."""
 
 
 @dataclass(frozen=True)

@@ -28,17 +28,15 @@ from shapepose_fg.estimation.gated_views import (
     observation_sigmas,
     triangulate,
 )
+from shapepose_fg.estimation.in_time import KNOWN_M
 
 EDGES = (0.1, 0.3, 0.5, 0.7, 0.8, 0.9)
 """Bounds between the K = 7 ranges of scores. Relative to the shipped law, a law is constant in
 each."""
 GROSS_M = 0.2
 """Standard deviation of a gross error along an axis, m. It lies on another joint or person."""
-_MIDDLES = (0.05, 0.2, 0.4, 0.6, 0.75, 0.85, 0.95)
 _GOOD_SCORE = 0.5
 """Minimum score of a detection in another view to be used for triangulation."""
-_GOOD_M = 0.1
-"""Maximum standard deviation of the triangulated position, m."""
 _AGREE_SIGMA = 3.5
 """Maximum residual of each triangulated detection, standard deviations. Above it, they disagree."""
 _PRIOR_COUNT = 30.0
@@ -114,13 +112,11 @@ class NoiseLaw:
         """The law as JSON values, with the score and sigma of each range for readers of
         run.json.
         """
-        sigma_m = [
-            times * float(core_sigma_m(score))
-            for times, score in zip(self.times, _MIDDLES, strict=True)
-        ]
+        bounds = np.array([0.0, *EDGES, 1.0])
+        score = ((bounds[1:] + bounds[:-1]) / 2).round(2)
         return {
-            "score": list(_MIDDLES),
-            "sigma_mm": [round(1e3 * each, 1) for each in sigma_m],
+            "score": score.tolist(),
+            "sigma_mm": (1e3 * np.array(self.times) * core_sigma_m(score)).round(1).tolist(),
             **{name: list(getattr(self, name)) for name in self.COLUMNS},
         }
 
@@ -189,7 +185,7 @@ class Residuals:
                 good, sigmas, 1.0
             )
             there = (evidence.inlier == good).all(axis=-1) & (off < _AGREE_SIGMA).all(axis=-1)
-            there &= every.seen[..., view] & (evidence.sigma_m < _GOOD_M)
+            there &= every.seen[..., view] & (evidence.sigma_m < KNOWN_M)
             row, joint = np.nonzero(there)
             xy, depth, slope = views.rows(row).project(evidence.target[there][:, None])
             focal = np.broadcast_to(views.focal_px, (len(chosen), len(views)))[row, view]

@@ -6,12 +6,10 @@ import numpy as np
 
 from factors import Motion
 from shapepose_fg.core.arrays import Array, Whole
-from shapepose_fg.estimation.in_time import motion_of
+from shapepose_fg.estimation.in_time import WALK_M_S, motion_of
 from shapepose_fg.estimation.kernels import solve_chains
 from shapepose_fg.estimation.motion_densities import MotionModel
 
-SPEED_M_S = 1.5
-"""Minimum speed of a joint for the density of its accelerations: that of a walker, m/s."""
 LEAST_SIGMA_M = 0.03
 """Added standard deviation, m, besides a factor of two, since errors of initial estimates are
 correlated over time."""
@@ -45,7 +43,8 @@ def smoothed(
     information = np.where(known, 1.0 / np.where(known, variance, 1.0), 1.0 / _UNKNOWN).reshape(
         C, T
     )
-    density = motion.density(np.maximum(speed, SPEED_M_S), turning=turning).reshape(T - 1, C)
+    # Joints are at least as fast as a walker.
+    density = motion.density(np.maximum(speed, WALK_M_S), turning=turning).reshape(T - 1, C)
     moving, below = motion_information(motion.law, np.diff(times), density)
     n, weight, mean, of_mean = motion.law.order, information, place, 1.0 / information
     for _ in range(_ROUNDS):

@@ -15,9 +15,10 @@ from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.core.detections import Input
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.rows import Rows
+from shapepose_fg.estimation.in_time import WALK_M_S
 from shapepose_fg.proposal.nearby import FrameArrays
-from shapepose_fg.tracking.global_hypotheses import PLACED_M
 from shapepose_fg.tracking.identities import observed
+from shapepose_fg.tracking.motion_filter import LOST_M
 from shapepose_fg.tracking.sides import correct_swaps_now
 from shapepose_fg.tracking.stitching import LEAST_ROWS, Ends, StitchingConfig, Trace, stitch
 from shapepose_fg.tracking.track_selection import APPEARS_S, LEAST_S, own_evidence, weighed
@@ -138,7 +139,7 @@ class Filter:
     def placed(self, now: FilterState) -> Array:
         """(A, J, 3) joints, metres; NaN where their uncertainty is too large."""
         joints = now.tracks.joints
-        return np.where((joints.sigma_m < PLACED_M)[..., None], joints.position, np.nan)
+        return np.where((joints.sigma_m < LOST_M)[..., None], joints.position, np.nan)
 
     def observations(self, now: FilterState, candidate: Index, given: Input) -> Observations:
         """The rows of a frame for stage II: its tracks and their detections."""
@@ -256,7 +257,7 @@ class Filter:
         gap_s = now.born_s[row] - now.gone.time_s
         apart_m = np.linalg.norm(now.gone.place - now.place[row], axis=1)
         near = (gap_s >= 0) & (gap_s <= self.stitching.longest_gap_s)
-        return bool((near & (apart_m <= self.stitching.reach_m + 1.5 * gap_s)).any())
+        return bool((near & (apart_m <= self.stitching.reach_m + WALK_M_S * gap_s)).any())
 
     def _returned(self, now: FilterState, ready: Index) -> dict[int, int]:
         """Identities of the rows among `ready` that continue an ended track, found by

@@ -20,8 +20,7 @@ from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.gated_views import linearise, observation_sigmas
 from shapepose_fg.estimation.motion_densities import MotionModel
 from shapepose_fg.live.filtering import FilterState
-from shapepose_fg.tracking.global_hypotheses import PLACED_M
-from shapepose_fg.tracking.motion_filter import JointStates
+from shapepose_fg.tracking.motion_filter import LOST_M, JointStates
 from shapepose_fg.tracking.tracker import Tracker
 
 _OWN_S, _TOGETHER_S = 0.3, 0.7
@@ -94,11 +93,11 @@ class Newest:
         follows from motion and the prior. Tracks without a known joint are left out.
         """
         named = np.flatnonzero(
-            self.state.named & (self.state.tracks.joints.sigma_m < PLACED_M).any(axis=1)
+            self.state.named & (self.state.tracks.joints.sigma_m < LOST_M).any(axis=1)
         )
         order = named[np.argsort(self.state.identity[named], kind="stable")]
         now = self.state.rows(order)
-        joints, known = now.tracks.joints, now.tracks.joints.sigma_m < PLACED_M
+        joints, known = now.tracks.joints, now.tracks.joints.sigma_m < LOST_M
         covariance = joints.covariance[..., :3, :3].copy()
         information = np.zeros_like(covariance)
         information[known] = np.linalg.inv(covariance[known])

@@ -7,20 +7,12 @@ import numpy as np
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.compiled import kernel
 from shapepose_fg.proposal.candidates import PairPoints
-from shapepose_fg.proposal.people_2d import group_people
+from shapepose_fg.proposal.growth import GrowthConfig
+from shapepose_fg.proposal.people_2d import LEAST_COMMON, group_people
 from shapepose_fg.proposal.possible_people import Frame, PossiblePeople, connected, settled, sizes
 
-_LEAST_JOINTS = 3
-"""Minimum number of connected joints at which rays of two 2D people intersect: two hips may do so
-by chance."""
-_LEAST_SHARE = 0.25
-"""Minimum share of the joints seen by both views with intersecting rays; below it, halves of two
-people are mixed."""
-_LEAST_AFFINITY = 0.2
-"""Minimum affinity that groups detections: unrelated pairs are mostly 0, true ones above 0.4 (as
-`growth.doubt`)."""
-_SAME_M = 0.2
-"""Distance, m, below which joints of two hypotheses agree."""
+SAME_M = 0.2
+"""Distance, m, below which joints of two hypotheses are of one person: a pelvis is 20 cm deep."""
 _SAME_SHARE = 0.8
 """Share of the smaller hypothesis's joints that must agree for the two to be duplicates."""
 _PASSES = 3
@@ -37,7 +29,7 @@ def pooled(points: PairPoints, free: Mask, frame: Frame) -> PossiblePeople:
     group = _groups(free, frame)
     places, owners = _meeting(points, group, frame)
     part = connected(places, frame)
-    hypothesis, first = np.nonzero(sizes(part) >= _LEAST_JOINTS)
+    hypothesis, first = np.nonzero(sizes(part) >= LEAST_COMMON)
     places = np.where((part[hypothesis] == first[:, None])[..., None], places[hypothesis], np.nan)
     owners, detections = owners[hypothesis], frame.detections
     confidence = np.zeros((group.max(initial=-1) + 1, places.shape[1]))
@@ -62,20 +54,18 @@ def _groups(free: Mask, frame: Frame) -> Index:
     joints.
     """
     detections = frame.detections
-    tied = free[detections.pairs].all(axis=1) & (detections.affinity >= _LEAST_AFFINITY)
+    tied = free[detections.pairs].all(axis=1) & (detections.affinity >= GrowthConfig.doubt)
     tied = replace(detections, pairs=detections.pairs[tied], affinity=detections.affinity[tied])
     group = np.full(len(detections), -1, dtype=np.intp)
     for number, members in enumerate(
-        each for each in group_people(tied) if len(each) >= _LEAST_JOINTS
+        each for each in group_people(tied) if len(each) >= LEAST_COMMON
     ):
         group[members] = number
     return group
 
 
 def _meeting(points: PairPoints, group: Index, frame: Frame) -> tuple[Array, Index]:
-    """Joints (M, J, 3) at which rays of two 2D people intersect in sufficient number, and the two
-    people (M, 2).
-    """
+    """Joints (M, J, 3) at which rays of two 2D people intersect, and the two people (M, 2)."""
     count, joints = group.max(initial=-1) + 1, len(frame.skeleton)
     ends = np.sort(group[points.pair], axis=1)
     both = (ends >= 0).all(axis=1)
@@ -83,12 +73,7 @@ def _meeting(points: PairPoints, group: Index, frame: Frame) -> tuple[Array, Ind
     owners = np.stack(np.divmod(pair, max(count, 1)), axis=1)
     places = np.full((len(pair), joints, 3), np.nan)
     places[place, points.joint[both]] = points.xyz[both]
-    has = np.zeros((count, joints), dtype=bool)
-    has[group[group >= 0], frame.detections.joint[group >= 0]] = True
-    shared = (has[owners[:, 0]] & has[owners[:, 1]]).sum(axis=1)
-    met = np.bincount(place, minlength=len(pair))
-    enough = (met >= _LEAST_JOINTS) & (met >= _LEAST_SHARE * shared)
-    return places[enough], owners[enough]
+    return places, owners
 
 
 def _different(places: Array, weight: Array) -> Index:
@@ -108,7 +93,7 @@ def _sieve(places, order, stays):
     """Fill in the indices that stay, going through `order`, as far as the array reaches; returns
     their number.
     """
-    count, least = 0, _SAME_M * _SAME_M
+    count, least = 0, SAME_M * SAME_M
     for h in order:
         alone = True
         for n in range(count):

@@ -8,6 +8,9 @@ from shapepose_fg.core.detections import Detections
 
 LEAST_JOINTS = 4
 """Minimum number of joints that a 2D person must share with a 3D person to match it."""
+LEAST_COMMON = 3
+"""Minimum number of joints in which two 2D people, of one view or of two, can be compared: two hips
+may agree by chance."""
 _MOST_OF = 0.6
 """Minimum share of the 3D person's detections in the view that belong to this 2D person."""
 

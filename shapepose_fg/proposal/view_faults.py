@@ -7,10 +7,8 @@ import numpy as np
 from shapepose_fg.core.arrays import Mask
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Detections
-from shapepose_fg.proposal.people_2d import group_people
+from shapepose_fg.proposal.people_2d import LEAST_COMMON, group_people
 
-_LEAST_JOINTS = 3
-"""Minimum number of common joints for two 2D people to be compared."""
 _SAME = 0.03
 """Median distance of the common joints of duplicates, as a share of the person's size in the image:
 two boxes around one person differ by 1 to 2 %, two people on one viewing ray by more."""
@@ -62,7 +60,7 @@ def doubled(found: Detections, rig: Rig) -> Mask:
     confident.
     """
     again = np.zeros(len(found), dtype=bool)
-    groups = [group for group in group_people(found) if len(group) >= _LEAST_JOINTS]
+    groups = [group for group in group_people(found) if len(group) >= LEAST_COMMON]
     # Most confident first; ties keep the order of detections.
     groups.sort(key=lambda group: -float(found.confidence[group].sum()))
     view = found.view[[group[0] for group in groups]]
@@ -80,7 +78,7 @@ def doubled(found: Detections, rig: Rig) -> Mask:
     apart = np.sort(np.linalg.norm(xy[one] - xy[other], axis=2), axis=1)
     common = np.isfinite(apart).sum(axis=1)
     has = np.isfinite(xy[..., 0]).sum(axis=1)
-    enough = common >= np.maximum(_LEAST_JOINTS, np.minimum(has[one], has[other]) / 2)
+    enough = common >= np.maximum(LEAST_COMMON, np.minimum(has[one], has[other]) / 2)
     median = apart[np.arange(len(one)), np.maximum(common - 1, 0) // 2]
     same = enough & (
         median < np.maximum(_SAME * np.minimum(size[one], size[other]), least[view[one]])

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from shapepose_fg.core.detections import Input
 from shapepose_fg.proposal.nearby import FrameArrays
-from shapepose_fg.tracking.motion_filter import JointStates
+from shapepose_fg.tracking.motion_filter import LOST_M, JointStates
 from shapepose_fg.tracking.track_selection import EvidenceTable, SelectedTracks, weighed
 from shapepose_fg.tracking.tracker import SEARCH_S, Tracker, Tracks
 
@@ -35,10 +35,8 @@ _ALIKE = 0.95
 """Agreement of detections above which two selections count as one. The best selection is tracked
 again, and the best different one: on ten simulated recordings, most before three cameras, IDF1 is
 95.0 (92.8 without; 95.2 with two others, at twice the time)."""
-PLACED_M = 0.2
-"""Standard deviation below which a track's joint has a known position, m."""
-_PLAIN, _PLAIN_S = 0.25, 0.3
-"""Minimum evidence per second, over any window of `_PLAIN_S` s, of a person to whom no
+_PLAIN = 0.25
+"""Minimum evidence per second, over any window of `SEARCH_S`, of a person to whom no
 alternatives are sought; in simulated crowds, they are found only for people with less."""
 _SAME_M = 0.02
 """Maximum distance between joints of two worlds with the same detections for these to
@@ -153,7 +151,7 @@ def _plain(found: Hypotheses, times: Array) -> NDArray[np.bool_]:
     if len(times) == 1:
         return np.ones(len(found), dtype=bool)
     evidence = found.weight.sum(axis=(2, 3)) - found.price
-    frames = min(len(times), max(1, round(_PLAIN_S / float(np.median(np.diff(times))))))
+    frames = min(len(times), max(1, round(SEARCH_S / float(np.median(np.diff(times))))))
     high = sliding_window_view(evidence, frames, axis=1).mean(axis=-1) >= _PLAIN
     return np.asarray(found.there.all(axis=1) & high.all(axis=1))
 
@@ -380,7 +378,7 @@ def _twins(
     Duplicate worlds have the same detections (A, J, V) and the same positions of placed joints.
     """
     gone, same = np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp)
-    known, kept = tracks.joints.sigma_m < PLACED_M, dict[tuple[bytes, ...], NDArray[np.intp]]()
+    known, kept = tracks.joints.sigma_m < LOST_M, dict[tuple[bytes, ...], NDArray[np.intp]]()
     for world in np.unique(tracks.world).tolist():
         who = np.flatnonzero(tracks.world == world)
         names = [candidate[row].tobytes() for row in who.tolist()]
@@ -420,7 +418,7 @@ class _Log:
             return
         frame, joints, A = self.frames[t], tracks.joints, len(tracks)
         candidate = self.rest.index[t][candidate]
-        places = np.where((joints.sigma_m < PLACED_M)[..., None], joints.position, np.nan)
+        places = np.where((joints.sigma_m < LOST_M)[..., None], joints.position, np.nan)
         arrays = FrameArrays.of(frame.detections, frame.rig, self.tracker.skeleton)
         # The people who are tracked already occlude those of every world.
         others = self.rest.places[:, t]

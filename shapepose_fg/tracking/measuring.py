@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from factors import DEFAULT_WIDTH_SIGMA
+from shapepose_fg.body.fitting.evidence import LEAST_JOINTS
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.compiled import kernel, part
 from shapepose_fg.core.kernel_geometry import ROBUST, project, triangulated
@@ -19,11 +20,9 @@ from shapepose_fg.tracking.view_assignment import FARTHEST_M
 
 _ITERATIONS = 3
 """Number of linearisations (and gatings) per frame."""
-MIN_SEEN_TWICE = 4
-"""Core joints that two views must see for a frame to count as evidence of the person."""
 MIN_IN_A_VIEW = 9
-"""Core joints that a single view must see for the same purpose: over half a body is no
-coincidence."""
+"""Core joints that a single view must see for a frame to count as evidence of the person, if two
+views do not see `LEAST_JOINTS`: over half a body is no coincidence."""
 
 
 class Trust(NamedTuple):
@@ -124,7 +123,7 @@ def _measure(mean, covariance, lost, candidate, confident, arrays, trust, bones,
                     depth = fixed_m if fixed_m > 0 else depth
                     px = focal[v] * np.sqrt(trust.floor_rad**2 + (trust.sigma_m / depth) ** 2)
                     sigma_px[v], seen = px * scatter[j] / np.sqrt(confident[d]), seen + 1
-            swings = near == 0 and arrays.swings[j] and trunk >= MIN_SEEN_TWICE
+            swings = near == 0 and arrays.swings[j] and trunk >= LEAST_JOINTS
             if seen >= 2 and (lost[a, j] or swings):
                 for v in range(views):
                     d = candidate[a, j, v]
@@ -169,7 +168,7 @@ def _measure(mean, covariance, lost, candidate, confident, arrays, trust, bones,
                 twice += 1
         for v in range(views):
             most = max(most, (core & (candidate[a, :, v] >= 0)).sum())
-        evident[a] = twice >= MIN_SEEN_TWICE or most >= MIN_IN_A_VIEW
+        evident[a] = twice >= LEAST_JOINTS or most >= MIN_IN_A_VIEW
 
 
 @part

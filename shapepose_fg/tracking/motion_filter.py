@@ -8,22 +8,23 @@ from typing import NamedTuple
 import numpy as np
 
 from factors import Motion
+from shapepose_fg.body.fitting.evidence import WELL_SEEN_M
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.compiled import kernel, part
 from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.skeleton import Skeleton
 
 LOST_M = 0.2
-"""Predicted standard deviation, m, above which a joint is lost, and searched for around its parent.
-A joint seen by one view is not lost, however uncertain its depth."""
+"""Standard deviation, m, above which the place of a joint is not known. If it is predicted, the
+joint is lost, and searched for around its parent; a joint seen by one view is not lost, however
+uncertain its depth."""
 TRUSTED_M = 0.1
 """Standard deviation, m, below which a joint's bone lengths are checked, and below which it is not
 lost in the next frame however long the interval: at 10 frames per second the unknown velocity of a
 new person's joints alone adds 20 cm."""
 _FOLLOW_S = 0.25
-"""Time constant with which the velocity of an unseen joint approaches that of the person, s."""
-_FOLLOW_SIGMA_M = 0.05
-"""Standard deviation, m, above which a joint counts as unseen here."""
+"""Time constant with which the velocity of a joint that is not well seen approaches that of the
+person, s."""
 
 
 @dataclass(frozen=True)
@@ -166,7 +167,7 @@ def _predict(
                     velocity[x] += certainty * mean[a, j, 3 + x]
         any_placed = False
         for j in range(joints):
-            unseen, was_m = sigma(covariance[a, j]) > _FOLLOW_SIGMA_M, _across(covariance[a, j])
+            unseen, was_m = sigma(covariance[a, j]) > WELL_SEEN_M, _across(covariance[a, j])
             for k in range(size):
                 moving[k] = mean[a, j, k]
             if unseen:

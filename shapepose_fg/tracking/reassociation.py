@@ -10,6 +10,7 @@ from shapepose_fg.core.detections import Input
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.proposal.nearby import FrameArrays
+from shapepose_fg.proposal.pairs_of_people import SAME_M
 from shapepose_fg.proposal.possible_people import Frame, PossiblePeople, gaps
 from shapepose_fg.proposal.selection import PRIOR_WITH_BODY, existence
 from shapepose_fg.tracking.identities import core_distance
@@ -18,9 +19,6 @@ from shapepose_fg.tracking.view_assignment import Predicted, assign_with_probabi
 LEAST_PROBABILITY = 0.6
 """Minimum existence probability of a person in an isolated frame. Of people with probability 0.6,
 six in ten are real, in simulated crowds and in a real operating room alike."""
-_DOUBLE_M = 0.2
-"""Mean distance of core joints below which two people are duplicates, metres: a pelvis is 20 cm
-deep."""
 
 
 def reassociate(
@@ -84,7 +82,7 @@ def probabilities_of(frame: Input, candidate: Index, joints: Array, skeleton: Sk
 
 
 def who_goes(
-    sure: Array, joints: Array, skeleton: Skeleton, least: float, double_m: float = _DOUBLE_M
+    sure: Array, joints: Array, skeleton: Skeleton, least: float, double_m: float = SAME_M
 ) -> Mask:
     """(P,) whether to remove: the least probable person below `least`, and the less probable of
     duplicates.

@@ -13,12 +13,12 @@ from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.bounds import Settings
 from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.skeleton import Skeleton
+from shapepose_fg.estimation.in_time import WALK_M_S
+from shapepose_fg.tracking.tracker import TrackingConfig
 
 _BONE_SIGMA_M = 0.015
 """Standard deviation of a bone's mean length in a track, m; detector errors are correlated over
 time."""
-_PLACE_SIGMA_M = 0.05
-"""Minimum standard deviation of the centre of the core joints, m."""
 LEAST_ROWS = 10
 """Minimum number of rows with a bone for its length in a track to be known."""
 _BUILD = 2.0
@@ -29,11 +29,6 @@ _BRIEF_S = 1.0
 """Longest gap over which tracks are joined without knowing their build, s."""
 _PACE_S = 0.2
 """Duration over which the velocity at the end of a track is measured, s."""
-_COASTS_S = 0.5
-"""Longest extrapolation of a person out of sight, s; as long as a track is followed without
-evidence."""
-_WALK_MPS = 1.5
-"""Growth of the maximum distance with the gap, m/s: people walk at 1.4 m/s."""
 
 
 @dataclass(frozen=True)
@@ -150,9 +145,10 @@ def _pairs(
     before = np.repeat(np.arange(len(end_s)), count)
     after = order[np.arange(len(before)) + np.repeat(first - np.cumsum(count) + count, count)]
     gap_s = begin_s[after] - end_s[before]
-    moved = ends.velocity[before] * np.minimum(gap_s, _COASTS_S)[:, None]
+    # As long as a track is followed without evidence.
+    moved = ends.velocity[before] * np.minimum(gap_s, TrackingConfig.patience_s)[:, None]
     apart_m = np.linalg.norm(ends.place[after, 0] - ends.place[before, 1] - moved, axis=-1)
-    reach_m = config.reach_m + _WALK_MPS * gap_s
+    reach_m = config.reach_m + WALK_M_S * gap_s
     may = (gap_s <= config.longest_gap_s) & (apart_m <= reach_m)
     for cut in cuts_s:
         may &= ~((end_s[before] < cut) & (begin_s[after] >= cut))
@@ -160,8 +156,8 @@ def _pairs(
     unlike = _unlike(ends.bones[before], ends.bones[after])
     unlike = np.where(np.isnan(unlike) & (gap_s[may] <= _BRIEF_S), 1.0, unlike)  # the expectation
     alike = unlike <= _BUILD  # false where unknown
-    cost = _costs(apart_m, reach_m, ends.bones.shape[1] * unlike)[alike]
-    return before[alike], after[alike], cost
+    unlike = ends.bones.shape[1] * unlike[alike]
+    return before[alike], after[alike], _costs(apart_m[alike], reach_m[alike], unlike)
 
 
 def _unlike(bones: Array, others: Array) -> Array:
@@ -178,13 +174,13 @@ def _unlike(bones: Array, others: Array) -> Array:
 
 
 def _costs(apart_m: Array, reach_m: Array, unlike: Array) -> Array:
-    """(K,) cost of joining two tracks: -2 log-density up to a constant.
+    """(K,) cost of joining two tracks: -2 log-density up to a constant; at least 0.
 
     Distances `apart_m` (K,) are Gaussian on the floor, with `reach_m` (K,) as two standard
     deviations; `unlike` (K,) is the sum of squared differences of bone lengths, in variances.
     """
-    sigma_m = np.maximum(reach_m / 2, _PLACE_SIGMA_M)
-    return (apart_m / sigma_m) ** 2 + 4 * np.log(sigma_m / _PLACE_SIGMA_M) + unlike
+    cost = (2 * apart_m / reach_m) ** 2 + 4 * np.log(reach_m) + unlike
+    return cost - cost.min(initial=np.inf)
 
 
 def _matched(before: Index, after: Index, cost: Array) -> dict[int, int]:

@@ -14,7 +14,7 @@ from shapepose_fg.core.compiled import kernel, part
 from shapepose_fg.core.kernel_geometry import project
 from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.proposal.nearby import FrameArrays, limbs_of, tie
+from shapepose_fg.proposal.nearby import LEAST_AFFINITY, FrameArrays, limbs_of, tie
 
 _PRICE = 0.4
 """Cost of an expected but missing detection, relative to a present one. The price of a person's
@@ -30,10 +30,8 @@ _LIMB_M = 0.12
 _IN_FRONT_M = 0.15
 """Minimum depth gap for an occlusion, metres; below it the order of two people is ambiguous."""
 _SURE_AFFINITY = 0.6
-"""Mean affinity to the person's other detections at which a detection gets its full weight."""
-_ALONE = 0.5
-"""Weight of a detection without detected neighbours on the skeleton, for which there are no
-affinities."""
+"""Mean affinity to the person's other detections at which a detection gets its full weight; without
+detected neighbours on the skeleton it is `LEAST_AFFINITY`."""
 APPEARS_S = 0.125
 """Cost of a track birth or death within the observed time, s of evidence; as much as 0.3 s of
 missed detections in plain view. People rarely appear or disappear in the middle of the scene."""
@@ -119,8 +117,8 @@ def _weigh(
     tie(whose[:count], which[:count], candidate, arrays, tied, neighbours)
     of_joint, of_view = arrays.of_joint, arrays.of_view
     for n in range(count):
-        counts, d = min(max(tied[n] / _SURE_AFFINITY, 0.0), 1.0), which[n]
-        weight[whose[n], of_joint[d], of_view[d]] = counts if neighbours[n] > 0 else _ALONE
+        affinity, d = tied[n] if neighbours[n] > 0 else LEAST_AFFINITY, which[n]
+        weight[whose[n], of_joint[d], of_view[d]] = min(max(affinity / _SURE_AFFINITY, 0.0), 1.0)
     for a in range(people):
         _fill(places[a], known[a], at[a])
     for v in range(views):

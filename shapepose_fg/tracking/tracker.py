@@ -23,6 +23,7 @@ from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.gated_views import ObservationConfig
 from shapepose_fg.proposal.nearby import FrameArrays
+from shapepose_fg.proposal.proposals import ProposalConfig
 from shapepose_fg.tracking.measuring import Trust, measured
 from shapepose_fg.tracking.motion_filter import LOST_M, Bones, JointStates, predicted
 from shapepose_fg.tracking.view_assignment import Predicted, assign
@@ -40,9 +41,6 @@ take that person's detections, so every world is searched: in crowds before thre
 two to six more people of a hundred."""
 _APART_M = 0.25
 """Minimum mean distance of a new person's joints from any track's, m; nearer is the same person."""
-_MOST_PEOPLE = 64
-"""Maximum number of new people; no further search where stage I reaches it
-(`ProposalConfig.most_people`)."""
 _BIRTH_SIGMA_M = 0.04
 """Standard deviation of a new person's joints from stage I, m."""
 
@@ -193,7 +191,8 @@ class Tracker:
         free = np.ones(len(detections), dtype=bool)
         free[candidate[candidate >= 0]] = False
         for find in self.find:
-            if not self.enough(detections, free) or sum(map(len, found)) >= _MOST_PEOPLE:
+            many = sum(map(len, found)) >= ProposalConfig.most_people
+            if many or not self.enough(detections, free):
                 break
             rest = np.flatnonzero(free)
             people = find(detections.only(free), rig)

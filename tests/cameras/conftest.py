@@ -180,7 +180,7 @@ def detected_files(rig, late, tmp_path_factory) -> Path:
     under their own numbers, and times that say which frames each has.
     """
     folder = tmp_path_factory.mktemp("detected")
-    shown = np.arange(300)[:, None] < [300, 250, 300, 220]
+    shown = np.arange(300)[:, None] < [300, 250, 240, 220]
     own = Recording(
         BODY_25, [frame.only(has[frame.view]) for frame, has in zip(late, shown, strict=True)]
     )
@@ -205,5 +205,5 @@ def in_detected_files(detected_files, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
 
 
-COMMON = round((10.78 - 4.0) * FPS)
-"""Frames in which all four run: the last began at 4 s, the first ended at 10.78 s."""
+COMMON = round((8.38 - 4.0) * FPS)
+"""Frames in which all four run: the last began at 4 s, the first ended at 8.38 s."""

@@ -87,7 +87,7 @@ def test_bodies_are_fitted_again_only_where_their_targets_have_changed(fitter, m
     """Of three scenes twenty rows, half of them with the neighbour's leg in three views: about as
     when all are fitted every time.
     """
-    count, moved_m, apart_m = len(FRAMES), draft.MOVED_M, []
+    count, apart_m, usual = len(FRAMES), [], draft.changed_targets
     for scene in (
         SCENE,
         *(built_in_scene(seed, people=2, frames=40, cameras=6) for seed in (4, 5)),
@@ -99,8 +99,8 @@ def test_bodies_are_fitted_again_only_where_their_targets_have_changed(fitter, m
             [disturbed, replace(disturbed, xy=clean, track=disturbed.track + count)]
         )
         drafts, fitted = [], []
-        for again_m in (moved_m, -1.0):
-            monkeypatch.setattr(draft, "MOVED_M", again_m)
+        for chosen in (usual, lambda before, now, *_: np.arange(len(now.xyz))):
+            monkeypatch.setattr(draft, "changed_targets", chosen)
             counting = Counting(fitter)
             found = draft.draft(rows, Views.of(scene.rig), counting, EstimatorConfig())
             drafts.append(found.places)
@@ -116,7 +116,7 @@ def test_bodies_are_fitted_again_only_where_their_targets_have_changed(fitter, m
         assert apart_m[-1][count:].max() < 1e-3
     # A detection near its gate may fall on either side of it. With targets that count as unmoved:
     # 2.8 to 24 mm.
-    assert np.mean(apart_m) < moved_m / 8
+    assert np.mean(apart_m) < draft.MODEL_SIGMA_M / 8
 
 
 def test_only_rows_whose_detections_change_are_fitted_again(fitter):

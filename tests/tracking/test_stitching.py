@@ -202,8 +202,8 @@ def joined_all_at_once(ends: Ends, config: StitchingConfig, cuts_s: list[float])
             if unlike <= 2.0 and near and not cut:
                 # -2 log of a Gaussian on the floor, two sigmas of which are in reach, and of the 14
                 # bones.
-                sigma = max((0.5 + 1.5 * gap) / 2, 0.05)
-                cost[a, b] = apart**2 / sigma**2 + 2 * np.log(sigma**2 / 0.05**2) + 14 * unlike
+                sigma = (0.5 + 1.5 * gap) / 2
+                cost[a, b] = apart**2 / sigma**2 + 2 * np.log(sigma**2) + 14 * unlike
     pairs = zip(*linear_sum_assignment(cost), strict=True)
     before = {b: a for a, b in pairs if cost[a, b] < alone}
     names: dict[int, int] = {}

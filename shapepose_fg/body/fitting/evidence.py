@@ -16,6 +16,8 @@ LEAST_JOINTS = 4
 allows a check."""
 _SEEN_SIGMA_M = 0.3
 """A joint has full information if its standard deviation along every axis is below this, m."""
+WELL_SEEN_M = 0.05
+"""Standard deviation up to which a joint is well seen, m."""
 MIN_SPREAD_M = 0.03
 """Minimum root mean square distance of the joints with full information from a common line, m; else
 the rotation about it is undetermined."""

@@ -15,7 +15,7 @@ from shapepose_fg.body.fitting.energy import (
     nothing,
     robust_weight,
 )
-from shapepose_fg.body.fitting.evidence import LEAST_JOINTS
+from shapepose_fg.body.fitting.evidence import LEAST_JOINTS, WELL_SEEN_M
 from shapepose_fg.body.fitting.person_frame import PersonFrame
 from shapepose_fg.body.fitting.priors import PosePrior
 from shapepose_fg.body.fitting.weights import FitterWeights
@@ -27,8 +27,6 @@ from shapepose_fg.core.arrays import Array, Mask
 
 STALE = 0.3
 """Change of a joint's robust weight in a step above which the row is linearised again."""
-WELL_SEEN_M = 0.05
-"""Standard deviation of a joint, metres, above which it is not an input of the network."""
 ANNEAL_STEPS = 2
 """Cold starts begin with a kernel 2^ANNEAL_STEPS times as wide, halved in every iteration."""
 MAX_ITERATIONS = 40

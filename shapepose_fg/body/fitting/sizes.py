@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from shapepose_fg.body.fitting.fitter import BodyConfig
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS
 from shapepose_fg.core.arrays import Array, Mask
@@ -19,8 +20,6 @@ _ADULT = 2.0
 """Range of adults' stature, standard deviations from the mean."""
 _ROUNDS = 2
 """Number of estimates at an adult's size; the first size is biased by the prior of adults."""
-_POINT_M = 0.02
-"""Distance of a point, m, that costs as much as a beta of 1."""
 
 
 def points_at_rest(body: BodyModel) -> tuple[Array, Array]:
@@ -83,7 +82,7 @@ class Sizes:
         wanted = size[:, None] * (mean + betas @ by_betas.T) - mean
         taller = (size * self.ratio(betas) - 1) * self.stature_m
         system = np.zeros((11, 11))
-        system[:10, :10] = by_betas.T @ by_betas + _POINT_M**2 * np.eye(10)
+        system[:10, :10] = by_betas.T @ by_betas + BodyConfig.model_sigma_m**2 * np.eye(10)
         system[:10, 10] = system[10, :10] = self.taller
         right = np.concatenate([wanted @ by_betas, taller[:, None]], axis=1)
         return np.asarray(np.linalg.solve(system, right.T).T[:, :10], dtype=np.float64)
