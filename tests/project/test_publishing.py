@@ -78,3 +78,14 @@ def test_a_release_is_tested_before_it_is_published_without_a_token():
     assert jobs["publish"]["needs"] == "build"
     assert jobs["publish"]["permissions"] == {"id-token": "write"}
     assert "secrets." not in (ROOT / ".github/workflows/release.yml").read_text(encoding="utf-8")
+
+
+def test_the_tests_that_ci_names_exist():
+    """pytest with several processes runs nothing, and names no file, if one of its paths is gone."""
+    text = (ROOT / ".ci/run").read_text("utf-8")
+    folders = [
+        each for names in re.findall(r"tests/\{([\w,]+)\}", text) for each in names.split(",")
+    ]
+    named = re.findall(r"tests/\w[\w/.]*", text) + [f"tests/{each}" for each in folders]
+    assert len(named) > 10
+    assert [each for each in named if not (ROOT / each).exists()] == []
