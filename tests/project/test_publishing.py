@@ -81,7 +81,7 @@ def test_a_release_is_tested_before_it_is_published_without_a_token():
 
 
 def test_the_tests_that_ci_names_exist():
-    """pytest with several processes runs nothing, and names no file, if one of its paths is gone."""
+    """With several processes pytest runs nothing if a path is gone, and does not name it."""
     text = (ROOT / ".ci/run").read_text("utf-8")
     folders = [
         each for names in re.findall(r"tests/\{([\w,]+)\}", text) for each in names.split(",")
