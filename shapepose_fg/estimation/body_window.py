@@ -460,10 +460,10 @@ class BodyWindow:
             after[:N, :N] = own
             arrows = np.concatenate((arrow[t], arrows[:-N])) if n > 1 else arrow[t]
         del kept, L, ahead  # twice as much memory as the covariances
-        across = arrow @ shape
-        poses += across @ arrow.mT
-        steps[:-1] += across[1:] @ arrow[:-1].mT
-        return Marginals(self, state, poses, steps, shape, -across)
+        with_shape = arrow @ shape
+        poses += with_shape @ arrow.mT
+        steps[:-1] += with_shape[1:] @ arrow[:-1].mT
+        return Marginals(self, state, poses, steps, shape, -with_shape)
 
 
 @dataclass(frozen=True)
