@@ -5,6 +5,7 @@ problem (`body_solution.py`).
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,10 +15,8 @@ from shapepose_fg.core.arrays import Array, Mask
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.notes import Problem
 from shapepose_fg.core.observations import Observations, window_rows
-from shapepose_fg.core.reconstruction import Known
 from shapepose_fg.estimation.alternation_covariances import state_covariances
-from shapepose_fg.estimation.camera_pose_uncertainty import carried_covariance
-from shapepose_fg.estimation.draft import MODEL_SIGMA_M, first_places
+from shapepose_fg.estimation.draft import MODEL_SIGMA_M
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.frame_graph import WindowGraph
 from shapepose_fg.estimation.gated_views import (
@@ -26,16 +25,8 @@ from shapepose_fg.estimation.gated_views import (
     mean_confidence,
     observation_sigmas,
 )
-from shapepose_fg.estimation.mirrored_sides import mirrored_spread
-from shapepose_fg.estimation.user_factors import FactorFunction, add_factors, factors_of
-from shapepose_fg.estimation.window_solution import (
-    RUNAWAY_M,
-    PersonGraph,
-    WindowSolution,
-    statuses,
-    strong_detections,
-    tied,
-)
+from shapepose_fg.estimation.user_factors import FactorFunction, add_factors
+from shapepose_fg.estimation.window_solution import RUNAWAY_M, Estimates, WindowSolution
 
 JOINT_SIGMA_M = 0.03
 """Standard deviation of all joints to which a body is fitted, metres."""
@@ -43,18 +34,20 @@ JOINT_SIGMA_M = 0.03
 
 def alternate(
     observations: Observations,
+    first: Array,
     views: Views,
     fitter: BodyFitter,
     config: EstimatorConfig,
     functions: Sequence[FactorFunction] = (),
 ) -> WindowSolution:
-    """Joints, covariances and bodies of N rows by Algorithm 1, each row by itself.
+    """Joints, covariances and bodies of N rows by Algorithm 1, each row by itself, from X_0:
+    `first` (N, J, 3), metres.
 
     Each round fits bodies to X_n, gates the detections there (Eq. 2), and solves each person's
     graph by GTSAM: Eq. 1 for what gates leave, Eq. 3 for joints with a mean confidence of at most
     rho_3D (Eq. 4), and the factors of `functions`. Covariances are the marginals of the last graph.
     """
-    X = first = first_places(observations, views, fitter, config)
+    X = first
     sigmas = observation_sigmas(observations, X, views, config.observations, config.joints)
     people = list[WindowGraph]()
     for row in np.concatenate([np.empty(0, np.intp), *window_rows(observations)])[:, None]:
@@ -76,7 +69,15 @@ def alternate(
         moved = np.linalg.norm(X - before, axis=-1)
         if (np.isnan(X).any(axis=-1) | (moved < config.refine.settled_m)).all():
             break
-    return _solution(observations, views, sigmas, X, evidence, fit, people, enough, config)
+    covariance = np.full((*X.shape, 3), np.nan)
+    for person, of_positions in zip(people, state_covariances(people), strict=True):
+        covariance[person.rows] = of_positions
+    failed = _problems(observations, X, covariance, people)
+    final = linearise(observations, sigmas, X, views, config.observations)
+    found = Estimates.of(X, covariance, replace(final, inlier=evidence.inlier), fit)
+    found.add_other_errors(observations, np.zeros(covariance.shape), sigmas, views, config)
+    nothing = np.zeros(enough.shape + X.shape[1:2], dtype=bool)
+    return found.solution(observations, people, failed, enough, nothing)
 
 
 def _targets(X: Array, enough: Mask) -> JointTargets:
@@ -116,59 +117,6 @@ def _solved(
     for each in people:
         X[each.rows] = each.positions
     return X
-
-
-def _solution(
-    rows: Observations,
-    views: Views,
-    sigmas: Array,
-    X: Array,
-    evidence: ViewEvidence,
-    fit: BodyFit,
-    people: Sequence[WindowGraph],
-    enough: Mask,
-    config: EstimatorConfig,
-) -> WindowSolution:
-    covariance = np.full((*X.shape, 3), np.nan)
-    for person, of_positions in zip(people, state_covariances(people), strict=True):
-        covariance[person.rows] = of_positions
-    final = linearise(rows, sigmas, X, views, config.observations)
-    if views.carried is not None:
-        nothing = JointTargets(X, np.zeros((*X.shape, 3)))
-        covariance += carried_covariance(final, nothing, sigmas, views, config.observations)
-    covariance += mirrored_spread(X, rows.mirrored, config.joints)
-    inlier, nowhere = evidence.inlier, np.full(X.shape, np.nan)
-    strong = strong_detections(rows, inlier)
-    known = np.where(inlier.any(axis=-1), Known.WEAK, Known.BODY)
-    known = np.where(strong.sum(axis=-1) >= 2, Known.SEEN, known)
-    known = np.where(np.isfinite(X).all(axis=-1), known, Known.UNKNOWN)
-    wrong = _problems(rows, X, covariance, people)
-    graphs = [
-        PersonGraph(
-            window=each,
-            joints=X[each.rows],
-            covariance=covariance[each.rows],
-            bodies=fit.rows(each.rows),
-        )
-        for each in people
-    ]
-    return WindowSolution(
-        observations=rows,
-        joints=X,
-        covariance=covariance,
-        velocity=nowhere,
-        velocity_covariance=np.full_like(covariance, np.nan),
-        confidence=mean_confidence(rows, inlier),
-        inlier=inlier,
-        contradicts=np.zeros(X.shape[:2], dtype=bool),
-        residual_px=final.residual_px,
-        known=known.astype(np.uint8),
-        fit=fit,
-        status=statuses(rows, fit.ok, enough, wrong),
-        problems=wrong,
-        people=tied(graphs),
-        factors=factors_of(people),
-    )
 
 
 def _problems(

@@ -45,6 +45,8 @@ class Draft(Rows):
 
     observations: Observations
     """Observations of the estimate."""
+    triangulated: Array
+    """(N, J, 3) positions of the joints that stage I or several views give, metres; else NaN."""
     body: BodyFit
     """Bodies of the rows."""
     fitted: JointTargets
@@ -53,6 +55,13 @@ class Draft(Rows):
     """(N, J, 3) positions, metres; NaN if neither views nor body determine them."""
     covariance: Array
     """(N, J, 3, 3) covariances, m²; NaN like the positions."""
+
+    @property
+    def start(self) -> Array:
+        """(N, J, 3) X_0, metres: joints that views give, others where the body is, so that a single
+        view of a joint counts from the first round on.
+        """
+        return np.where(np.isnan(self.triangulated), self.places, self.triangulated)
 
     def updated(self, new: "Draft") -> "Draft":
         """The estimates with those of the frames of `new` in their place."""
@@ -89,13 +98,7 @@ def draft(
         body.put(here, last.body.rows(there))
         near[here] = body.ok[here]
     new = np.flatnonzero(~near)
-    if len(new) > 0:
-        first = joint_targets(evidence, enough).rows(new)
-        begun = fitter.fit(first)
-        placed = np.flatnonzero(begun.ok)
-        fitted.put(new, first)
-        body.put(new[placed], begun.rows(placed))
-    for reach_m in NARROWING_M:
+    for reach_m in (None, *NARROWING_M):
         asked = np.arange(N) if reach_m == NARROWING_M[-1] else new
         given, seen_by, around = observations.rows(asked), views.rows(asked), body.rows(asked)
         around = np.where(around.ok[:, None, None], around.joints, X[asked])
@@ -104,12 +107,12 @@ def draft(
         moved = changed_targets(fitted.rows(asked), targets, MODEL_SIGMA_M, 2.0)
         if len(moved) == 0:
             continue
-        again = fitter.fit(targets.rows(moved))
+        fit = fitter.fit(targets.rows(moved))
         fitted.put(asked[moved], targets.rows(moved))
-        placed = np.flatnonzero(again.ok)
-        body.put(asked[moved[placed]], again.rows(placed))
+        placed = np.flatnonzero(fit.ok)
+        body.put(asked[moved[placed]], fit.rows(placed))
     places, covariance = drafted(evidence, body)
-    return Draft(observations, body, fitted, places, covariance)
+    return Draft(observations, X, body, fitted, places, covariance)
 
 
 def _unchanged(now: Observations, before: Observations) -> tuple[Index, Index]:
@@ -121,42 +124,6 @@ def _unchanged(now: Observations, before: Observations) -> tuple[Index, Index]:
     _, here, there = np.intersect1d(*names, assume_unique=True, return_indices=True)
     same = (now.xy[here] == before.xy[there]).all(axis=(1, 2, 3))
     return here[same], there[same]
-
-
-def first_places(
-    observations: Observations, views: Views, fitter: BodyFitter, config: EstimatorConfig
-) -> Array:
-    """X_0 (N, J, 3), metres: joints of stage I, else triangulated ones, and in windows of several
-    frames initial estimates, so that a single view of a joint counts from the first round on.
-    """
-    X = observations.initial
-    if config.refine.complete_start:
-        X = triangulate(observations, views, config.observations)
-    _, whose, rows_of = np.unique(observations.track, return_inverse=True, return_counts=True)
-    unknown = np.asarray(np.isnan(X).any(axis=2))
-    rows = np.flatnonzero(unknown.any(axis=1) & (rows_of[whose] > 1))
-    if len(rows) == 0:
-        return X
-    found = draft(observations.rows(rows), views.rows(rows), fitter, config)
-    complete = X.copy()
-    complete[rows] = np.where(unknown[rows][..., None], found.places, X[rows])
-    return complete
-
-
-def first_bodies(
-    observations: Observations, targets: JointTargets, fitter: BodyFitter, drafted: Draft | None
-) -> BodyFit:
-    """Bodies of N rows: of the initial estimates, for rows with the same detections; others are
-    fitted to the `targets`.
-    """
-    body = BodyFit.failed(np.full(len(targets), FitStatus.TOO_FEW_JOINTS), targets.xyz.shape[1])
-    if drafted is not None:
-        here, there = _unchanged(observations, drafted.observations)
-        body.put(here, drafted.body.rows(there))
-    new = np.flatnonzero(~body.ok)
-    if len(new) > 0:
-        body.put(new, fitter.fit(targets.rows(new)))
-    return body
 
 
 def joint_targets(evidence: ViewEvidence, enough: Mask) -> JointTargets:

@@ -51,22 +51,15 @@ class RefineConfig(Settings):
     """Motion of joints in a round below which the alternation ends, m; 0: it makes all rounds."""
     max_sigma_m: Metres = 0.5
     """Maximum standard deviation of a joint determined by its views, in the worst direction, m."""
-    complete_start: bool = True
-    """Whether, in single frames, joints seen by two views but missing from stage I are triangulated
-    for X_0. In the paper they are missing until the body gives them a position."""
     with_body: bool = True
-    """Whether joints and bodies are one problem (`body_window.BodyWindow`), not two in turn as in
-    the paper."""
+    """Whether joints and bodies are one problem (`body_window.BodyWindow`), and X_0 is an initial
+    estimate of all joints. In the paper bodies and joints are found in turn, and joints that stage
+    I does not find are missing until the body gives them a position."""
 
     @classmethod
     def paper(cls) -> "RefineConfig":
         """Algorithm 1 as written, with N = 10."""
-        return cls(
-            alternations=10,
-            settled_m=0.0,
-            complete_start=False,
-            with_body=False,
-        )
+        return cls(alternations=10, settled_m=0.0, with_body=False)
 
 
 @dataclass(frozen=True)

@@ -258,7 +258,7 @@ def triangulate(observations: Observations, views: Views, config: ObservationCon
     Linear triangulation, iterated with robust weights; joints of stage I keep their position, and
     joints seen by fewer than two views, or by views that disagree, stay NaN.
     """
-    points = np.array(observations.initial, dtype=float, order="C")
+    points = observations.initial.astype(float, order="C")
     given = views.projection, views.focal, ready(observations.xy), ready(observations.confidence)
     complete(*given, 2.0 * config.sigma_m, config.rho_2d_m, MIN_DEPTH_M, points)
     return points

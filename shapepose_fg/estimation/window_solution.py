@@ -2,25 +2,32 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Self
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from shapepose_fg.body.fitting.fitter import BodyFit
+from shapepose_fg.body.fitting.fitter import BodyFit, JointTargets
 from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.errors import NotDetermined
 from shapepose_fg.core.notes import Problem
 from shapepose_fg.core.observation_table import Gate, ObservationTable
 from shapepose_fg.core.observations import Observations
-from shapepose_fg.core.reconstruction import BODY, Reconstruction, Status
+from shapepose_fg.core.reconstruction import BODY, Known, Reconstruction, Status
 from shapepose_fg.core.rows import Rows
 from shapepose_fg.estimation.asynchronous_views import carried_to_frames
+from shapepose_fg.estimation.camera_pose_uncertainty import carried_covariance
+from shapepose_fg.estimation.estimator_config import EstimatorConfig
+from shapepose_fg.estimation.gated_views import ViewEvidence, mean_confidence
+from shapepose_fg.estimation.in_time import near_in_time
 from shapepose_fg.estimation.minimise import undetermined_key
-from shapepose_fg.estimation.mirrored_sides import DOUBTED
-from shapepose_fg.estimation.user_factors import PersonWindow
+from shapepose_fg.estimation.mirrored_sides import DOUBTED, mirrored_spread
+from shapepose_fg.estimation.user_factors import PersonWindow, factors_of
 
+RECENT_S = 0.25
+"""Time since a view last detected a joint, s, within which its motion determines it."""
 RUNAWAY_M = 1.0
 """Distance of a joint with a user factor from its solution without, or from X_0, at which it has
 diverged, m."""
@@ -222,6 +229,91 @@ class PersonGraph:
         says = "constrains" if self.window.of_body(t, joint).any() else "does not constrain"
         said = f"{saw}, and the body {says} it"
         return NotDetermined(self.person, str(joint_names[joint]), frame, time_s, said)
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """What is known of N rows while they are solved."""
+
+    joints: Array
+    """(N, J, 3) metres; NaN if unknown."""
+    covariance: Array
+    """(N, J, 3, 3) m²; NaN if unknown."""
+    velocity: Array
+    """(N, J, 3) m/s; NaN if unknown."""
+    velocity_covariance: Array
+    """(N, J, 3, 3) m²/s²; NaN if unknown."""
+    evidence: ViewEvidence
+    """The detections at the joints, with those that were used."""
+    fit: BodyFit
+    """The bodies."""
+
+    @classmethod
+    def of(cls, joints: Array, covariance: Array, evidence: ViewEvidence, fit: BodyFit) -> Self:
+        """Estimates without velocities."""
+        unknown = np.full_like(joints, np.nan), np.full_like(covariance, np.nan)
+        return cls(joints, covariance, *unknown, evidence, fit)
+
+    def add_other_errors(
+        self,
+        rows: Observations,
+        of_body: Array,
+        sigmas: Array,
+        views: Views,
+        config: EstimatorConfig,
+    ) -> None:
+        """Add errors that graphs do not have to the covariances: poses of moving cameras, against
+        which bodies hold joints with the information `of_body` (N, J, 3, 3), and exchanged sides.
+        """
+        bodies, gates = JointTargets(self.joints, of_body), config.observations
+        self.covariance[:] += carried_covariance(self.evidence, bodies, sigmas, views, gates)
+        self.covariance[:] += mirrored_spread(self.joints, rows.mirrored, config.joints)
+
+    def solution(
+        self,
+        rows: Observations,
+        people: Sequence[PersonWindow],
+        problems: tuple[Problem, ...],
+        enough: Mask,
+        contradicts: Mask,
+    ) -> WindowSolution:
+        """The solution, with codes, statuses and the graphs of `people`. `enough` (N,) are rows
+        whose views determine a body.
+        """
+        inlier = self.evidence.inlier
+        recent = np.asarray(inlier.any(axis=-1))
+        for each in people:
+            recent[each.rows] = near_in_time(recent[each.rows], each.times_s, RECENT_S)
+        known = np.where(recent, Known.MOTION, Known.BODY)
+        known = np.where(inlier.any(axis=-1), Known.WEAK, known)
+        known = np.where(strong_detections(rows, inlier).sum(axis=-1) >= 2, Known.SEEN, known)
+        known = np.where(np.isfinite(self.joints).all(axis=-1), known, Known.UNKNOWN)
+        graphs = [
+            PersonGraph(
+                window=each,
+                joints=self.joints[each.rows],
+                covariance=self.covariance[each.rows],
+                bodies=self.fit.rows(each.rows),
+            )
+            for each in people
+        ]
+        return WindowSolution(
+            observations=rows,
+            joints=self.joints,
+            covariance=self.covariance,
+            velocity=self.velocity,
+            velocity_covariance=self.velocity_covariance,
+            confidence=mean_confidence(rows, inlier),
+            inlier=inlier,
+            contradicts=contradicts,
+            residual_px=self.evidence.residual_px,
+            known=known.astype(np.uint8),
+            fit=self.fit,
+            status=statuses(rows, self.fit.ok, enough, problems),
+            problems=problems,
+            people=tied(graphs),
+            factors=factors_of(people),
+        )
 
 
 def tied(people: Sequence[PersonGraph]) -> tuple[PersonGraph, ...]:

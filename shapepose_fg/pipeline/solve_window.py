@@ -85,10 +85,15 @@ def solve_window(
     assigned = time.perf_counter()
 
     functions = functions_of(extra_factors)
-    if config.refine.with_body and fitter.model is not None:
-        solution = solve_bodies(observations, views, fitter, config, motion, functions, drafted)
+    if not config.refine.with_body:
+        X = observations.initial
+        solution = alternate(observations, X, views, fitter, config, functions)
     else:
-        solution = alternate(observations, views, fitter, config, functions)
+        first = draft(observations, views, fitter, config, drafted)
+        if fitter.model is None:
+            solution = alternate(observations, first.start, views, fitter, config, functions)
+        else:
+            solution = solve_bodies(first, views, fitter.model, config, motion, functions)
     solution.seconds.update(
         {"associate again": assigned - began, "solve": time.perf_counter() - assigned}
     )

@@ -109,7 +109,7 @@ def run(
         config = EstimatorConfig(
             ObservationConfig(kernel=kernel),
             WindowGraphConfig(rho_3d=rho_3d, max_iterations=100, tolerance=1e-12),
-            RefineConfig(alternations=alternations, settled_m=settled_m),
+            RefineConfig(alternations=alternations, settled_m=settled_m, with_body=False),
         )
         return solve_window(
             observations, Views.of(rig), fitter, config, extra_factors=extra_factors

@@ -127,16 +127,14 @@ def test_a_lone_row_is_what_it_is_by_itself_beside_somebody_s_window(
         np.testing.assert_array_equal(getattr(alone, name)[0], getattr(together, name)[31])
 
 
-def test_a_start_that_is_not_complete_is_for_frames_alone(walk, five_cameras, two_people):
-    """Nothing placed by stage I and no triangulation: alone there is nobody, a window has its
-    draft.
-    """
+def test_what_stage_one_did_not_place_is_missing_by_the_paper_only(walk, five_cameras, two_people):
+    """Nothing placed by stage I: the paper's X_0 is empty, ours is triangulated."""
     observations, truth = walk
-    config = EstimatorConfig(refine=RefineConfig(complete_start=False))
-    asked = Views.of(five_cameras), NobodyFitter(), config
-    alone = solve_window(replace(observations, track=np.arange(len(observations))), *asked)
-    assert (alone.status == Status.TOO_FEW_VIEWS).all() and np.isnan(alone.joints).all()
-    np.testing.assert_allclose(solve_window(observations, *asked).joints, truth, atol=0.03)
+    views, fitter = Views.of(five_cameras), NobodyFitter()
+    paper = solve_window(observations, views, fitter, EstimatorConfig(refine=RefineConfig.paper()))
+    assert (paper.status == Status.TOO_FEW_VIEWS).all() and np.isnan(paper.joints).all()
+    ours = solve_window(observations, views, fitter, EstimatorConfig())
+    np.testing.assert_allclose(ours.joints, truth, atol=0.03)
 
 
 def test_the_order_of_rows_does_not_matter(walk, five_cameras, two_people):

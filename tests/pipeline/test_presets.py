@@ -226,7 +226,7 @@ def test_stage_two_s_settings_of_the_paper():
     """
     r, w, o = PAPER.refine, PAPER.window_graph, PAPER.observations
     assert (r.alternations, w.rho_3d, o.confidence_power, o.kernel) == (10, 0.25, 1.0, "none")
-    assert (r.complete_start, r.with_body, r.settled_m) == (False, False, 0.0)
+    assert (r.with_body, r.settled_m) == (False, 0.0)
     assert not PAPER.temporal and PAPER.offsets.source == "none"
 
 
