@@ -3,19 +3,20 @@ bodies.
 """
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factors import CONSTANT_VELOCITY
 from shapepose_fg.body.fitting.evidence import LEAST_JOINTS
 from shapepose_fg.body.fitting.fitter import BodyFit, FitStatus
 from shapepose_fg.body.model.body_model import BodyModel
-from shapepose_fg.core.arrays import Array, Mask
+from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.notes import Problem
-from shapepose_fg.core.observations import window_rows
+from shapepose_fg.core.observations import Observations, window_rows
 from shapepose_fg.estimation.body_frames import BodyFrames
 from shapepose_fg.estimation.body_window import BodyWindow, Marginals
 from shapepose_fg.estimation.condensed_graph import gtsam_step
@@ -25,6 +26,7 @@ from shapepose_fg.estimation.draft import Draft
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.factor_solution import solve_with_factors
 from shapepose_fg.estimation.gated_views import (
+    ObservationConfig,
     ViewEvidence,
     inverses,
     linearise,
@@ -66,27 +68,75 @@ def solve_bodies(
     that of the graph with user factors (`solve_with_factors`); plus errors of moving cameras
     and exchanged sides (`Estimates.add_other_errors`).
     """
-    observations, start = first.observations, first.body
-    # Gating of the initial estimate; what it rejects stays out, since bodies can be drawn to the
-    # other leg's detections.
-    seen, ratio = observations.seen, config.noise.ratios(observations.confidence)
-    noisy = max(1.0, float(np.sqrt(ratio[seen].mean()))) if seen.any() else 1.0
+    observations = first.observations
+    noisy = config.noise.typical(observations.confidence[observations.seen])
     rho_2d_m = noisy * min(GATE_M, config.observations.rho_2d_m)
     gates = replace(config.observations, rho_2d_m=rho_2d_m)
-    X = first.start
-    sigmas = observation_sigmas(observations, X, views, config.observations, config.joints)
-    sigmas = sigmas * np.sqrt(ratio)
-    evidence = linearise(observations, sigmas, X, views, gates)
+    evidence, sigmas = _at_start(first, views, config, gates)
     enough = (evidence.sigma_m <= config.refine.max_sigma_m).sum(axis=1) >= LEAST_JOINTS
-    # Where it rejects some detections of a joint, the others are less certain, too.
-    kept = evidence.inlier.sum(axis=-1) / np.maximum(observations.seen.sum(axis=-1), 1)
-    sigmas = np.where(evidence.inlier, sigmas / np.maximum(kept, 1e-9)[..., None], 0.0)
+    agreed = np.asarray(evidence.inlier.sum(axis=-1) >= 2)
 
     # Bodies and joints together. Rows without a body keep what their views determine.
-    agreed = np.asarray(evidence.inlier.sum(axis=-1) >= 2)
-    no_body = BodyFit.failed(start.status, X.shape[1])
-    found = _of_views(evidence, config.refine.max_sigma_m, no_body)
+    found = _of_views(evidence, config.refine.max_sigma_m, first.body.status)
     people, spread = list[BodyGraph](), list[Array]()
+    for rows, solved in _solved(first, sigmas, views, model, config, gates, motion):
+        widen = covariance_factors(solved, noisy)
+        for (place, each), factor in zip(solved.window.apart(solved), widen, strict=True):
+            people.append(BodyGraph(each.window, each.state, float(factor), rows[place]))
+            spread.append(each.of_bodies)
+            _put(found, people[-1], each)
+        del solved, each  # memory that the next person needs
+
+    _widen_unseen(found, people, spread, observations, views, config)
+    if len(functions) > 0:  # people who have some are solved once more
+        add_factors(people, functions)
+        for each in solve_with_factors(people, config.graph):
+            _put(found, each.person, each.marginals)
+            found.covariance[each.person.rows] = each.covariance
+    of_body = inverses(found.fit.covariance + np.eye(3) * 1e-6)
+    found.add_other_errors(observations, of_body, sigmas, views, config)
+
+    # Views that agreed on a joint, of which none is used: they contradict the body.
+    against = agreed & ~found.evidence.inlier.any(axis=-1)
+    failed = tuple(
+        Problem(int(row), each.track, int(observations.frame[row]), joint, each.failure)
+        for each in people
+        for row in (each.rows if each.failure else ())
+        for joint in np.flatnonzero(each.touched).tolist()
+    )
+    return found.solution(observations, people, failed, enough, against)
+
+
+def _at_start(
+    first: Draft, views: Views, config: EstimatorConfig, gates: ObservationConfig
+) -> tuple[ViewEvidence, Array]:
+    """Detections gated at the start, and their standard deviations (N, J, V), pixels.
+
+    What the gate rejects stays out (0), since bodies can be drawn to the other leg's detections.
+    Where it rejects some detections of a joint, the others are less certain, too.
+    """
+    rows, X = first.observations, first.start
+    sigmas = observation_sigmas(rows, X, views, config.observations, config.joints)
+    sigmas = sigmas * np.sqrt(config.noise.ratios(rows.confidence))
+    evidence = linearise(rows, sigmas, X, views, gates)
+    kept = evidence.inlier.sum(axis=-1) / np.maximum(rows.seen.sum(axis=-1), 1)
+    less = sigmas / np.maximum(kept, 1e-9)[..., None]
+    return evidence, np.where(evidence.inlier, less, 0.0)
+
+
+def _solved(
+    first: Draft,
+    sigmas: Array,
+    views: Views,
+    model: BodyModel,
+    config: EstimatorConfig,
+    gates: ObservationConfig,
+    motion: MotionModel,
+) -> Iterator[tuple[Index, Marginals]]:
+    """The rows of each window that can be solved: a person's, or all people of single frames; and
+    its marginals.
+    """
+    observations, start = first.observations, first.body
     feet = feet_of(config.joints if config.motion.contact else ())
     over_time = len(np.unique(observations.track)) < len(observations)
     Model = BodyWindow if over_time else BodyFrames
@@ -105,23 +155,23 @@ def solve_bodies(
             if over_time and len(rows) > 2 and len(feet) > 0:
                 window.hold(state, feet)
             state = window.take(state, *gtsam_step(window, state))
-            marginals = window.covariances(state)
+            yield rows, window.covariances(state)
         except np.linalg.LinAlgError:
             if not over_time and len(rows) > 1:  # one of them
                 parts.extend(rows[:, None])
-            continue
-        widen = covariance_factors(marginals, noisy)
-        for (place, each), factor in zip(window.apart(marginals), widen, strict=True):
-            own = rows[place]
-            frames = observations.frame[own].astype(np.int64)
-            track = int(observations.track[own[0]])
-            people.append(BodyGraph(each.window, each.state, track, frames, float(factor), own))
-            spread.append(each.of_bodies)
-            _put(found, people[-1], each)
-        del marginals, each  # memory that the next person needs
 
-    # Uncertainty: unseen joints deviate from their bodies by more, above all those that cameras
-    # should see; cameras' poses and sides may be wrong.
+
+def _widen_unseen(
+    found: Estimates,
+    people: Sequence[BodyGraph],
+    spread: Sequence[Array],
+    observations: Observations,
+    views: Views,
+    config: EstimatorConfig,
+) -> None:
+    """Unseen joints deviate from their bodies by more, above all those that cameras should see.
+    `spread` has each person's covariances of joints from bodies alone.
+    """
     strong = strong_detections(observations, found.evidence.inlier)
     limbs = limbs_that_hide(config.joints)
     elsewhere = elsewhere_variance(found.joints, observations.frame, strong, views, limbs)
@@ -132,31 +182,16 @@ def solve_bodies(
         person.window.widen_unseen(of_bodies, moved / person.widen)  # a length, whatever the graph
         found.covariance[person.rows] = person.widen * person.window.of_joints(of_bodies)
 
-    # User factors: people who have some are solved once more.
-    if len(functions) > 0:
-        add_factors(people, functions)
-        for each in solve_with_factors(people, config.graph):
-            _put(found, each.person, each.marginals)
-            found.covariance[each.person.rows] = each.covariance
-    of_body = inverses(found.fit.covariance + np.eye(3) * 1e-6)
-    found.add_other_errors(observations, of_body, sigmas, views, config)
-    # Views that agreed on a joint, of which none is used: they contradict the body.
-    against = agreed & ~found.evidence.inlier.any(axis=-1)
-    failed = tuple(
-        Problem(int(row), each.track, int(observations.frame[row]), joint, each.failure)
-        for each in people
-        for row in (each.rows if each.failure else ())
-        for joint in np.flatnonzero(each.touched).tolist()
-    )
-    return found.solution(observations, people, failed, enough, against)
 
-
-def _of_views(evidence: ViewEvidence, most_m: float, fit: BodyFit) -> Estimates:
-    """What the views alone say of joints, where they determine them; NaN elsewhere."""
+def _of_views(evidence: ViewEvidence, most_m: float, status: NDArray[np.str_]) -> Estimates:
+    """What the views alone say of joints, where they determine them; NaN elsewhere. No bodies, with
+    the `status` (N,) of their fits.
+    """
     placed = np.asarray(evidence.sigma_m <= most_m)
     covariance = np.full((*placed.shape, 3, 3), np.nan)
     covariance[placed] = np.linalg.inv(evidence.information[placed])
     joints = np.where(placed[..., None], evidence.target, np.nan)
+    fit = BodyFit.failed(status, placed.shape[1])
     return Estimates.of(joints, covariance, evidence, fit)
 
 

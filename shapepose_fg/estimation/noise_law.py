@@ -127,6 +127,12 @@ class NoiseLaw:
         core = np.square(np.divide(self.times, self.shipped().times))
         return core[np.digitize(scores, EDGES)]
 
+    def typical(self, scores: Array) -> float:
+        """Standard deviation of detections with these `scores` (N,), relative to the shipped law's;
+        at least 1.
+        """
+        return max(1.0, float(np.sqrt(self.ratios(scores).mean()))) if len(scores) > 0 else 1.0
+
 
 def core_sigma_m(scores: Array | float, config: ObservationConfig | None = None) -> Array:
     """(...) standard deviation that Eq. 1 assumes for detections with these `scores` (...), m.

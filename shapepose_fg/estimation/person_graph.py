@@ -7,7 +7,6 @@ from itertools import pairwise
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from factors import (
     DEFAULT_WIDTH_SIGMA,
@@ -49,15 +48,15 @@ class BodyGraph(PersonWindow):
         self,
         window: BodyWindow,
         state: BodyState,
-        person: int,
-        frames: NDArray[np.int64],
         widen: float = 1.0,
         rows: Index | None = None,
     ) -> None:
-        """Take a solved window of T `frames`; all covariances of the graph are `widen` times those
-        of the model: neither solution nor kernels change.
+        """Take a person's solved window, the `rows` (T,) of the problem; all covariances of the
+        graph are `widen` times those of the model: neither solution nor kernels change.
         """
         joints = np.arange(window.sigmas_px.shape[1])
+        person = int(window.observations.track[0])
+        frames = window.observations.frame.astype(np.int64)
         keys = state_keys(person, joints, frames[:, None], 2)
         super().__init__(person, frames, window.times_s, keys, rows, window.joints(state))
         self.body_keys, self.shape_key = body_keys(person, frames), shape_key(person)

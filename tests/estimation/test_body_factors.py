@@ -21,11 +21,9 @@ CONFIG = WindowGraphConfig()
 
 
 def person(seed: int, number: int = 0) -> BodyGraph:
-    window, _, start = _person(seed)
+    window, _, start = _person(seed, track=number)
     state = window.solve(start)
-    return BodyGraph(
-        window, window.take(state, *gtsam_step(window, state)), number, FRAMES, widen=2.0
-    )
+    return BodyGraph(window, window.take(state, *gtsam_step(window, state)), widen=2.0)
 
 
 def moved(one: BodyGraph, expected: np.ndarray, asked: list[int]) -> float:

@@ -68,7 +68,7 @@ def test_marginals_are_those_of_each_row_s_graph() -> None:
     state = solved(window, start)
     marginals = window.covariances(state)
     for at, one in window.apart(marginals)[::5]:
-        built = BodyGraph(one.window, one.state, 3, at.astype(np.int64), widen=2.0).build()
+        built = BodyGraph(one.window, one.state, widen=2.0).build()
         found = gtsam.Marginals(built.graph, built.values)
         for joint in range(0, 25, 6):
             theirs = found.marginalCovariance(int(built.keys[0, joint]))

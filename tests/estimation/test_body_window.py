@@ -39,7 +39,7 @@ def _views() -> Views:
 
 
 def _person(
-    seed: int, hidden: float = 0.0, *, lasts: bool = False, step_s: float = 1 / 30
+    seed: int, hidden: float = 0.0, *, lasts: bool = False, step_s: float = 1 / 30, track: int = 0
 ) -> tuple[BodyWindow, np.ndarray, np.ndarray]:
     """A window, its true joints (T, J, 3) and a start (T, P) near the truth; errors that last are
     those of the first frame.
@@ -57,7 +57,7 @@ def _person(
     confidence[rng.random(confidence.shape) < hidden] = 0.0
     names = tuple(model.keypoint_names)
     observations = Observations(
-        xy, confidence, truth, track=np.zeros(T, dtype=np.intp), frame=np.arange(T),
+        xy, confidence, truth, track=np.full(T, track, dtype=np.intp), frame=np.arange(T),
         time_s=np.tile(step_s * np.arange(T, dtype=np.float64)[:, None], (1, CAMERAS)),
     )  # fmt: skip
     config = ObservationConfig()
@@ -130,7 +130,7 @@ def test_marginals_are_those_of_the_graph_and_its_step_moves_nothing() -> None:
     window, _, start = _person(1, 0.3)
     state = window.solve(start)
     covariance = window.covariances(state).joints()
-    built = BodyGraph(window, state, 3, np.arange(T), widen=2.0).build()
+    built = BodyGraph(window, state, widen=2.0).build()
     marginals = gtsam.Marginals(built.graph, built.values)
     apart = [
         np.abs(np.linalg.eigvals(np.linalg.solve(2.0 * covariance[t, joint], found)) - 1).max()
@@ -192,7 +192,7 @@ def test_a_body_s_values_are_those_of_the_model_wherever_it_was_linearised() -> 
     as it changes the model.
     """
     window, _, start = _person(3)
-    built = BodyGraph(window, window.solve(start), 0, np.arange(T)).build()
+    built = BodyGraph(window, window.solve(start)).build()
     before, key = window.joints(built.state), int(built.body_keys[5])
     built.take(built.values)
     np.testing.assert_allclose(window.joints(built.state), before, atol=1e-9)
