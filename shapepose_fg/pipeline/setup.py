@@ -68,12 +68,11 @@ class Setup:
         """Solve one window, in any process; returns rows of its own frames, by frame and person,
         and notes.
         """
-        every = [frame for frame, _ in span.decided]
-        given = [frame for frame in every if frame.key]
+        given = [frame for frame, _ in span.decided if frame.key]
         rows = Observations.concatenate([part for _, part in span.decided])
         windows, rig = self.config.windows, self.rig if span.rig is None else span.rig
         rounds = windows.again_alone if span.alone else windows.again_over_time
-        solution = solve_window(
+        whole = solve_window(
             rows,
             Views.of(rig, rows.time_s),
             self.fitter,
@@ -83,59 +82,37 @@ class Setup:
         )
         doubted = {frame.frame: frame.rig.doubted for frame in given if len(frame.rig.doubted) > 0}
         if len(doubted) > 0:
-            solution = replace(solution, status=_doubted(solution, doubted))
-        own = {frame.frame for frame in every[span.start : span.stop]}
-        found = solution.observations
-        left = Counter(rows.frame.tolist()) - Counter(found.frame.tolist())
-        by_person = np.lexsort((found.track, found.frame))
-        whole = solution
-        solution = solution.rows(by_person[np.isin(found.frame[by_person], list(own))])
-        rows = solution.observations
-        if not self.config.temporal:  # numbers within the frame
-            number = np.arange(len(rows)) - np.searchsorted(rows.frame, rows.frame)
-            problems = tuple(
-                replace(each, track=int(number[each.row])) for each in solution.problems
-            )
-            solution = replace(
-                solution, observations=replace(rows, track=number), problems=problems
-            )
-        notes = Notes(
-            len(own),
-            dict(solution.seconds),
-            problems=list(solution.problems),
-            factors=solution.factors,
-        )
-        if dropped := sorted(frame for frame in left.elements() if frame in own):
+            whole = replace(whole, status=_doubted(whole, doubted))
+        solution = _of_frames(whole, span.own, numbered=not self.config.temporal)
+        notes = _notes(solution, len(span.own), self.config.temporal)
+        left = Counter(rows.frame.tolist()) - Counter(whole.observations.frame.tolist())
+        if dropped := sorted(frame for frame in left.elements() if frame in span.own):
             notes.dropped[_FALSE_POSITIVE] = dropped
-        said = np.isfinite(rows.evidence)
-        if self.config.temporal:
-            for track in np.unique(rows.track[said]).tolist():
-                evidence = rows.evidence[said & (rows.track == track)]
-                notes.evidence[track] = float(evidence.sum()), len(evidence)
-        else:
-            tenths = (f"{tenth / 10:.1f}" for tenth in np.floor(10 * rows.evidence[said]))
-            notes.probable = dict(Counter(tenths))
-        if len(given) == len(every):
+        if len(given) == len(span.decided):
             return Part(self._result(solution, given, rig), notes)
-        frame, time_s = (
-            np.array([each.frame for each in every]),
-            np.array([each.time_s.mean() for each in every]),
-        )
-        key = np.array([each.key for each in every])
+        return self._with_rows_between(span, whole, self._result(whole, given, rig), notes)
+
+    def _with_rows_between(
+        self, span: Span, whole: WindowSolution, solved: Reconstruction, notes: Notes
+    ) -> Part:
+        """The own rows of a window of which only keyframes are `solved`, with those of the frames
+        between; frames in which people do not follow the motion model are solved, too.
+        """
+        every = [frame for frame, _ in span.decided]
+        frame, key = (np.array([getattr(each, of) for each in every]) for of in ("frame", "key"))
+        time_s = np.array([each.time_s.mean() for each in every])
         # The cubic between keyframes is that of white noise on acceleration, for any `law`.
         motion = MotionModel.load(self.skeleton.joints, self.config.motion)
-        carried = with_rows_between(self._result(whole, given, rig), frame, time_s, key, motion)
+        carried = with_rows_between(solved, frame, time_s, key, motion)
         for part in map(self.solve, halved(span, whole, carried, self.config)):
             anew = np.unique(part.rows.frame)
-            carried = Reconstruction.concatenate(
-                [carried.rows(~np.isin(carried.frame, anew)), part.rows]
-            )
-            notes.problems = [
-                each for each in notes.problems if each.frame not in anew
-            ] + part.notes.problems
+            others = carried.rows(~np.isin(carried.frame, anew))
+            carried = Reconstruction.concatenate([others, part.rows])
+            problems = [each for each in notes.problems if each.frame not in anew]
+            notes.problems = problems + part.notes.problems
             notes.add(Notes(seconds=part.notes.seconds))
         carried = carried.rows(np.lexsort((carried.person, carried.frame)))
-        return Part(carried.rows(np.isin(carried.frame, list(own))), notes)
+        return Part(carried.rows(np.isin(carried.frame, list(span.own))), notes)
 
     def _result(self, solution: WindowSolution, given: Sequence[Input], rig: Rig) -> Reconstruction:
         """The rows of a solution, with the indices of their detections in `given`."""
@@ -180,6 +157,35 @@ def _doubted(solution: WindowSolution, doubted: Mapping[int, tuple[int, ...]]) -
     there = np.isin(solution.observations.frame, list(doubted)) & ~of_two
     there &= np.isin(solution.status, (Status.OK, Status.BODY_UNDETERMINED))
     return np.where(there, Status.CONTRADICTED, solution.status)
+
+
+def _of_frames(whole: WindowSolution, frames: set[int], *, numbered: bool) -> WindowSolution:
+    """The rows of some frames, by frame and person, who may be `numbered` within each frame."""
+    found = whole.observations
+    by_person = np.lexsort((found.track, found.frame))
+    solution = whole.rows(by_person[np.isin(found.frame[by_person], list(frames))])
+    if not numbered:
+        return solution
+    rows = solution.observations
+    number = np.arange(len(rows)) - np.searchsorted(rows.frame, rows.frame)
+    problems = tuple(replace(each, track=int(number[each.row])) for each in solution.problems)
+    return replace(solution, observations=replace(rows, track=number), problems=problems)
+
+
+def _notes(solution: WindowSolution, frames: int, over_time: bool) -> Notes:
+    """Notes about a window of so many own `frames`."""
+    told = {"problems": list(solution.problems), "factors": solution.factors}
+    notes = Notes(frames, dict(solution.seconds), **told)
+    rows = solution.observations
+    said = np.isfinite(rows.evidence)
+    if over_time:
+        for track in np.unique(rows.track[said]).tolist():
+            evidence = rows.evidence[said & (rows.track == track)]
+            notes.evidence[track] = float(evidence.sum()), len(evidence)
+    else:
+        tenths = (f"{tenth / 10:.1f}" for tenth in np.floor(10 * rows.evidence[said]))
+        notes.probable = dict(Counter(tenths))
+    return notes
 
 
 def find_people(

@@ -58,6 +58,11 @@ class Span:
     """The cameras, if they move and their poses arrive with the frames; None if they are known
     beforehand."""
 
+    @property
+    def own(self) -> set[int]:
+        """The frames with rows to return."""
+        return {frame.frame for frame, _ in self.decided[self.start : self.stop]}
+
 
 @dataclass(frozen=True)
 class StreamState:

@@ -11,8 +11,6 @@ LEAST_JOINTS = 4
 LEAST_COMMON = 3
 """Minimum number of joints in which two 2D people, of one view or of two, can be compared: two hips
 may agree by chance."""
-_MOST_OF = 0.6
-"""Minimum share of the 3D person's detections in the view that belong to this 2D person."""
 
 
 def without_repeats(found: Detections) -> tuple[Detections, Index]:
@@ -74,7 +72,7 @@ def whole_people(chosen: Index, found: Detections) -> Index:
     for row, view in np.ndindex(len(chosen), chosen.shape[2]):
         own = chosen[row, :, view]
         number, count = np.unique(group[own[own >= 0]], return_counts=True)
-        if count.max(initial=0) >= max(LEAST_JOINTS, _MOST_OF * count.sum()):
+        if count.max(initial=0) >= LEAST_JOINTS:
             rows = groups[number[count.argmax()]]
             whole[row, found.joint[rows], view] = rows
     taken = np.bincount(chosen[chosen >= 0], minlength=len(found) + 1)

@@ -25,14 +25,10 @@ PRIOR_WITH_BODY = -0.3
 """Log-odds of a hypothesis without evidence, after a body fit and reassociation of detections."""
 _SINGLE = 0.1
 """Weight of a detection of a joint that no other view sees, since its depth is unknown."""
-_BESIDE = 0.5
-"""Weight of a detection of a joint whose other detections belong to others."""
 _MISSED = 0.2
 """Cost of an expected but missing joint, in a view that sees other joints of the person."""
 _HIDDEN = 0.07
 """Cost of a missing joint in a view that does not see the person at all, who may be occluded."""
-_TAKEN = 0.07
-"""Cost of a detection that another person explains better."""
 _BROKEN = 0.5
 """Cost of a bone outside the range of human bones."""
 _SHORT, _LONG = 0.4, 1.15
@@ -42,8 +38,6 @@ _USUAL = 0.59
 people."""
 _SPREAD, _PHANTOMS_SPREAD = 0.08, 0.35
 """Standard deviation of its logarithm, for people and for false positives."""
-_PHANTOMS_SHIFT = 0.08
-"""Mean excess of the logarithm for false positives."""
 _ASTRAY = 0.1
 """Share of people's bones distributed like those of false positives, because a joint is wrong. All
 these are from 5779 hypotheses of simulated crowds before two to six cameras."""
@@ -77,6 +71,7 @@ class Evidence:
         worth[has] = (
             detections.confidence[which] * np.where(neighbours > 0, affinity, LEAST_AFFINITY) * near
         )
+        worth[has.sum(axis=2) < 2] *= _SINGLE
         xy, depth = frame.rig.project(people.places)
         size = frame.rig.image_sizes[:, None, None]
         inside = np.moveaxis((depth > 0) & ((xy >= 0) & (xy < size)).all(axis=-1), 0, 2)
@@ -85,15 +80,12 @@ class Evidence:
 
     def score(self, taken: Mask) -> Array:
         """(H,) score of each hypothesis if others explain the detections `taken` (D,)."""
-        has = self.chosen >= 0
-        own = has & ~taken[self.chosen] if len(taken) > 0 else has
-        views, owned_views = has.sum(axis=2, keepdims=True), own.sum(axis=2, keepdims=True)
-        counts = np.where(views < 2, _SINGLE, np.where(owned_views < 2, _BESIDE, 1.0))
-        evidence = (self.worth * own * counts).sum(axis=(1, 2))
+        own = self.chosen >= 0
+        own = own & ~taken[self.chosen] if len(taken) > 0 else own
+        evidence = (self.worth * own).sum(axis=(1, 2))
         seen = (own & self.expected).sum(axis=1) / np.maximum(self.expected.sum(axis=1), 1)
         missed = (self.expected & ~own).sum(axis=1)
         price = (missed * (_MISSED * seen + _HIDDEN * (1 - seen))).sum(axis=1)
-        price += _TAKEN * (has & ~own).sum(axis=(1, 2))
         return np.asarray(evidence + self.bones - price, dtype=np.float64)
 
 
@@ -111,7 +103,7 @@ def _bones(people: PossiblePeople, frame: Frame) -> Array:
     off = np.log(np.maximum(share[:, core], 1e-3) / _USUAL)
     sigma = np.hypot(_SPREAD, DETECTOR_M / (_USUAL * frame.longest_m[core]))
     mine = np.exp(-0.5 * (off / sigma) ** 2) / sigma
-    phantoms = np.exp(-0.5 * ((off - _PHANTOMS_SHIFT) / _PHANTOMS_SPREAD) ** 2) / _PHANTOMS_SPREAD
+    phantoms = np.exp(-0.5 * (off / _PHANTOMS_SPREAD) ** 2) / _PHANTOMS_SPREAD
     # Far from both distributions `mine` vanishes, and `_ASTRAY` bounds the ratio.
     ratio = (1 - _ASTRAY) * mine / np.maximum(phantoms, 1e-300) + _ASTRAY
     return np.asarray(

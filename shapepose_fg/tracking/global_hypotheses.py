@@ -41,8 +41,6 @@ alternatives are sought; in simulated crowds, they are found only for people wit
 _SAME_M = 0.02
 """Maximum distance between joints of two worlds with the same detections for these to
 be merged, m."""
-_GAIN = 0.01
-"""Minimum relative gain of evidence for another round."""
 
 
 @dataclass(frozen=True)
@@ -136,7 +134,7 @@ def explained(
     before = 0.0
     for _ in range(_ROUNDS):
         best, *others = found.account.ways(found.world, on_trial=True)
-        if best.evidence_s.sum() <= (1 + _GAIN) * before:
+        if best.evidence_s.sum() <= before:
             break
         before = float(best.evidence_s.sum())
         unlike = (way for way in others if found.account.agreement(best, way) < _ALIKE)

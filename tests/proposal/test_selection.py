@@ -172,12 +172,12 @@ def test_what_others_explain_is_no_evidence(five_cameras, two_people, seen_exact
     expected = (detections.confidence * detections.affinity[0]).sum() + evidence.bones[0]
     np.testing.assert_allclose(evidence.score(nobody_else), expected, rtol=1e-6)
     # 125 places without a detection of one's own, in views that see nothing else of the person:
-    # 0.07 each, twice.
+    # 0.07 each.
     np.testing.assert_allclose(
-        evidence.score(~nobody_else), -125 * (0.07 + 0.07) + evidence.bones[0], rtol=1e-9
+        evidence.score(~nobody_else), -125 * 0.07 + evidence.bones[0], rtol=1e-9
     )
     assert existence(one, frame)[0] > 0.99
-    assert existence(type(one).concatenate([one, one]), frame).max() < 0.01
+    assert existence(type(one).concatenate([one, one]), frame).max() < 0.05
 
 
 def test_bones_of_usual_length_speak_for_a_person(five_cameras, two_people, seen_exactly):
