@@ -435,7 +435,7 @@ class _Log:
             self.kept.append((tracks.ids, joints))
 
     def hypotheses(self) -> Hypotheses:
-        """Everything recorded, as hypotheses."""
+        """All recorded tracks, as hypotheses."""
         H, T, (J, V) = len(self.carried), len(self.frames), self.shape
         there = np.zeros((H, T), dtype=bool)
         candidate, price = (
