@@ -21,7 +21,6 @@ from shapepose_fg.estimation.body_frames import BodyFrames
 from shapepose_fg.estimation.body_window import BodyWindow, Marginals
 from shapepose_fg.estimation.condensed_graph import gtsam_step
 from shapepose_fg.estimation.contact import feet_of
-from shapepose_fg.estimation.covariance_factors import covariance_factors
 from shapepose_fg.estimation.draft import Draft
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.factor_solution import solve_with_factors
@@ -39,6 +38,7 @@ from shapepose_fg.estimation.missed_detections import (
 )
 from shapepose_fg.estimation.motion_densities import MotionModel
 from shapepose_fg.estimation.person_graph import BodyGraph
+from shapepose_fg.estimation.reported_covariances import covariance_factors
 from shapepose_fg.estimation.user_factors import FactorFunction, add_factors
 from shapepose_fg.estimation.window_solution import (
     Estimates,
@@ -62,7 +62,7 @@ def solve_bodies(
     """Joints, covariances and bodies of N rows: each track over its rows, or a row by itself. They
     begin at the `first` estimates.
 
-    A joint's covariance is, in this order: what its views say, if its row has no body
+    A joint's covariance is, in this order: the one from its views, if its row has no body
     (`_of_views`); the marginal of its person's graph, with deviations wider for unseen joints
     (`BodyWindow.of_joints`, `widen_unseen`), times the person's factor (`covariance_factors`), or
     that of the graph with user factors (`solve_with_factors`); plus errors of moving cameras
@@ -184,7 +184,7 @@ def _widen_unseen(
 
 
 def _of_views(evidence: ViewEvidence, most_m: float, status: NDArray[np.str_]) -> Estimates:
-    """What the views alone say of joints, where they determine them; NaN elsewhere. No bodies, with
+    """Joints and covariances from the views only, where they determine them; no bodies, with
     the `status` (N,) of their fits.
     """
     placed = np.asarray(evidence.sigma_m <= most_m)
