@@ -14,7 +14,7 @@ from pathlib import Path
 
 from shapepose_fg.cameras.check.biases import COMMON
 from shapepose_fg.cameras.check.evidence import Look, gather
-from shapepose_fg.cameras.check.small_errors import Problem
+from shapepose_fg.cameras.check.small_errors import SmallErrors
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
 
@@ -33,7 +33,7 @@ def main() -> None:
     arguments = parser.parse_args()
     rig = read_rig(arguments.calibration, up=arguments.up)
     detections = read_detections(arguments.detections, rig)
-    problem = Problem.of(Look.given(gather(detections, range(len(detections)), len(rig)), rig))
+    problem = SmallErrors.of(Look.given(gather(detections, range(len(detections)), len(rig)), rig))
     found = []
     for shift, larger in product(RATIOS, RATIOS):
         marginals = problem.residuals.marginals(problem.given, LEVELS, shift, larger, COMMON)

@@ -12,7 +12,7 @@ from shapepose_fg.cameras.check.diagnosis import diagnose
 from shapepose_fg.cameras.check.evidence import Look, gather
 from shapepose_fg.cameras.check.findings import Kind, sentence
 from shapepose_fg.cameras.check.report import check_setup
-from shapepose_fg.cameras.check.small_errors import Problem
+from shapepose_fg.cameras.check.small_errors import SmallErrors
 from shapepose_fg.cameras.parameters import FOCAL, Q, changed
 from shapepose_fg.cameras.sightings import Sightings, least_of_each
 from shapepose_fg.core.camera import Rig, Views
@@ -142,7 +142,7 @@ def test_a_view_may_have_larger_biases_than_the_others(recording, room, people, 
     if of == "one view":
         bias[:, :, 1:] = 0
     seen = gather(biased(recording, room, people, bias), range(len(recording)), len(room))
-    problem = Problem.of(Look.given(seen, room))
+    problem = SmallErrors.of(Look.given(seen, room))
     marginals = problem.residuals.marginals
     alike = marginals(problem.given, common=COMMON)
     also = marginals(problem.given)
