@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from shapepose_fg.body.model.body_model import BodyModel
 from shapepose_fg.body.model.smpl_file import NUM_BETAS, SMPL_PARENTS
 from shapepose_fg.core.arrays import Array
-from shapepose_fg.simulation.motion import Motion
+from shapepose_fg.simulation.motion import BodyMotion
 from shapepose_fg.simulation.performance import Figure
 from shapepose_fg.simulation.scene import Scene
 
@@ -109,5 +109,5 @@ def recast(scene: Scene, proportions: Sequence[Proportions]) -> Scene:
         transl[:, person] = pelvis - after.rest[0]
         transl[:, person, 2] += sole(before) - sole(after)
     return replace(
-        scene, body=body, motion=Motion(betas, motion.global_orient, motion.body_pose, transl)
+        scene, body=body, motion=BodyMotion(betas, motion.global_orient, motion.body_pose, transl)
     )

@@ -22,7 +22,7 @@ from shapepose_fg.cameras.bundle import (
 from shapepose_fg.cameras.check.diagnosis import put_right
 from shapepose_fg.cameras.check.evidence import gather
 from shapepose_fg.cameras.check.findings import SURE, Finding, Kind
-from shapepose_fg.cameras.check.small_errors import Problem
+from shapepose_fg.cameras.check.small_errors import SmallErrors
 from shapepose_fg.cameras.parameters import CENTRE, FOCAL, MOVE, TURN, Q, difference
 from shapepose_fg.cameras.people import LEAST_PEOPLE, Footage, missed_px
 from shapepose_fg.cameras.stature import build_of
@@ -177,7 +177,7 @@ def refine(
     notes = tuple(_undetermined(found, freedom, counts))
     sure = 1.0
     if np.array_equal(start.wTc, rig.wTc):
-        sure = Problem.of(given).off(freedom.sigmas[:Q], reference)
+        sure = SmallErrors.of(given).off(freedom.sigmas[:Q], reference)
     return Refinement(rig, found, freedom, was, now, counts, notes, missed, stature, sure)
 
 

@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 
 from shapepose_fg.body.model.rotation import exp_so3, hat
 from shapepose_fg.cameras.sightings import GATE, MIN_JOINTS, depths_of_meeting
-from shapepose_fg.cameras.tracks import Tracks
+from shapepose_fg.cameras.tracks import CameraTracks
 from shapepose_fg.cameras.triangulation import KERNEL
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.decompositions import basis_across
@@ -59,7 +59,7 @@ class Relative:
 class Together:
     """Sightings of two cameras in the same frames: N pairs of rows, K pairs of tracks."""
 
-    def __init__(self, one: Tracks, other: Tracks, looks: Index) -> None:
+    def __init__(self, one: CameraTracks, other: CameraTracks, looks: Index) -> None:
         rows = [_rows(each, looks) for each in (one, other)]
         both = (rows[0][:, None] >= 0) & (rows[1][None] >= 0)
         a, b, look = np.nonzero(both)
@@ -119,7 +119,7 @@ class Together:
         return a, b, np.sqrt(self.size[0][rows[:, 0]] * self.size[1][rows[:, 1]])
 
 
-def relative(one: Tracks, other: Tracks, fps: float) -> Relative | None:
+def relative(one: CameraTracks, other: CameraTracks, fps: float) -> Relative | None:
     """Relative pose of the camera of `other` to that of `one`, with rays in their own frames; None
     if too few people are seen by both at once, or no pose fits.
     """
@@ -141,7 +141,7 @@ def relative(one: Tracks, other: Tracks, fps: float) -> Relative | None:
     return found
 
 
-def _guesses(one: Tracks, other: Tracks, seen: Together) -> Array:
+def _guesses(one: CameraTracks, other: CameraTracks, seen: Together) -> Array:
     """(H, 3, 3) essential matrices, each from a pair of tracks."""
     found = list[Array]()
     for pair in np.argsort(-seen.count, kind="stable")[:_MOST_TRIED].tolist():
@@ -251,7 +251,7 @@ def refined_pose(R: Array, t: Array, a: Array, b: Array, size: Array) -> tuple[A
     return moved(found.x)
 
 
-def _rows(tracks: Tracks, looks: Index) -> Index:
+def _rows(tracks: CameraTracks, looks: Index) -> Index:
     """(K, F) the row of each track at each compared frame, -1 where it has none."""
     begins = tracks.frame[tracks.first]
     there = (looks >= begins[:, None]) & (looks <= tracks.lasts[:, None])

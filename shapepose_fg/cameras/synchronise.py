@@ -14,7 +14,7 @@ import numpy as np
 from shapepose_fg.cameras.offsets.scan import LEAST_MISS, scan
 from shapepose_fg.cameras.offsets.subframe import InSpace, Pairwise
 from shapepose_fg.cameras.sightings import Sightings
-from shapepose_fg.cameras.tracks import Tracks, at_regular_times
+from shapepose_fg.cameras.tracks import CameraTracks, at_regular_times
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.detections import DetectionSequence
@@ -130,12 +130,12 @@ def offsets(
     """Offsets (V,) within `most_s` of `around_s`, their standard deviations and prominence, from
     sightings in `frames`.
     """
-    views, tracks = Views.of(rig), list[Tracks]()
+    views, tracks = Views.of(rig), list[CameraTracks]()
     start = -np.rint(around_s * fps).astype(np.intp)
     # Frames are counted on the clock of the first camera: with `shift` zero all clocks agree.
     sightings = replace(sightings, frame=sightings.frame - start[sightings.view])
     for view, name in enumerate(rig.names):
-        tracks.append(Tracks.of(sightings, views, view, fps))
+        tracks.append(CameraTracks.of(sightings, views, view, fps))
         if len(tracks[view].frame) < _LEAST_SEEN:
             raise InputError(
                 f"camera {name}: too few people are seen, or in single frames only, to estimate "

@@ -31,7 +31,7 @@ _LEAST_AROUND, _LEAST_SPREAD = 0.6, 0.25
 
 
 @dataclass(frozen=True)
-class Tracks:
+class CameraTracks:
     """K tracks of people in one camera: M rows, those of a track together, one per frame."""
 
     first: Index
@@ -68,7 +68,7 @@ class Tracks:
         return rays, speed, np.where(inside, self.size[row], np.nan)
 
     @classmethod
-    def of(cls, sightings: Sightings, views: Views, view: int, fps: float) -> "Tracks":
+    def of(cls, sightings: Sightings, views: Views, view: int, fps: float) -> "CameraTracks":
         """The tracks of camera `view`, smoothed."""
         seen = sightings.rows(sightings.view == view)
         rays, size = rays_of(seen, views), seen.size_px / views.focal_px[view]

@@ -15,7 +15,7 @@ from shapepose_fg.io.detections.association_text import TextSkeleton
 
 
 @dataclass(frozen=True)
-class Candidates:
+class PictureCandidates:
     """Joint candidates of one picture, sorted by joint, and affinities between them."""
 
     joint: Index
@@ -35,17 +35,19 @@ class Candidates:
     def __len__(self) -> int:
         return len(self.joint)
 
-    def moved(self, xy: Array, inside: Mask) -> "Candidates":
+    def moved(self, xy: Array, inside: Mask) -> "PictureCandidates":
         """Return the candidates at other positions; those that are not `inside` (D,) are left
         out.
         """
         place = np.cumsum(inside) - 1
         both = inside[self.pairs].all(axis=1)
         joint, score, pairs = self.joint[inside], self.score[inside], place[self.pairs[both]]
-        return Candidates(joint, xy[inside], score, pairs, self.limb[both], self.affinity[both])
+        return PictureCandidates(
+            joint, xy[inside], score, pairs, self.limb[both], self.affinity[both]
+        )
 
 
-def decode(output: NDArray[np.float32], skeleton: TextSkeleton) -> Candidates:
+def decode(output: NDArray[np.float32], skeleton: TextSkeleton) -> PictureCandidates:
     """Candidates of one picture from the network's `output` (C, H, W).
 
     The output has one map for each of the `skeleton`'s J joints, one for the background, and two
@@ -67,7 +69,7 @@ def decode(output: NDArray[np.float32], skeleton: TextSkeleton) -> Candidates:
         output[len(skeleton.joints) + 1 :], xy[pairs[:, 0]], xy[pairs[:, 1]], limb
     )
     there = affinity > 0
-    return Candidates(joint, xy, score, pairs[there], limb[there], affinity[there])
+    return PictureCandidates(joint, xy, score, pairs[there], limb[there], affinity[there])
 
 
 def peaks(heat: NDArray[np.float32], min_score: float = 0.1) -> tuple[Index, Array, Array]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.detection2d.decoding import Candidates, decode
+from shapepose_fg.detection2d.decoding import PictureCandidates, decode
 from shapepose_fg.detection2d.onnx_network import Backend, Blob, OnnxNetwork, words
 from shapepose_fg.detection2d.upright import UprightView
 from shapepose_fg.io.detections.association_text import TEXT_SKELETONS, TextSkeleton
@@ -128,8 +128,8 @@ class HeatMapNetwork:
         return f"{self.layout.text.number} {frames}\n"
 
     def text(self, number: int, found: Any, size: tuple[int, int]) -> str:
-        """A frame of the text: `Candidates` in a picture of the calibrated `size`, None if there
-        was no picture.
+        """A frame of the text: `PictureCandidates` in a picture of the calibrated `size`, None if
+        there was no picture.
         """
         if found is None:
             return "0\n" * len(self.layout.text.joints)
@@ -152,7 +152,7 @@ class HeatMapNetwork:
             blob = blob * np.float32(self.layout.scale) + np.float32(self.layout.offset)
         return self.network.run(blob)[0][0]
 
-    def detect(self, picture: NDArray[np.uint8]) -> Candidates:
+    def detect(self, picture: NDArray[np.uint8]) -> PictureCandidates:
         """Candidates in a `picture` (H, W, 3) of the view's size, in its pixels."""
         found = decode(self.run(picture), self.layout.text)
         return replace(found, xy=(found.xy + 0.5) * _STRIDE - 0.5)

@@ -17,9 +17,9 @@ from shapepose_fg.core.camera import Camera
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_sets import FrameSets
 from shapepose_fg.core.storage.files import inside, read_json, write_atomically, write_content
-from shapepose_fg.detection2d.decoding import Candidates
+from shapepose_fg.detection2d.decoding import PictureCandidates
 from shapepose_fg.detection2d.opening import Network
-from shapepose_fg.detection2d.top_down import People
+from shapepose_fg.detection2d.top_down import PicturePeople
 from shapepose_fg.detection2d.upright import UprightView, roll_of
 from shapepose_fg.io.footage.footage import Footage, Progress
 from shapepose_fg.io.footage.placement import FOOTAGE, CameraFootage, Placement, write_used_footage
@@ -54,7 +54,7 @@ class CameraDetector:
         view = network.view(placement.region, roll_of(camera, up))
         return cls(camera, footage, placement, network, view)
 
-    def detect(self, picture: NDArray[np.uint8]) -> Candidates | People:
+    def detect(self, picture: NDArray[np.uint8]) -> PictureCandidates | PicturePeople:
         """Detections in a `picture` (H, W, 3), blue green red; in calibrated pixels, not
         undistorted.
         """

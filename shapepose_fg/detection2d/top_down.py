@@ -63,7 +63,7 @@ class KeypointForm(BaseModel, extra="forbid"):
 
 
 @dataclass(frozen=True)
-class People:
+class PicturePeople:
     """People of one picture, with their joints grouped by the network."""
 
     xy: Array
@@ -74,7 +74,7 @@ class People:
     def __len__(self) -> int:
         return int((self.score > 0).sum())
 
-    def moved(self, xy: Array, inside: Mask) -> "People":
+    def moved(self, xy: Array, inside: Mask) -> "PicturePeople":
         """Return the people at other positions; joints that are not `inside` (P, K) get the score
         0.
         """
@@ -166,8 +166,8 @@ class TopDownNetwork:
         return f'{{"meta_info": {json.dumps(meta)}, "instance_info": ['
 
     def text(self, number: int, found: Any, size: tuple[int, int]) -> str:
-        """Frame `number` of the JSON: `People`, or None if there was no picture. Joints that were
-        not detected are 0 0 0.
+        """Frame `number` of the JSON: `PicturePeople`, or None if there was no picture. Joints that
+        were not detected are 0 0 0.
         """
         people = []
         for xy, score in zip(found.xy, found.score, strict=True) if found else ():
@@ -184,7 +184,7 @@ class TopDownNetwork:
         """The input for pictures with the given region and roll, at full resolution."""
         return UprightView.of(region, roll_deg)
 
-    def detect(self, picture: NDArray[np.uint8]) -> People:
+    def detect(self, picture: NDArray[np.uint8]) -> PicturePeople:
         """The people in a `picture` (H, W, 3), blue green red, in its pixels."""
         size, padding = np.array(self.form.size, dtype=np.float64), 1.0
         boxes = np.array([[0.0, 0.0, picture.shape[1], picture.shape[0]]])
@@ -205,7 +205,7 @@ class TopDownNetwork:
             )
             positions.append((xy / size - 0.5) * sides + middle)
             scores.append(score)
-        return People(np.concatenate(positions), np.concatenate(scores))
+        return PicturePeople(np.concatenate(positions), np.concatenate(scores))
 
     def _joints(self, crops: NDArray[np.uint8]) -> tuple[Array, Array]:
         """Positions (P, K, 2) in pixels of `crops` (B, H, W, 3), and scores (P, K).

@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from factors import DEFAULT_WIDTH_SIGMA, Motion
-from shapepose_fg.body.fitting.chains import Links, linked
+from shapepose_fg.body.fitting.chains import MotionChain, linked
 from shapepose_fg.body.fitting.energy import BodyEnergy, EnergyTargets, Held, nothing
 from shapepose_fg.body.fitting.evidence import WELL_SEEN_M
 from shapepose_fg.body.fitting.fitter import JointTargets
@@ -158,7 +158,7 @@ class BodyWindow:
         self.walk = np.full((len(steps), self.sigmas_px.shape[1]), np.inf)
         """(T - 1, J) density of the random walk of standing feet in each step, m²/s; infinite for
         others."""
-        self.links: Links | None = None
+        self.links: MotionChain | None = None
         self._asynchronous = bool(leads(observations, views).any())
 
     def __len__(self) -> int:

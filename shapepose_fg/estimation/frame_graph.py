@@ -145,7 +145,7 @@ class FrameGraph(PersonWindow):
         scale, kernel = 1.0 / np.sqrt(self.config.weight_2d), self._kernel
         width = None if kernel is None else DEFAULT_WIDTH_SIGMA[kernel] / scale
         return projection_factors(
-            cameras_of(self._views), view, self.keys[0, joint], self._observations.xy[chosen],
+            gtsam_cameras(self._views), view, self.keys[0, joint], self._observations.xy[chosen],
             scale * self._sigmas_px[chosen], robust_kernel(kernel, width),
         )  # fmt: skip
 
@@ -169,7 +169,7 @@ def _where(error: RuntimeError, people: Sequence[PersonWindow], names: Sequence[
     )
 
 
-def cameras_of(views: Views) -> list[gtsam.PinholeCameraCal3_S2]:
+def gtsam_cameras(views: Views) -> list[gtsam.PinholeCameraCal3_S2]:
     """GTSAM cameras: V of them, or T V by row if they move."""
     last = np.broadcast_to([0.0, 0.0, 0.0, 1.0], (*views.cTw.shape[:-2], 1, 4))
     wTc = np.linalg.inv(np.concatenate([views.cTw, last], axis=-2))
@@ -205,7 +205,7 @@ def _of_graph(graph: FrameGraph, known: dict[int, gtsam.Marginals]) -> Array:
             continue
         known[id(graph.ties)] = marginals
         found[graph.present] = of_keys
-        return determined(found)
+        return determined_only(found)
     return found
 
 
@@ -221,7 +221,7 @@ def _damped(graph: FrameGraph) -> gtsam.NonlinearFactorGraph:
     return damped
 
 
-def determined(covariance: Array) -> Array:
+def determined_only(covariance: Array) -> Array:
     """Return covariances (..., 3, 3), with NaN for those above `UNDETERMINED_M` in some
     direction.
     """

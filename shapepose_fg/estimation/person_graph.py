@@ -25,7 +25,7 @@ from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.decompositions import symmetric_root
 from shapepose_fg.estimation.body_window import BodyState, BodyWindow, Marginals
 from shapepose_fg.estimation.condensed_graph import frame_systems
-from shapepose_fg.estimation.frame_graph import cameras_of
+from shapepose_fg.estimation.frame_graph import gtsam_cameras
 from shapepose_fg.estimation.in_time import moments
 from shapepose_fg.estimation.user_factors import PersonWindow
 
@@ -254,7 +254,7 @@ class BodyGraph(PersonWindow):
         kernel, views = window.config.robust_kernel, window.views
         width = None if kernel is None else DEFAULT_WIDTH_SIGMA[kernel] / scale
         return projection_factors(
-            cameras_of(views), view if views.rows_known is None else frame * len(views) + view,
+            gtsam_cameras(views), view if views.rows_known is None else frame * len(views) + view,
             self.keys[frame, joint], xy[chosen], scale * window.sigmas_px[chosen],
             robust_kernel(kernel, width),
         )  # fmt: skip

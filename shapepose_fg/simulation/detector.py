@@ -29,7 +29,7 @@ from shapepose_fg.simulation.candidates import (
 from shapepose_fg.simulation.detector_statistics import JOINT_GROUP, DetectorStatistics, measured
 from shapepose_fg.simulation.scene import Scene
 from shapepose_fg.simulation.visibility import (
-    Skin,
+    OccludingSurface,
     Visibility,
     VisibilityConfig,
     VisibilityWorker,
@@ -123,7 +123,7 @@ def simulate(
     config = DetectorConfig() if config is None else config
     scene = scene if config.offsets is None else scene.with_keypoint_offsets(config.offsets)
     frames = range(len(scene)) if frames is None else frames
-    skin = Skin.of(scene.body, config.visibility.cell_m)
+    skin = OccludingSurface.of(scene.body, config.visibility.cell_m)
     detector = Detector(scene.rig, scene.people, scene.fps, config, seed)
     rigs = [scene.rig.at(np.full(len(scene.rig), frame / scene.fps)) for frame in frames]
     people = (

@@ -29,7 +29,7 @@ headings (...,), radians, unwrapped."""
 
 
 @dataclass(frozen=True)
-class Motion(Table):
+class BodyMotion(Table):
     """P people's bodies in N frames, in SMPL's parameters."""
 
     betas: Annotated[Array, Column("P 10")]
@@ -42,13 +42,13 @@ class Motion(Table):
     """(N, P, 3) metres."""
 
     @classmethod
-    def still(cls, betas: Array, frames: int = 1) -> "Motion":
+    def still(cls, betas: Array, frames: int = 1) -> "BodyMotion":
         """People of shapes `betas` (P, 10) in the T-pose, without translation."""
         people = len(betas)
         return cls(betas, *(np.zeros((frames, people, *shape)) for shape in ((3,), (23, 3), (3,))))
 
 
-class Build:
+class BodyDimensions:
     """Dimensions of a body that a role needs, metres."""
 
     def __init__(self, rest: Array, floor: float):
@@ -66,8 +66,8 @@ class Build:
 
 
 def close_motion(
-    betas: Array, builds: list[Build], frames: int, fps: float, rng: np.random.Generator
-) -> Motion:
+    betas: Array, builds: list[BodyDimensions], frames: int, fps: float, rng: np.random.Generator
+) -> BodyMotion:
     """People of shapes `betas` (P, 10) in close motion, in groups of four: a couple dances, one
     walks through, one waves.
 
@@ -88,11 +88,13 @@ def close_motion(
             puppets.append(wave(group[-1], time, centre + WAVER, np.pi, rng))
     posed = [pose(puppet, build.rest) for puppet, build in zip(puppets, builds, strict=True)]
     if len(posed) == 0:
-        return Motion.still(betas, frames)
-    return Motion(betas, *(np.stack(part, axis=1) for part in zip(*posed, strict=True)))
+        return BodyMotion.still(betas, frames)
+    return BodyMotion(betas, *(np.stack(part, axis=1) for part in zip(*posed, strict=True)))
 
 
-def dance(pair: list[Build], time: Array, centre: Array, rng: np.random.Generator) -> list[Puppet]:
+def dance(
+    pair: list[BodyDimensions], time: Array, centre: Array, rng: np.random.Generator
+) -> list[Puppet]:
     """Two people who face each other, hold both hands and rotate about each other, with one pair of
     hands raised.
     """
@@ -158,7 +160,7 @@ def dance(pair: list[Build], time: Array, centre: Array, rng: np.random.Generato
     return puppets
 
 
-def walk(build: Build, time: Array, centre: Array, rng: np.random.Generator) -> Puppet:
+def walk(build: BodyDimensions, time: Array, centre: Array, rng: np.random.Generator) -> Puppet:
     """A person who walks on a long loop around `centre` (2,), past the others, with
     swinging arms.
     """
@@ -189,7 +191,7 @@ def walk(build: Build, time: Array, centre: Array, rng: np.random.Generator) -> 
 
 
 def wave(
-    build: Build, time: Array, spot: Array, heading: float, rng: np.random.Generator
+    build: BodyDimensions, time: Array, spot: Array, heading: float, rng: np.random.Generator
 ) -> Puppet:
     """A person who stays at `spot` (2,): waves with the right hand, then crouches and
     reaches down.
@@ -226,7 +228,7 @@ def wave(
 
 
 def _puppet(
-    build: Build,
+    build: BodyDimensions,
     time: Array,
     path: Path,
     *,

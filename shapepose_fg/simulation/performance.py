@@ -15,7 +15,7 @@ from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.skeleton import smpl_joints
 from shapepose_fg.simulation.limbs import ARMS, SPINE, turned_about
 from shapepose_fg.simulation.mocap import Clip, shoulder_rhythm
-from shapepose_fg.simulation.motion import Motion
+from shapepose_fg.simulation.motion import BodyMotion
 
 _FEET = smpl_joints("left_ankle right_ankle left_foot right_foot")
 """Ankles and balls of the feet, left and right."""
@@ -127,9 +127,9 @@ def grounded(
     return Performance(rotations, joints, figure.rest)
 
 
-def together(betas: Array, performances: list[Performance], frames: int) -> Motion:
+def together(betas: Array, performances: list[Performance], frames: int) -> BodyMotion:
     """SMPL's parameters of P people, `betas` (P, 10), in `frames` frames (used if P is 0)."""
-    motion = Motion.still(
+    motion = BodyMotion.still(
         np.asarray(betas, dtype=np.float64).reshape(len(performances), 10), frames
     )
     for person, performed in enumerate(performances):

@@ -14,7 +14,7 @@ from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.rendering import look_at
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.simulation.motion import Build, Motion, close_motion
+from shapepose_fg.simulation.motion import BodyDimensions, BodyMotion, close_motion
 
 if TYPE_CHECKING:  # not needed by visibility workers
     from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
@@ -32,7 +32,7 @@ class Scene:
     """The cameras."""
     body: "BodyModel"
     """The body model of the parameters in `motion`."""
-    motion: Motion
+    motion: BodyMotion
     """Bodies of P people in T frames."""
     fps: float
     """Frame rate, Hz."""
@@ -143,31 +143,33 @@ def ring_of_cameras(
     return Rig(tuple(cameras), up="z")
 
 
-def builds_of(body: "BodyModel", betas: Array) -> list[Build]:
+def builds_of(body: "BodyModel", betas: Array) -> list[BodyDimensions]:
     """Dimensions of P shapes `betas` (P, 10) for motions."""
-    parameters = parameters_of(Motion.still(betas))
+    parameters = parameters_of(BodyMotion.still(betas))
     joints, floors = body.joints(parameters), body.vertices(parameters)[..., 1].min(axis=1)
-    return [Build(rest, float(floor)) for rest, floor in zip(joints, floors, strict=True)]
+    return [BodyDimensions(rest, float(floor)) for rest, floor in zip(joints, floors, strict=True)]
 
 
-def keypoints_of(body: "BodyModel", motion: Motion) -> Array:
+def keypoints_of(body: "BodyModel", motion: BodyMotion) -> Array:
     """BODY_25 keypoints (T, P, 25, 3) of a motion."""
     points = body.keypoints(parameters_of(motion))
     return points.reshape(*motion.transl.shape[:2], *points.shape[1:])
 
 
-def _on_the_floor(body: "BodyModel", motion: Motion, builds: list[Build]) -> Motion:
+def _on_the_floor(
+    body: "BodyModel", motion: BodyMotion, builds: list[BodyDimensions]
+) -> BodyMotion:
     """Shift each person vertically so that in each frame the lowest toe or heel is as high as when
     standing.
     """
     floors = np.array([build.floor for build in builds])
-    soles = keypoints_of(body, Motion.still(motion.betas))[0][:, _FEET, 1].min(axis=1) - floors
+    soles = keypoints_of(body, BodyMotion.still(motion.betas))[0][:, _FEET, 1].min(axis=1) - floors
     transl = motion.transl.copy()
     transl[..., 2] += soles - keypoints_of(body, motion)[:, :, _FEET, 2].min(axis=2)
     return replace(motion, transl=transl)
 
 
-def parameters_of(motion: Motion) -> "BodyParameters":
+def parameters_of(motion: BodyMotion) -> "BodyParameters":
     """The bodies of all frames, frame by frame, as one batch."""
     from shapepose_fg.body.model.body_model import BodyParameters
 

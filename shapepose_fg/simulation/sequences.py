@@ -25,7 +25,7 @@ from shapepose_fg.simulation.bystanders import (
 )
 from shapepose_fg.simulation.limbs import turned_about
 from shapepose_fg.simulation.mocap import Clip, Mocap
-from shapepose_fg.simulation.motion import Motion
+from shapepose_fg.simulation.motion import BodyMotion
 from shapepose_fg.simulation.performance import Figure, Performance, hold_hands, perform, together
 from shapepose_fg.simulation.scene import Scene, ring_of_cameras
 
@@ -332,7 +332,7 @@ def sequence(
     )
     betas, without = _shapes(config, rng), DANCERS | config.without
     dances = _dances(mocap, takes, config, fps, rng)
-    parts, clips, starts = [Motion.still(betas, 0)], [], [0]
+    parts, clips, starts = [BodyMotion.still(betas, 0)], [], [0]
     while starts[-1] < (frames if until is None else min(until, frames)):
         # One segment between cuts: first pairs, then standing people, then people walking around
         # them.
@@ -350,7 +350,7 @@ def sequence(
         parts.append(together(betas, room.performed, room.frames))
         clips.append(tuple(room.names))
         starts.append(starts[-1] + room.frames)
-    return Scene(rig, body, Motion.concatenate(parts), fps, tuple(starts[1:-1]), tuple(clips))
+    return Scene(rig, body, BodyMotion.concatenate(parts), fps, tuple(starts[1:-1]), tuple(clips))
 
 
 def salsa_takes(mocap: Mocap, split: Split) -> list[tuple[int, int]]:

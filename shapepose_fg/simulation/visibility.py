@@ -80,7 +80,7 @@ class Visibility:
 
 
 @dataclass(frozen=True)
-class Skin:
+class OccludingSurface:
     """The surface used for every person, and the joints that belong to each part of it."""
 
     vertices: Index
@@ -91,7 +91,7 @@ class Skin:
     """(M, J) whether at least half of a vertex's weight is on the joint's own or adjacent bones."""
 
     @classmethod
-    def of(cls, body: "BodyModel", cell_m: float) -> "Skin":
+    def of(cls, body: "BodyModel", cell_m: float) -> "OccludingSurface":
         """The surface of `body`; vertices within a cube of `cell_m` in the mean T-pose
         are merged.
         """
@@ -106,7 +106,7 @@ class Skin:
 
 
 def see(
-    rig: Rig, joints: Array, surfaces: Real, skin: Skin, config: VisibilityConfig
+    rig: Rig, joints: Array, surfaces: Real, skin: OccludingSurface, config: VisibilityConfig
 ) -> Visibility:
     """Visibility of BODY_25 `joints` (P, 25, 3) of people with `surfaces` (P, M, 3), the vertices
     of `skin`.
@@ -157,7 +157,7 @@ class VisibilityWorker:
 
     rig: Rig
     """The cameras."""
-    skin: Skin
+    skin: OccludingSurface
     """The surface of people."""
     config: VisibilityConfig
     """Settings of the depth buffer."""

@@ -25,7 +25,7 @@ MIN_IN_A_VIEW = 9
 views do not see `LEAST_JOINTS`: over half a body is no coincidence."""
 
 
-class Trust(NamedTuple):
+class MeasurementNoise(NamedTuple):
     """Noise of detections in the form that kernels take (from `ObservationConfig`)."""
 
     kinds = "f1 f0 f0 f0 f0 i0 f0"
@@ -40,7 +40,7 @@ class Trust(NamedTuple):
     """Robust kernel and its width, in standard deviations."""
 
     @classmethod
-    def of(cls, config: ObservationConfig, joints: tuple[str, ...]) -> "Trust":
+    def of(cls, config: ObservationConfig, joints: tuple[str, ...]) -> "MeasurementNoise":
         """Build it from the settings, for the named `joints`."""
         return cls(
             scatter=config.scatter(joints),
@@ -59,7 +59,7 @@ def measured(
     candidate: Index,
     weight: Array,
     arrays: FrameArrays,
-    trust: Trust,
+    trust: MeasurementNoise,
     bones: Bones,
 ) -> tuple[JointStates, Index, Mask]:
     """Update people's joints with the detections `candidate` (A, J, V) of a frame, -1 for none.
@@ -76,7 +76,7 @@ def measured(
     return JointStates(mean, covariance), kept, evident
 
 
-@kernel("f3 f4 b2 i3 f1", FrameArrays, Trust, Bones, "b1")
+@kernel("f3 f4 b2 i3 f1", FrameArrays, MeasurementNoise, Bones, "b1")
 def _measure(mean, covariance, lost, candidate, confident, arrays, trust, bones, evident):
     """Update `mean` (A, J, S) and `covariance` (A, J, S, S) in place, set rejected detections in
     `candidate` to -1, and fill in `evident` (A,).

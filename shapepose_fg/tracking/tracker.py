@@ -24,7 +24,7 @@ from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.gated_views import ObservationConfig
 from shapepose_fg.proposal.nearby import FrameArrays
 from shapepose_fg.proposal.proposals import ProposalConfig
-from shapepose_fg.tracking.measuring import Trust, measured
+from shapepose_fg.tracking.measuring import MeasurementNoise, measured
 from shapepose_fg.tracking.motion_filter import LOST_M, Bones, JointStates, predicted
 from shapepose_fg.tracking.view_assignment import Predicted, assign
 
@@ -156,8 +156,8 @@ class Tracker:
         return Bones.of(self.skeleton, self.scale.longest_m)
 
     @cached_property
-    def _trust(self) -> Trust:
-        return Trust.of(self.observation, self.skeleton.joints)
+    def _trust(self) -> MeasurementNoise:
+        return MeasurementNoise.of(self.observation, self.skeleton.joints)
 
     def alive(self, tracks: Tracks) -> Mask:
         """(A,) tracks with evidence within the last `patience_s`."""

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from factors import CONSTANT_ACCELERATION, CONSTANT_VELOCITY, Motion, matrices
-from shapepose_fg.body.fitting.chains import Links
+from shapepose_fg.body.fitting.chains import MotionChain
 from shapepose_fg.body.fitting.priors import NUM_MOVING, MotionPrior
 from shapepose_fg.body.kernels.solving import eliminated, put_back
 from shapepose_fg.body.model.rotation import exp_so3
@@ -69,13 +69,13 @@ LAWS = {
 
 
 @pytest.fixture(params=LAWS.values(), ids=LAWS)
-def chain(request) -> tuple[Links, np.ndarray, np.ndarray]:
+def chain(request) -> tuple[MotionChain, np.ndarray, np.ndarray]:
     """Six rows of uneven steps, turning a few degrees a step; the last two are past the end."""
     T, N = 6, 8
     rng = np.random.default_rng(0)
     step = rng.uniform(0.02, 0.1, T - 1)
     step[3:] = np.inf
-    motion = Links(request.param, rng.uniform(0.5, 1.5, N), rng.uniform(0.1, 1.1, N), step)
+    motion = MotionChain(request.param, rng.uniform(0.5, 1.5, N), rng.uniform(0.1, 1.1, N), step)
     return motion, exp_so3(0.05 * draw(T, 3).cumsum(0)), 0.3 * draw(T, N - 3, seed=1)
 
 
@@ -105,7 +105,7 @@ def test_motion_s_gradient_and_couplings_are_those_of_its_energy(chain):
 
 
 def test_even_motion_costs_its_speed_alone():
-    motion = Links(CONSTANT_VELOCITY, np.full(6, 2.0), np.full(6, 0.5), np.full(9, 0.1))
+    motion = MotionChain(CONSTANT_VELOCITY, np.full(6, 2.0), np.full(6, 0.5), np.full(9, 0.1))
     time = 0.1 * np.arange(10)[:, None]
     energy, _ = motion.at(exp_so3(time * [0.0, 0.0, 0.7]), time * [0.3, 0.0, 0.0])
     assert energy == pytest.approx(

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from shapepose_fg.body.fitting.descent import (
-    BodyState,
+    DescentState,
     LearnedDescent,
     NetworkInputs,
     gradient_scale,
@@ -50,10 +50,10 @@ def network(random: bool) -> UpdateNetwork:
     return UpdateNetwork(config, weights)
 
 
-def states(count: int = ROWS) -> BodyState:
+def states(count: int = ROWS) -> DescentState:
     rng = np.random.default_rng(0)
     turns, place = 0.4 * rng.normal(size=(count, 24, 3)), 0.1 * rng.normal(size=(count, 3))
-    return BodyState(rng.normal(size=(count, 10)), exp_so3(turns), place)
+    return DescentState(rng.normal(size=(count, 10)), exp_so3(turns), place)
 
 
 def targets_of(places: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
@@ -67,7 +67,7 @@ def targets_of(places: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
     return rng.normal(0, 0.4, (ROWS, 50, 3)), information
 
 
-def assert_same(one: BodyState, other: BodyState, atol: float) -> None:
+def assert_same(one: DescentState, other: DescentState, atol: float) -> None:
     for name, value in vars(one).items():
         np.testing.assert_allclose(value, getattr(other, name), atol=atol, err_msg=name)
 
@@ -159,9 +159,9 @@ def test_rows_are_independent_and_steps_are_rotations(model):
     )
     *_, all_rows = descent.unroll(states(), xyz, information)
     row = slice(2, 3)
-    alone = BodyState(*(value[row] for value in vars(states()).values()))
+    alone = DescentState(*(value[row] for value in vars(states()).values()))
     *_, one = descent.unroll(alone, xyz[row], information[row])
-    assert_same(one, BodyState(*(value[row] for value in vars(all_rows).values())), atol=1e-5)
+    assert_same(one, DescentState(*(value[row] for value in vars(all_rows).values())), atol=1e-5)
     eye = np.broadcast_to(np.eye(3), (ROWS, 24, 3, 3))
     np.testing.assert_allclose((all_rows.local.swapaxes(-1, -2) @ all_rows.local), eye, atol=1e-5)
 

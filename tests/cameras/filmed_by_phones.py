@@ -25,7 +25,7 @@ from shapepose_fg.simulation.detector import Detector, DetectorConfig
 from shapepose_fg.simulation.mocap import Mocap
 from shapepose_fg.simulation.performance import Performance, together
 from shapepose_fg.simulation.scene import UP, Scene
-from shapepose_fg.simulation.visibility import Skin, see
+from shapepose_fg.simulation.visibility import OccludingSurface, see
 
 SECONDS, FPS = 60.0, 60.0
 """Duration of a recording, s, and rate of the simulated motion, Hz."""
@@ -57,7 +57,7 @@ def film(room: int, mocap: Mocap) -> tuple[list[Phone], Recording]:
         for n, angle in enumerate(LAYOUTS[layout])
     ]
     phones.append(_carried(f"phone{len(phones) + 1}", rng))
-    skin = Skin.of(scene.body, DetectorConfig().visibility.cell_m)
+    skin = OccludingSurface.of(scene.body, DetectorConfig().visibility.cell_m)
     seen = [_seen(each, scene, skin, int(rng.integers(1 << 30))) for each in phones]
     frames = []
     for parts in zip(*seen, strict=True):
@@ -174,7 +174,7 @@ def odometry(phone: Phone, rng: np.random.Generator, drift: float = 0.01) -> Tra
     return Trajectory(phone.camera.name, phone.time_s - phone.time_s[0], oTw @ own)
 
 
-def _seen(phone: Phone, scene: Scene, skin: Skin, seed: int) -> list[Detections]:
+def _seen(phone: Phone, scene: Scene, skin: OccludingSurface, seed: int) -> list[Detections]:
     """The detections of a phone, frame by frame."""
     camera, H = phone.camera, phone.camera.image_size[1]
     ideal = replace(camera, distortion=np.zeros(5))

@@ -32,7 +32,7 @@ from shapepose_fg.io.calibration import read_rig, write_rig
 from shapepose_fg.io.detections import read_detections
 from shapepose_fg.io.lenses import lenses_of
 from shapepose_fg.io.write_detections import write_openpose
-from shapepose_fg.simulation.motion import Motion
+from shapepose_fg.simulation.motion import BodyMotion
 from shapepose_fg.simulation.scene import keypoints_of
 from tests.cameras.conftest import FPS, off_by
 from tests.conftest import read_body
@@ -100,7 +100,7 @@ def test_bones_say_how_tall_somebody_is():
     body = BodyModel.default()
     betas = np.random.default_rng(0).normal(size=(40, body.num_betas))
     statures = statures_m(betas, read_body())
-    stands = keypoints_of(body, Motion.still(betas))[0][:, list(BODY_25.core)]
+    stands = keypoints_of(body, BodyMotion.still(betas))[0][:, list(BODY_25.core)]
     said = np.array([build_of(each[None], BODY_25).stature for each in stands])
     # The model's shape space leaves 0.9 %; limbs alone, legs and arms alike, would leave 2.4.
     assert np.std(said / statures) < 0.012 and np.mean(said / statures) == pytest.approx(

@@ -11,7 +11,7 @@ import pytest
 from shapepose_fg.cameras import refine as refinement
 from shapepose_fg.cameras.bundle import Freedom, adjust, dilution, misfit
 from shapepose_fg.cameras.check.evidence import Look, gather
-from shapepose_fg.cameras.check.small_errors import Problem
+from shapepose_fg.cameras.check.small_errors import SmallErrors
 from shapepose_fg.cameras.parameters import MOVE, TURN
 from shapepose_fg.cameras.people import Footage
 from shapepose_fg.cameras.refine import refine
@@ -117,9 +117,10 @@ def test_more_frames_of_the_same_biases_are_no_more_evidence(rig, recording, peo
     usual = np.array([*Freedom(1.0, 0.02).sigmas[:6], 0.0, 0.0, 0.02])
     few, many = (gather(seen, frames, 4) for frames in (range(60), range(250)))
     for evidence in (few, many):
-        assert Problem.of(Look.given(evidence, rig)).off(usual) < 0.5
+        assert SmallErrors.of(Look.given(evidence, rig)).off(usual) < 0.5
     assert (
-        Problem.of(Look.given(many, disturbed(rig, seed, degrees=3, metres=0.1))).off(usual) > 0.5
+        SmallErrors.of(Look.given(many, disturbed(rig, seed, degrees=3, metres=0.1))).off(usual)
+        > 0.5
     )
 
 

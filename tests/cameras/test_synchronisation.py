@@ -12,7 +12,7 @@ from shapepose_fg.cameras import synchronise as synchronisation
 from shapepose_fg.cameras.offsets.subframe import InSpace, Pairwise
 from shapepose_fg.cameras.sightings import Sightings
 from shapepose_fg.cameras.synchronise import synchronise
-from shapepose_fg.cameras.tracks import Tracks, at_regular_times
+from shapepose_fg.cameras.tracks import CameraTracks, at_regular_times
 from shapepose_fg.cli.main import main
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.detections import Recording
@@ -100,7 +100,7 @@ def test_a_camera_that_sees_somebody_else_beside_is_left_out_of_a_person(rig, tw
         )
     )
     views = Views.of(rig)
-    tracks = [Tracks.of(both, views, view, FPS) for view in range(4)]
+    tracks = [CameraTracks.of(both, views, view, FPS) for view in range(4)]
     space = InSpace.of(Pairwise(tracks, views, np.zeros(4), FPS))
     assert len(space.time) >= 45  # of 50 moments
     assert (space.member[:, :3] == 0).all() and (space.member[:, 3] == -1).all()

@@ -245,7 +245,7 @@ def test_networks_in_each_other_s_place_are_refused(tmp_path):
     five = str(rtmpose_file(tmp_path / "five.onnx", 5, (192, 256), 0))
     with pytest.raises(
         InputError,
-        match="no known skeleton has 5 joints; describe it in a TOML file of the network",
+        match="no known skeleton has 5 joints; describe the network in a TOML file",
     ):
         open_network(five, yolox, Path)
 

@@ -663,7 +663,7 @@ def test_a_format_of_the_user_s_own(tmp_path, rig):
         block = PeopleBlock(rows[:, 0].astype(np.intp), rows[:, 1:].reshape(len(rows), -1, 3))
         return CameraPeople(file, "our CSV", iter([block]), 0, 2)
 
-    ours = reading.Format("our CSV", ("{}.csv",), read)
+    ours = reading.DetectionFormat("our CSV", ("{}.csv",), read)
     reading.FORMATS.insert(0, ours)
     try:
         table = read_detections(tmp_path, rig)

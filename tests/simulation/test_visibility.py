@@ -13,7 +13,7 @@ from shapepose_fg.simulation.visibility import (
     BORDER,
     ITSELF,
     NOBODY,
-    Skin,
+    OccludingSurface,
     Visibility,
     VisibilityConfig,
     see,
@@ -40,7 +40,7 @@ def rig_of(*views: tuple[NDArray, NDArray]) -> Rig:
 def look(
     rig: Rig, joints: NDArray, meshes: NDArray, scene: Scene, config: VisibilityConfig
 ) -> Visibility:
-    skin = Skin.of(scene.body, config.cell_m)
+    skin = OccludingSurface.of(scene.body, config.cell_m)
     return see(rig, joints, meshes[:, skin.vertices], skin, config)
 
 

@@ -16,7 +16,12 @@ import numpy as np
 import pytest
 
 from shapepose_fg.simulation import DetectorConfig, Scene, built_in_scene, simulate
-from shapepose_fg.simulation.visibility import AHEAD, FramePeople, Skin, VisibilityWorker
+from shapepose_fg.simulation.visibility import (
+    AHEAD,
+    FramePeople,
+    OccludingSurface,
+    VisibilityWorker,
+)
 
 CONFIG = DetectorConfig().visibility
 
@@ -28,7 +33,7 @@ def scene() -> Scene:
 
 @pytest.fixture(scope="module")
 def worker(scene: Scene) -> VisibilityWorker:
-    return VisibilityWorker(scene.rig, Skin.of(scene.body, CONFIG.cell_m), CONFIG)
+    return VisibilityWorker(scene.rig, OccludingSurface.of(scene.body, CONFIG.cell_m), CONFIG)
 
 
 @pytest.fixture(scope="module")

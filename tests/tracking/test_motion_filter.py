@@ -12,7 +12,7 @@ from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.gated_views import ObservationConfig, linearise, observation_sigmas
 from shapepose_fg.proposal.nearby import FrameArrays
-from shapepose_fg.tracking.measuring import Trust, measured
+from shapepose_fg.tracking.measuring import MeasurementNoise, measured
 from shapepose_fg.tracking.motion_filter import Bones, JointStates, predicted
 from shapepose_fg.tracking.view_assignment import Predicted, assign
 
@@ -86,7 +86,7 @@ def test_a_measurement_is_the_information_filter_s_also_for_a_ray(
         mean = np.einsum("...ij,...j->...i", covariance, right)
         at = mean[..., :3]
     weight = config.weight(seen.confidence)
-    given = before, lost, candidate, weight, arrays, Trust.of(config, names), BONES
+    given = before, lost, candidate, weight, arrays, MeasurementNoise.of(config, names), BONES
     after, kept, evident = measured(*given)
     inlier = kept >= 0
     assert evident.all()
@@ -107,7 +107,7 @@ def test_a_lost_joint_begins_where_the_views_put_it(five_cameras, two_people, se
     arrays, config = FrameArrays.of(seen, five_cameras, BODY_25), ObservationConfig()
     candidate = assign(Predicted(two_people, sure / 20, lost & False), arrays)
     before = JointStates.at(two_people + 0.5 * lost[..., None], sure, (2.0,))
-    trust = Trust.of(config, BODY_25.joints)
+    trust = MeasurementNoise.of(config, BODY_25.joints)
     after, kept, _ = measured(
         before, lost, candidate, config.weight(seen.confidence), arrays, trust, BONES
     )

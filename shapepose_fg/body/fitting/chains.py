@@ -10,7 +10,7 @@ from shapepose_fg.body.model.rotation import log_so3, right_jacobian_inverse
 from shapepose_fg.core.arrays import Array, Index
 
 
-class Links:
+class MotionChain:
     """`MotionPrior` along a chain of T rows with N parameters, as a part of a least-squares
     problem.
 
@@ -128,7 +128,7 @@ class Links:
         return found
 
 
-def linked(law: Motion, energy: BodyEnergy, times_s: Array, faster: Array) -> Links:
+def linked(law: Motion, energy: BodyEnergy, times_s: Array, faster: Array) -> MotionChain:
     """The motion prior along T rows at `times_s` (T,). Where joints accelerate more than people on
     average, `faster` (T - 1, J) times, it is as much wider for the unknowns that move them.
     """
@@ -139,7 +139,7 @@ def linked(law: Motion, energy: BodyEnergy, times_s: Array, faster: Array) -> Li
     fastest = times[: len(times) - n + 1].copy()  # of the steps that an acceleration links
     for k in range(1, n):
         fastest = np.maximum(fastest, times[k : k + len(fastest)])
-    return Links(law, acceleration * fastest, velocity * times, step)
+    return MotionChain(law, acceleration * fastest, velocity * times, step)
 
 
 def nearest_keypoint(energy: BodyEnergy) -> Index:

@@ -35,7 +35,7 @@ betas."""
 
 
 @dataclass(frozen=True)
-class BodyState:
+class DescentState:
     """Shape and pose of B bodies, rotations as matrices."""
 
     betas: Array
@@ -68,14 +68,14 @@ class LearnedDescent:
             NetworkInputs(points, slots, kernel_scale, others, offsets),
         )
 
-    def unroll(self, state: BodyState, xyz: Array, information: Array) -> Iterator[BodyState]:
+    def unroll(self, state: DescentState, xyz: Array, information: Array) -> Iterator[DescentState]:
         """Yield the state after each update, given targets (B, K, 3) in the person's own frame,
         metres, finite, and their information (B, K, 3, 3), 1/m², including the model's error; zero
         for an unseen joint.
         """
         for step in range(self.network.config.steps):
             inputs = self._inputs(state, xyz, information, self.network.gradient_scale)
-            state = BodyState(*(np.array(part, order="C") for part in vars(state).values()))
+            state = DescentState(*(np.array(part, order="C") for part in vars(state).values()))
             moved(self.network(inputs, step), STEP, state.betas, state.local, state.transl)
             yield state
 
@@ -106,7 +106,7 @@ class NetworkInputs:
         self._own, self._limbs, self._kernel_scale = own, every.limbs(), kernel_scale
 
     def __call__(
-        self, state: BodyState, target: Array, information: Array, scale: Any
+        self, state: DescentState, target: Array, information: Array, scale: Any
     ) -> NDArray[np.float32]:
         """(B, `UpdateNetwork.num_inputs`) network inputs; gradients are multiplied by `scale`
         (79,).

@@ -6,7 +6,7 @@ independent.
 
 import numpy as np
 
-from shapepose_fg.body.fitting.descent import BodyState, LearnedDescent
+from shapepose_fg.body.fitting.descent import DescentState, LearnedDescent
 from shapepose_fg.body.fitting.energy import (
     BodyEnergy,
     EnergyTargets,
@@ -73,7 +73,9 @@ class NetworkDescent:
         well_seen |= (well_seen.sum(1) < LEAST_JOINTS)[:, None]
         information = rotation[:, None].swapaxes(-1, -2) @ targets.information @ rotation[:, None]
         local = np.broadcast_to(frame.local, (count, 24, 3, 3))
-        state = BodyState(np.zeros((count, 10)), local, np.broadcast_to(frame.transl, (count, 3)))
+        state = DescentState(
+            np.zeros((count, 10)), local, np.broadcast_to(frame.transl, (count, 3))
+        )
         with np.errstate(all="ignore"):  # divergence gives NaN
             *_, arrived = self._descent.unroll(
                 state, inside, information * well_seen[..., None, None]

@@ -39,7 +39,7 @@ from shapepose_fg.cameras.people import LEAST_PEOPLE, Footage, missed_px
 from shapepose_fg.cameras.relative_pose import Relative, relative
 from shapepose_fg.cameras.sightings import Sightings
 from shapepose_fg.cameras.stature import ADULT_M
-from shapepose_fg.cameras.tracks import OneClock, Tracks, seen_at
+from shapepose_fg.cameras.tracks import CameraTracks, OneClock, seen_at
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.decompositions import rigid
@@ -214,7 +214,7 @@ def _pairs(
     return found
 
 
-def own_tracks(sightings: Sightings, rig: Rig, fps: float) -> list[Tracks]:
+def own_tracks(sightings: Sightings, rig: Rig, fps: float) -> list[CameraTracks]:
     """The tracks of each camera, in its own frame; raises Undetermined if one sees too
     few people.
     """
@@ -224,7 +224,7 @@ def own_tracks(sightings: Sightings, rig: Rig, fps: float) -> list[Tracks]:
         least = f"at least {_LEAST_S:g} s of a person are needed, but only {figures} s are seen"
         raise Undetermined((f"{_named(rig, few)}: {least}; {FILM}",))
     still = Views(rig.K, np.tile(np.eye(3, 4), (len(rig), 1, 1)))
-    return [Tracks.of(sightings, still, view, fps) for view in range(len(rig))]
+    return [CameraTracks.of(sightings, still, view, fps) for view in range(len(rig))]
 
 
 def _apart(rig: Rig, connected: list[list[int]]) -> list[str]:

@@ -33,13 +33,14 @@ correlated."""
 
 
 @dataclass(frozen=True)
-class Marginal:
+class BiasMarginal:
     """Log-likelihood of residuals r = J theta for one size of biases: log + g' theta - theta' H
     theta / 2.
     """
 
     H: Array
-    """(C, C) information about cameras' parameters and individual people's biases (`Residuals`)."""
+    """(C, C) information about cameras' parameters and individual people's biases
+    (`BiasedResiduals`)."""
     g: Array
     """(C,) information vector."""
     log: float
@@ -47,7 +48,7 @@ class Marginal:
 
 
 @dataclass(frozen=True)
-class Residuals:
+class BiasedResiduals:
     """Detections of N people in single frames, J joints, V cameras; P identities, K parts of a
     recording.
     """
@@ -68,7 +69,7 @@ class Residuals:
     @classmethod
     def of(
         cls, seen: tuple[Array, Array, Array], views: Views, person: Index, part: Index
-    ) -> "Residuals":
+    ) -> "BiasedResiduals":
         """Build residuals from the arrays of `observed`. Robust weights use each residual's
         deviation from its median over the person's frames.
         """
@@ -114,7 +115,7 @@ class Residuals:
         shift: float = SHIFT,
         larger: float = LARGER,
         common: Sequence[float | Array] | None = None,
-    ) -> list[Marginal]:
+    ) -> list[BiasMarginal]:
         """Marginal likelihoods around the cameras `views` for each size of biases: `levels`, each
         with all ratios `common`, of all views or of each (V,), by default those of `COMMON`.
         """
@@ -182,7 +183,7 @@ class Residuals:
         shift: float,
         larger: float,
         ratios: Sequence[float | Array],
-    ) -> list[Marginal]:
+    ) -> list[BiasMarginal]:
         """Marginals for each of the common biases' `ratios`, with biases of these standard
         deviations.
         """
@@ -215,7 +216,7 @@ class Residuals:
             spread = np.linalg.slogdet(known * size[:, None] * size)[1].sum()
             spread += np.linalg.slogdet(shared / prior)[1]
             likely = log - 0.5 * float(spread + rest[-1, -1])
-            found.append(Marginal(rest[:-1, :-1], rest[:-1, -1], likely))
+            found.append(BiasMarginal(rest[:-1, :-1], rest[:-1, -1], likely))
         return found
 
 

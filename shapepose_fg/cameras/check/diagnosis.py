@@ -18,7 +18,7 @@ from shapepose_fg.cameras.check.hypotheses import GOOD_PAIR, mistake_of_cameras
 from shapepose_fg.cameras.check.joint_order import order_of_joints
 from shapepose_fg.cameras.check.lags import Lag, lag_of, lags
 from shapepose_fg.cameras.check.over_time import parted, parting_of
-from shapepose_fg.cameras.check.small_errors import LEAST_DEG, Problem
+from shapepose_fg.cameras.check.small_errors import LEAST_DEG, SmallErrors
 from shapepose_fg.cameras.parameters import difference
 from shapepose_fg.cameras.sightings import MIN_SIGHTINGS, same_frame
 from shapepose_fg.cameras.stature import SHORTEST_M, TALLEST_M, Build, build_of
@@ -182,7 +182,7 @@ def _sound(look: Look, detections: DetectionSequence, rig: Rig) -> Diagnosis | N
         or any(each is not None and each.drop > _STEADY for each in partings)
     ):
         return None
-    problem = Problem.of(look)
+    problem = SmallErrors.of(look)
     refined = replace(look, views=problem.relaxed())
     remaining = lags(without_biases(refined))
     build = build_of(refined.structure()[1].points, detections.skeleton)
@@ -213,7 +213,7 @@ def _all_mistakes(
         )
         trust = trust_of(findings, given, look, frames)
         return Diagnosis(tuple(findings), given, look, trust=trust)
-    problem = Problem.of(look)
+    problem = SmallErrors.of(look)
     refined = replace(look, views=problem.relaxed())
     remaining = lags(without_biases(refined))
     for _ in range(_MOST_FINDINGS):
@@ -283,7 +283,7 @@ def _nobody(look: Look) -> list[Finding]:
     return [Finding(Kind.NOBODY, (), amount=float(len(look.sightings)))]
 
 
-def _settled(look: Look, view: int, frames: int) -> tuple[Look, Problem]:
+def _settled(look: Look, view: int, frames: int) -> tuple[Look, SmallErrors]:
     """The look with a camera late by about `frames`, and its residuals.
 
     People who move mostly in one direction make a time offset look like a rotation, so that the two
@@ -291,7 +291,7 @@ def _settled(look: Look, view: int, frames: int) -> tuple[Look, Problem]:
     """
     for _ in range(6):
         look = look.later(view, frames)
-        problem = Problem.of(look)
+        problem = SmallErrors.of(look)
         refined = replace(look, views=problem.relaxed())
         more = lag_of(without_biases(refined), view, 8)
         frames = more.frames
@@ -308,7 +308,7 @@ def _with_late(findings: list[Finding], view: int, frames: int) -> list[Finding]
     return [*rest, Finding(Kind.LATE, (view,), total)] if total != 0 else rest
 
 
-def _small_findings(problem: Problem, known: set[int]) -> tuple[list[Finding], list[Finding]]:
+def _small_findings(problem: SmallErrors, known: set[int]) -> tuple[list[Finding], list[Finding]]:
     """Small errors of cameras that are more probable than no error and than detector biases; and
     such biases.
     """

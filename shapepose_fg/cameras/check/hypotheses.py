@@ -12,7 +12,7 @@ from shapepose_fg.cameras.check.evidence import Look
 from shapepose_fg.cameras.check.findings import SURE, Finding, Kind, one_of
 from shapepose_fg.cameras.check.lags import lag_of
 from shapepose_fg.cameras.check.over_time import motions
-from shapepose_fg.cameras.check.small_errors import ONE, Problem, named, probable
+from shapepose_fg.cameras.check.small_errors import ONE, SmallErrors, named, probable
 from shapepose_fg.cameras.parameters import CENTRE, FOCAL, POSE, TURN
 from shapepose_fg.cameras.resection import ERROR, independent, likelihood, match
 from shapepose_fg.cameras.sightings import GATE, Pinhole, Sightings
@@ -149,7 +149,7 @@ def _likeliest(look: Look, found: list[tuple[float, Change]]) -> Change | None:
         for each in changes
         if each.fitted is not None and each.finding.cameras == best.finding.cameras
     ]
-    problem = Problem.of(best.look, look.views)
+    problem = SmallErrors.of(best.look, look.views)
     if best.fitted is None:
         of_camera = [problem.as_they_are(best.finding, best.look.views)]
     else:

@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 
 from shapepose_fg.body.model.rotation import exp_so3, log_so3
-from shapepose_fg.cameras.check.biases import Marginal, Residuals
+from shapepose_fg.cameras.check.biases import BiasedResiduals, BiasMarginal
 from shapepose_fg.cameras.check.evidence import Look
 from shapepose_fg.cameras.check.findings import Finding, Kind
 from shapepose_fg.cameras.parameters import (
@@ -60,7 +60,7 @@ LEAST_DEG = 0.25
 
 
 @dataclass(frozen=True)
-class Cause:
+class ErrorCause:
     """One explanation of the residuals."""
 
     finding: Finding | None
@@ -74,10 +74,10 @@ class Cause:
 
 
 @dataclass(frozen=True)
-class Problem:
+class SmallErrors:
     """The residuals of a recording, to be explained."""
 
-    residuals: Residuals
+    residuals: BiasedResiduals
     """Residuals of people associated under the cameras of a look."""
     frame: Index
     """(N,) frame of each person."""
@@ -87,7 +87,7 @@ class Problem:
     """People and views with an unusual bias already accounted for."""
 
     @classmethod
-    def of(cls, look: Look, given: Views | None = None) -> "Problem":
+    def of(cls, look: Look, given: Views | None = None) -> "SmallErrors":
         """Build the problem from people spread over the frames, relative to the look's own cameras
         or to `given`.
         """
@@ -107,13 +107,13 @@ class Problem:
         )[1]
         seen = observed(groups, look.sightings)
         return cls(
-            Residuals.of(seen, look.views, person, part),
+            BiasedResiduals.of(seen, look.views, person, part),
             frame,
             look.views if given is None else given,
         )
 
     @cached_property
-    def _marginals(self) -> list[Marginal]:
+    def _marginals(self) -> list[BiasMarginal]:
         return self.residuals.marginals(self.given)
 
     def _likelihood(
@@ -151,23 +151,23 @@ class Problem:
         return float(np.logaddexp.reduce(logs)), best[int(np.argmax(logs)), : len(sigma)] * sigma
 
     @cached_property
-    def causes(self) -> list[Cause]:
+    def causes(self) -> list[ErrorCause]:
         """Possible explanations including no mistake, most probable first, with probabilities."""
         found = [self.as_they_are(None, self.given), *self.biases(), *self._of_several()]
         for view in range(len(self.given)):
             found += [*self.explained(view, dict.fromkeys(ONE, self.given)), *self._over_time(view)]
         return probable(found)
 
-    def as_they_are(self, finding: Finding | None, views: Views) -> Cause:
+    def as_they_are(self, finding: Finding | None, views: Views) -> ErrorCause:
         """The explanation that cameras are as in `views`, which corrects a finding; None for no
         mistake.
         """
         likely, _ = self._likelihood(self.residuals.camera(0, []), np.zeros(0), views)
-        return Cause(
+        return ErrorCause(
             finding, likely if finding is None else likely + self._rare(finding.kind), views
         )
 
-    def explained(self, view: int, starts: Mapping[Kind, Views]) -> list[Cause]:
+    def explained(self, view: int, starts: Mapping[Kind, Views]) -> list[ErrorCause]:
         """Mistakes of a single camera; `starts` are the cameras with each mistake approximately
         corrected.
         """
@@ -180,10 +180,10 @@ class Problem:
                 likely, change = self._likelihood(directions, sigma, views, before)
                 views = changed_one(views, view, which, change)
             likely += self._rare(kind) - float(np.log(len(ONE[kind])))
-            found.append(Cause(named(kind, view, self.given, views), likely, views))
+            found.append(ErrorCause(named(kind, view, self.given, views), likely, views))
         return found
 
-    def biases(self) -> Iterator[Cause]:
+    def biases(self) -> Iterator[ErrorCause]:
         """A bias of each person in each view."""
         people, views = int(self.residuals.person.max(initial=-1)) + 1, len(self.given)
         seen = np.zeros((people, views))
@@ -192,9 +192,11 @@ class Problem:
             directions = self.residuals.of_person(person, view)
             likely, bias = self._likelihood(directions, np.full(3, BIAS))
             finding = Finding(Kind.BIASED, (view,), float(np.hypot(*bias[:2])))
-            yield Cause(finding, likely + np.log(_WRONG / (people * views)), self.given, person)
+            yield ErrorCause(
+                finding, likely + np.log(_WRONG / (people * views)), self.given, person
+            )
 
-    def _over_time(self, view: int) -> Iterator[Cause]:
+    def _over_time(self, view: int) -> Iterator[ErrorCause]:
         """Rotations of one camera in the parts before or after a frame, and linear drifts."""
         K, times = self.residuals.parts, np.unique(self.residuals.part, return_index=True)[1]
         if K < 3:
@@ -212,9 +214,9 @@ class Problem:
             )
             finding = Finding(kind, (view,), float(np.rad2deg(np.linalg.norm(turn))), frames=frames)
             count = 2 if kind == Kind.DRIFTING else 2 * K - 2
-            yield Cause(finding, likely + self._rare(kind) - np.log(count), self.given)
+            yield ErrorCause(finding, likely + self._rare(kind) - np.log(count), self.given)
 
-    def _of_several(self) -> list[Cause]:
+    def _of_several(self) -> list[ErrorCause]:
         """Independent errors of the principal points of all cameras."""
         V = len(self.given)
         directions = np.concatenate(
@@ -229,7 +231,7 @@ class Problem:
             return []
         shifts = tuple((float(x), float(y)) for x, y in change[rest])
         finding = Finding(Kind.PRINCIPAL_POINT, tuple(rest), float(degrees.max()), shifts)
-        return [Cause(finding, likely + self._rare(Kind.PRINCIPAL_POINT), self.given)]
+        return [ErrorCause(finding, likely + self._rare(Kind.PRINCIPAL_POINT), self.given)]
 
     def relaxed(self) -> Views:
         """The cameras with the small errors that are likely in all of them."""
@@ -271,10 +273,10 @@ class Problem:
         return float(np.log(_WRONG * often / (len(self.given) * (len(ONE) + 2 * _KNOCKED))))
 
 
-def probable(causes: list[Cause]) -> list[Cause]:
+def probable(causes: list[ErrorCause]) -> list[ErrorCause]:
     """Mutually exclusive causes, most probable first, with the probability of each finding."""
     total = np.logaddexp.reduce([each.log for each in causes])
-    told = list[Cause]()
+    told = list[ErrorCause]()
     for each in sorted(causes, key=lambda each: -each.log):
         sure = float(np.exp(each.log - total))
         told.append(

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.fft import next_fast_len
 
 from shapepose_fg.cameras.relative_pose import relative
-from shapepose_fg.cameras.tracks import FASTEST, Tracks, fast_part
+from shapepose_fg.cameras.tracks import FASTEST, CameraTracks, fast_part
 from shapepose_fg.core.arrays import Array
 
 _STEP_S = 0.04
@@ -40,7 +40,7 @@ _FITS_S = 5.0
 
 
 def offsets_without_poses(
-    tracks: list[Tracks], fps: float, most_s: float, told: Callable[[], None] = lambda: None
+    tracks: list[CameraTracks], fps: float, most_s: float, told: Callable[[], None] = lambda: None
 ) -> Array:
     """(V,) shifts in frames: frame f of the first camera is frame f + shift of another, to a few
     frames.
@@ -123,7 +123,7 @@ def _peaks(
     return found
 
 
-def _rises(tracks: Tracks, step: int, fps: float) -> list[tuple[int, Array]]:
+def _rises(tracks: CameraTracks, step: int, fps: float) -> list[tuple[int, Array]]:
     """For each track, the index of its first sample, and vertical speeds (N, J) of its joints, as
     shares of the person's size per frame, one sample every `step` frames; 0 if unknown.
     """

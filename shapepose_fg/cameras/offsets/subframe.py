@@ -15,7 +15,7 @@ from shapepose_fg.body.model.rotation import hat
 from shapepose_fg.cameras.offsets.scan import LEAST_MISS, normals
 from shapepose_fg.cameras.relative_pose import Together
 from shapepose_fg.cameras.sightings import GATE, MIN_JOINTS, Pairs, Sightings, centres_of, median_of
-from shapepose_fg.cameras.tracks import FAST_S, FASTEST, Tracks, block_frames, fast_part
+from shapepose_fg.cameras.tracks import FAST_S, FASTEST, CameraTracks, block_frames, fast_part
 from shapepose_fg.cameras.triangulation import triangulate
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Views
@@ -34,7 +34,7 @@ _MOST_SAMPLES = 3000
 class Pairwise:
     """Tracks of all cameras, and the current estimate of their clocks."""
 
-    tracks: list[Tracks]
+    tracks: list[CameraTracks]
     """Tracks of each camera."""
     views: Views
     """The cameras."""
@@ -109,7 +109,7 @@ class InSpace:
     others.
     """
 
-    tracks: list[Tracks]
+    tracks: list[CameraTracks]
     """Tracks of each camera."""
     views: Views
     """The cameras."""

@@ -14,7 +14,7 @@ from shapepose_fg.core.storage.files import LARGE, read_text
 from shapepose_fg.core.validation import is_number
 from shapepose_fg.io.calibration.content import Content
 from shapepose_fg.io.calibration.written import (
-    Format,
+    CalibrationFormat,
     WrittenCamera,
     WrittenRig,
     intrinsics,
@@ -147,4 +147,4 @@ def _numbers(words: Sequence[str], count: int, place: str) -> list[float]:
     return [float(word) for word in words]
 
 
-COLMAP = Format("COLMAP's cameras.txt and images.txt", _read)
+COLMAP = CalibrationFormat("COLMAP's cameras.txt and images.txt", _read)

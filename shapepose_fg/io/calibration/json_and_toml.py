@@ -21,7 +21,7 @@ from shapepose_fg.core.trajectory import DRIFT, Trajectory
 from shapepose_fg.core.validation import describe, validated
 from shapepose_fg.io.calibration.content import Content
 from shapepose_fg.io.calibration.written import (
-    Format,
+    CalibrationFormat,
     Node,
     Unit,
     WrittenCamera,
@@ -332,9 +332,12 @@ _DIALECTS: dict[str, tuple[Unit | None, Axis | None, dict[str, str]]] = {
 """Unit, up axis and advice for errors, by program. AniPose's world frame is not levelled and has
 the unit of the board; FreeMoCap's world frame is the first camera."""
 JSON_AND_TOML = (
-    Format("rig file", _read_rig_file),
-    Format("CMU Panoptic's JSON", _read_panoptic),
-    Format("VoxelPose's JSON", _read_voxelpose),
-    Format("4D Association's calibration.json", _read_association),
-    *(Format(f"{program}'s TOML", partial(_read_tables, program=program)) for program in _DIALECTS),
+    CalibrationFormat("rig file", _read_rig_file),
+    CalibrationFormat("CMU Panoptic's JSON", _read_panoptic),
+    CalibrationFormat("VoxelPose's JSON", _read_voxelpose),
+    CalibrationFormat("4D Association's calibration.json", _read_association),
+    *(
+        CalibrationFormat(f"{program}'s TOML", partial(_read_tables, program=program))
+        for program in _DIALECTS
+    ),
 )

@@ -16,7 +16,7 @@ from shapepose_fg.core.lens import Lens
 from shapepose_fg.core.storage.files import SMALL
 from shapepose_fg.io.calibration.content import Content, load
 from shapepose_fg.io.calibration.written import (
-    Format,
+    CalibrationFormat,
     Node,
     WrittenCamera,
     WrittenRig,
@@ -373,9 +373,9 @@ def message_of(value: Any) -> tuple[Any, Any] | None:
 
 
 OPENCV = (
-    Format("EasyMocap's intri.yml and extri.yml", _read_easymocap),
-    Format("OpenCV's multi-view calibration", _read_multiview),
-    Format("OpenCV's stereo calibration", _read_stereo),
-    Format("OpenCV's FileStorage with a node or file per camera", _read_nodes),
+    CalibrationFormat("EasyMocap's intri.yml and extri.yml", _read_easymocap),
+    CalibrationFormat("OpenCV's multi-view calibration", _read_multiview),
+    CalibrationFormat("OpenCV's stereo calibration", _read_stereo),
+    CalibrationFormat("OpenCV's FileStorage with a node or file per camera", _read_nodes),
 )
-ROS = Format("ROS' camera_info and pose YAML", _read_ros)
+ROS = CalibrationFormat("ROS' camera_info and pose YAML", _read_ros)

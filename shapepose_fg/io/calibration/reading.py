@@ -20,12 +20,12 @@ from shapepose_fg.io.calibration.colmap import COLMAP
 from shapepose_fg.io.calibration.content import Content, load
 from shapepose_fg.io.calibration.json_and_toml import JSON_AND_TOML
 from shapepose_fg.io.calibration.opencv_and_ros import OPENCV, ROS
-from shapepose_fg.io.calibration.written import METRES, Format, Unit, WrittenRig
+from shapepose_fg.io.calibration.written import METRES, CalibrationFormat, Unit, WrittenRig
 from shapepose_fg.io.calibration.xml_files import QUALISYS, VICON
 from shapepose_fg.io.camera_names import listing
 from shapepose_fg.io.trajectories import read_trajectory
 
-FORMATS: tuple[Format, ...] = (*JSON_AND_TOML, QUALISYS, VICON, *OPENCV, COLMAP, ROS)
+FORMATS: tuple[CalibrationFormat, ...] = (*JSON_AND_TOML, QUALISYS, VICON, *OPENCV, COLMAP, ROS)
 """All known formats, in the order in which they are tried."""
 
 _MISSING = {
@@ -110,7 +110,7 @@ def cameras_of(folder: Path) -> Rig:
     return read_rig(file)
 
 
-def recognised(content: Content) -> tuple[Format, WrittenRig] | None:
+def recognised(content: Content) -> tuple[CalibrationFormat, WrittenRig] | None:
     """The first format that recognises the content, and its cameras; None for an unknown format.
     InputError if damaged.
     """

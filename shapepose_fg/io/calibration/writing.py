@@ -22,7 +22,7 @@ from shapepose_fg.io.calibration.json_and_toml import entries, wanted_tables
 from shapepose_fg.io.calibration.opencv_and_ros import OPENCV
 from shapepose_fg.io.calibration.reading import FORMATS, recognised
 from shapepose_fg.io.calibration.rewriting import REWRITTEN, numbers_of
-from shapepose_fg.io.calibration.written import METRES, Format, Unit, WrittenRig
+from shapepose_fg.io.calibration.written import METRES, CalibrationFormat, Unit, WrittenRig
 
 _SEVERAL = (OPENCV[0].name, COLMAP.name)
 """Formats that consist of several files."""
@@ -110,7 +110,7 @@ def check_target(source: Path, target: Path) -> None:
         )
 
 
-def _found(source: Path) -> tuple[Content, Format, WrittenRig]:
+def _found(source: Path) -> tuple[Content, CalibrationFormat, WrittenRig]:
     """The content of `source`, its format, and its cameras."""
     content = load(source)
     if (found := recognised(content)) is None:

@@ -77,7 +77,7 @@ class WrittenRig:
 
 
 @dataclass(frozen=True)
-class Format:
+class CalibrationFormat:
     """A calibration format."""
 
     name: str

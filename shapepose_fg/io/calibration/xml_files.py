@@ -14,7 +14,7 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.validation import is_number
 from shapepose_fg.io.calibration.content import Content
 from shapepose_fg.io.calibration.written import (
-    Format,
+    CalibrationFormat,
     Node,
     WrittenCamera,
     WrittenRig,
@@ -212,10 +212,10 @@ def _vicon(camera: ET.Element, place: str) -> WrittenCamera:
     )
 
 
-QUALISYS = Format(
+QUALISYS = CalibrationFormat(
     "Qualisys' .qca.txt",
     lambda content: _cameras(content, "calibration", *QTM_CAMERAS, "serial", _qualisys),
 )
-VICON = Format(
+VICON = CalibrationFormat(
     "Vicon's .xcp", lambda content: _cameras(content, "Cameras", *NEXUS_CAMERAS, "DEVICEID", _vicon)
 )

@@ -45,7 +45,7 @@ from shapepose_fg.io.skeleton_file import find_skeleton
 
 
 @dataclass(frozen=True)
-class Format:
+class DetectionFormat:
     """A format of detections, with one file or folder per camera."""
 
     name: str
@@ -58,20 +58,20 @@ class Format:
     file, place and cure."""
 
 
-JSON = Format(
+JSON = DetectionFormat(
     "JSON of OpenPose, Pose2Sim, MMPose, AlphaPose, or COCO's keypoint results",
     ("{}", "{}_json", "{}.json", "results_{}.json", "{}_results.json", "alphapose-results_{}.json"),
     lambda place, camera: _read_folder(place, camera),
 )
-CSV = Format(
+CSV = DetectionFormat(
     "CSV of DeepLabCut and AniPose", ("{}.csv",), lambda place, camera: read_deeplabcut(place)
 )
-HDF5 = Format(
+HDF5 = DetectionFormat(
     "HDF5 of SLEAP, DeepLabCut and AniPose",
     ("{}.h5", "{}.analysis.h5"),
     lambda place, camera: read_hdf5(place),
 )
-TEXT = Format("4D Association's text", ("{}.txt",), read_association_text)
+TEXT = DetectionFormat("4D Association's text", ("{}.txt",), read_association_text)
 FORMATS = [TEXT, JSON, CSV, HDF5]
 """Known formats. The first one with a matching file or folder for some camera is used for all
 cameras."""
@@ -130,7 +130,7 @@ def read_detections(
     return replace(table, notes=(*notes, *table.notes), first=first)
 
 
-def find_places(path: Path, rig: Rig) -> tuple[Format, list[Path], list[str]]:
+def find_places(path: Path, rig: Rig) -> tuple[DetectionFormat, list[Path], list[str]]:
     """The format, the file or folder of each camera (in the rig's order) in the folder `path`, and
     notes on inferred names.
 
@@ -222,7 +222,7 @@ def _entries(path: Path) -> tuple[Path, list[Path]]:
     return folder, sorted(each for each in folder.iterdir() if not each.name.startswith("."))
 
 
-def _offered(entries: list[Path]) -> list[tuple[Format, list[Path], list[str]]]:
+def _offered(entries: list[Path]) -> list[tuple[DetectionFormat, list[Path], list[str]]]:
     """For each format, the files of a folder that may belong to cameras, and the names of these
     cameras.
     """
@@ -243,16 +243,16 @@ def _offered(entries: list[Path]) -> list[tuple[Format, list[Path], list[str]]]:
     return found
 
 
-def _of_all_cameras(file: Path, names: Sequence[str]) -> Format | None:
+def _of_all_cameras(file: Path, names: Sequence[str]) -> DetectionFormat | None:
     """The format of a file with all cameras; None for other files."""
     if file.is_file() and _FREEMOCAP_FILES.search(file.name) is not None:
-        return Format(
+        return DetectionFormat(
             "",
             (),
             lambda place, camera: read_freemocap(place, names.index(camera.name), len(names)),
         )
     if file.is_file() and file.suffix == ".csv" and is_caliscope(file):
-        return Format(
+        return DetectionFormat(
             "", (), lambda place, camera: read_caliscope(place, names.index(camera.name), names)
         )
     return None

@@ -13,7 +13,7 @@ from shapepose_fg.core.drawing import colour_of, vertex_normals
 from shapepose_fg.core.skeleton import SMPL_24
 from shapepose_fg.core.world_axes import y_up
 from shapepose_fg.io.export.registry import Job, Written
-from shapepose_fg.io.export.skinned import BONES, Motion, everybody
+from shapepose_fg.io.export.skinned import BONES, SkinnedMotion, everybody
 
 _SET = 4
 """Number of bone influences of a vertex in one set. Every program reads the first set, Blender all
@@ -36,7 +36,10 @@ def write_glb(job: Job) -> Written:
 
 
 def glb_bytes(
-    motions: dict[int, Motion], arrays: SmplArrays, times_s: Array, origin_m: Array | None = None
+    motions: dict[int, SkinnedMotion],
+    arrays: SmplArrays,
+    times_s: Array,
+    origin_m: Array | None = None,
 ) -> bytes:
     """A GLB file of people by number, in frames at `times_s` (T,), seconds; time 0 of the file is
     the first frame.
@@ -148,7 +151,7 @@ def influences(weights: Array) -> list[tuple[NDArray[np.uint8], NDArray[np.float
 
 
 def _add_person(
-    file: _File, who: int, motion: Motion, shared: dict[str, int], triangles: int
+    file: _File, who: int, motion: SkinnedMotion, shared: dict[str, int], triangles: int
 ) -> int:
     """Add the nodes of a person in the pose of the first frame, with mesh, material and skin;
     returns the index of the first node.
@@ -192,7 +195,7 @@ def _add_person(
     return first
 
 
-def _animate(file: _File, first: int, motion: Motion, times: Array) -> None:
+def _animate(file: _File, first: int, motion: SkinnedMotion, times: Array) -> None:
     """Add the animation channels of the person whose first node is `first`."""
 
     def channel(

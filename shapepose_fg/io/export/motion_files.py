@@ -17,7 +17,7 @@ from shapepose_fg.core.storage.files import write_atomically
 from shapepose_fg.core.storage.npz import write_npz
 from shapepose_fg.core.world_axes import y_up, z_up
 from shapepose_fg.io.export.registry import Job, Written
-from shapepose_fg.io.export.skinned import BONES, Motion, RestBody, all_segments
+from shapepose_fg.io.export.skinned import BONES, RestBody, SkinnedMotion, all_segments
 
 _SHARED = SMPL_24.index("left_hand")
 """Number of joints, from the pelvis on, that SMPL and SMPL-H have in common."""
@@ -46,7 +46,7 @@ def write_amass(job: Job) -> Written:
     return written
 
 
-def amass_columns(segment: Motion, fps: float) -> dict[str, NDArray[Any]]:
+def amass_columns(segment: SkinnedMotion, fps: float) -> dict[str, NDArray[Any]]:
     """The arrays of AMASS for one segment of one person.
 
     `poses` (F, 156) are SMPL-H's: pelvis and body are ours; SMPL's two hand joints have no
@@ -91,7 +91,7 @@ def write_bvh(job: Job) -> Written:
     return written
 
 
-def bvh_text(motion: Motion, fps: float) -> str:
+def bvh_text(motion: SkinnedMotion, fps: float) -> str:
     """A BVH file: the T-pose, and per frame the position of the pelvis and the rotations.
 
     The pelvis has offset zero, because some programs add the offset to its position in a frame, and

@@ -113,7 +113,7 @@ class Written:
 
 
 @dataclass(frozen=True)
-class Format:
+class ExportFormat:
     """An export format."""
 
     name: str
@@ -143,23 +143,23 @@ _ANYBODY = {"identities": False}
 FORMATS = {
     each.name: each
     for each in (
-        Format("amass", "motion_files:write_amass"),
-        Format("trc", "markers:write_trc"),
-        Format("c3d", "markers:write_c3d"),
-        Format("bvh", "motion_files:write_bvh"),
-        Format("glb", "glb:write_glb"),
-        Format("angles", "tables:write_angles", **_ANYBODY),
-        Format("opensim", "opensim:write_opensim"),
-        Format("csv", "tables:write_csv", **_ANYBODY),
-        Format("parquet", "tables:write_parquet", **_ANYBODY, rows=True),
-        Format("mcap", "mcap:write_mcap"),
-        Format("rrd", "rerun_app:write_rrd", **_ANYBODY, observations=True),
+        ExportFormat("amass", "motion_files:write_amass"),
+        ExportFormat("trc", "markers:write_trc"),
+        ExportFormat("c3d", "markers:write_c3d"),
+        ExportFormat("bvh", "motion_files:write_bvh"),
+        ExportFormat("glb", "glb:write_glb"),
+        ExportFormat("angles", "tables:write_angles", **_ANYBODY),
+        ExportFormat("opensim", "opensim:write_opensim"),
+        ExportFormat("csv", "tables:write_csv", **_ANYBODY),
+        ExportFormat("parquet", "tables:write_parquet", **_ANYBODY, rows=True),
+        ExportFormat("mcap", "mcap:write_mcap"),
+        ExportFormat("rrd", "rerun_app:write_rrd", **_ANYBODY, observations=True),
     )
 }
 """Formats by name. To add one, write a module beside this one, and an entry here."""
 
 
-def chosen(names: Sequence[str]) -> list[Format]:
+def chosen(names: Sequence[str]) -> list[ExportFormat]:
     """The formats with these names, without duplicates, in the given order; InputError for unknown
     names.
     """
@@ -171,7 +171,7 @@ def chosen(names: Sequence[str]) -> list[Format]:
 
 def export_result(
     results: Path,
-    formats: Sequence[Format],
+    formats: Sequence[ExportFormat],
     folder: Path,
     *,
     markers: MarkerSet = MarkerSet.OPENSIM,

@@ -62,7 +62,7 @@ class RestBody:
 
 
 @dataclass(frozen=True)
-class Motion:
+class SkinnedMotion:
     """The motion of one person's body in F frames, in the axes of a format."""
 
     rest: RestBody
@@ -88,7 +88,7 @@ class Motion:
         """(F, 24, 3, 3) rotation of each bone, world from bone."""
         return _accumulated(self.rotations)
 
-    def segments(self, longest_hole: int) -> Iterator["Motion"]:
+    def segments(self, longest_hole: int) -> Iterator["SkinnedMotion"]:
         """Split the motion at gaps; gaps of up to `longest_hole` frames are interpolated.
 
         Rotations are interpolated spherically (slerp) between the frames before and after the gap,
@@ -106,10 +106,10 @@ class Motion:
                 ]
                 rotations = np.stack([turn(index).as_quat() for turn in turns], axis=1)
                 pelvis = np.stack([np.interp(index, given, axis) for axis in pelvis.T], axis=1)
-            yield Motion(self.rest, index, rotations, pelvis, filled=~np.isin(index, given))
+            yield SkinnedMotion(self.rest, index, rotations, pelvis, filled=~np.isin(index, given))
 
 
-def motion_of(take: Take, person: int, arrays: SmplArrays, axes: Array) -> Motion | None:
+def motion_of(take: Take, person: int, arrays: SmplArrays, axes: Array) -> SkinnedMotion | None:
     """The body of one person in the world rotated by `axes` (3, 3); None for a person without a
     body.
     """
@@ -123,7 +123,7 @@ def motion_of(take: Take, person: int, arrays: SmplArrays, axes: Array) -> Motio
     turned[:, 0] = axes @ turned[:, 0]
     quaternions = np.roll(quaternion(turned), -1, axis=-1)
     pelvis = (own[:, 0] + transl) @ axes.T
-    motion = Motion(RestBody(arrays, betas.mean(axis=0)), index, quaternions, pelvis)
+    motion = SkinnedMotion(RestBody(arrays, betas.mean(axis=0)), index, quaternions, pelvis)
     if (betas == betas[0]).all():
         return motion
     apart = np.linalg.norm(
@@ -134,7 +134,7 @@ def motion_of(take: Take, person: int, arrays: SmplArrays, axes: Array) -> Motio
 
 def everybody(
     job: Job, take: Take, kind: str, axes: Array, written: Written
-) -> Iterator[tuple[int, Motion]]:
+) -> Iterator[tuple[int, SkinnedMotion]]:
     """All people with a body, with their motions in the world rotated by `axes` (3, 3).
 
     People without a body, or with several shapes, are noted in `written`.
@@ -155,7 +155,7 @@ def everybody(
 
 def all_segments(
     job: Job, kind: str, axes: Array, written: Written
-) -> Iterator[tuple[Path, Motion, Take]]:
+) -> Iterator[tuple[Path, SkinnedMotion, Take]]:
     """All motions at a constant rate, split at long gaps: path without suffix, motion, and take of
     its frames.
     """

@@ -24,8 +24,8 @@ from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.simulation.training.differentiable import TrainedNetwork
 from shapepose_fg.simulation.training.motions import Motions
 from shapepose_fg.simulation.training.train import (
+    FitterScore,
     PeopleSource,
-    Score,
     Trainer,
     TrainingConfig,
     calibrated,
@@ -43,7 +43,7 @@ def adapted(
     config: TrainingConfig,
     card: Mapping[str, str],
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> tuple[FitterWeights, dict[str, Score]]:
+) -> tuple[FitterWeights, dict[str, FitterScore]]:
     """Train the package's weights on `motions` for `body`; also returns scores of these and of the
     plain optimiser on `unseen` motions.
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from shapepose_fg.body.fitting.descent import STEP, BodyState, NetworkInputs
+from shapepose_fg.body.fitting.descent import STEP, DescentState, NetworkInputs
 from shapepose_fg.body.fitting.network import (
     NUM_PARAMETERS,
     NUM_ROTATIONS,
@@ -99,7 +99,7 @@ class DescentTargets:
 
 @dataclass(frozen=True)
 class State:
-    """A `BodyState` of tensors."""
+    """A `DescentState` of tensors."""
 
     betas: Tensor
     """(B, 10) shape."""
@@ -118,7 +118,7 @@ def unroll(
     xyz, information = (value.double().numpy() for value in (targets.xyz, targets.information))
     scale = network.gradient_scale.cpu().numpy()
     for step in range(network.config.steps):
-        plain = BodyState(*(value.detach().double().numpy() for value in vars(state).values()))
+        plain = DescentState(*(value.detach().double().numpy() for value in vars(state).values()))
         change = STEP * network(torch.from_numpy(see(plain, xyz, information, scale)), step)
         turned = _six_d(state.local[:, :NUM_ROTATIONS]) + change[:, 10:-3].unflatten(
             1, (NUM_ROTATIONS, 6)

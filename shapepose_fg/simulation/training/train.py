@@ -81,7 +81,7 @@ class TrainingConfig:
 
 
 @dataclass(frozen=True)
-class People:
+class TrainingBodies:
     """True bodies, upright, without a camera: pelvis at the origin, any heading."""
 
     state: State
@@ -101,7 +101,7 @@ class PeopleSource:
         self._weight = torch.from_numpy(motions.weight).double().cumsum(0)
         self._mirror = torch.tensor(MIRROR_JOINTS)
 
-    def draw(self, count: int, generator: torch.Generator) -> People:
+    def draw(self, count: int, generator: torch.Generator) -> TrainingBodies:
         """Sample `count` people."""
         pose = self._pose(count, generator)
         other = self._pose(count, generator)
@@ -115,7 +115,7 @@ class PeopleSource:
         betas = torch.randn(count, 10, generator=generator).clamp(-3, 3)
         local = _tensor(exp_so3(pose.numpy()) @ exp_so3(shake.numpy()))
         state = State(betas, local, _tensor(self._frame.transl).expand(count, 3))
-        return People(state, positions(self.model.points, state))
+        return TrainingBodies(state, positions(self.model.points, state))
 
     def _pose(self, count: int, generator: torch.Generator) -> Tensor:
         """(count, 24, 3) axis-angle poses, half of them mirrored."""
@@ -206,7 +206,7 @@ def _learning_rate(config: TrainingConfig, iteration: int) -> float:
 
 @torch.no_grad()
 def prepared(
-    people: People, frame: PersonFrame, config: TrainingConfig, generator: torch.Generator
+    people: TrainingBodies, frame: PersonFrame, config: TrainingConfig, generator: torch.Generator
 ) -> tuple[DescentTargets, State, State, Tensor]:
     """Corrupted targets, initial state, true state and true points, all in the person's estimated
     frame.
@@ -323,7 +323,7 @@ def _corrupted(
 
 
 @dataclass(frozen=True)
-class Score:
+class FitterScore:
     """Scores of a fitter."""
 
     joints_mm: float
@@ -334,7 +334,7 @@ class Score:
 
 def compared(
     fitters: Mapping[str, BodyFitter], source: PeopleSource, count: int = 512
-) -> dict[str, Score]:
+) -> dict[str, FitterScore]:
     """Scores of `fitters` for BODY_25's joints on the same people, over the rows that all of them
     fit.
     """
@@ -348,4 +348,6 @@ def compared(
         )
         spent[name] = 1000 * (time.process_time() - begin) / count
     done = np.isfinite(list(error.values())).all(axis=0)
-    return {name: Score(float(each[done].mean()), spent[name]) for name, each in error.items()}
+    return {
+        name: FitterScore(float(each[done].mean()), spent[name]) for name, each in error.items()
+    }

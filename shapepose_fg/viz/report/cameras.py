@@ -18,7 +18,7 @@ from shapepose_fg.core.world_axes import z_up
 from shapepose_fg.io.export.take import Take
 from shapepose_fg.viz.report.figures import Residual
 from shapepose_fg.viz.report.page import filled
-from shapepose_fg.viz.report.scene import Scene, camera_of, scene_of
+from shapepose_fg.viz.report.scene import PageScene, scene_camera, scene_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,7 +69,7 @@ class CameraPage:
         )
         write_atomically(file, lambda stream: stream.write(text.encode("utf-8", "replace")))
 
-    def _scene(self) -> Scene | None:
+    def _scene(self) -> PageScene | None:
         if not np.isfinite(self.points).all(axis=-1).any():
             return None
         P, J = self.points.shape[:2]
@@ -94,5 +94,5 @@ class CameraPage:
         scene = scene_of(Take.of(people, up, rig=self.rig), None, 4_000_000)
         if self.before is None:
             return scene
-        before = [camera_of(each, z_up(up)) for each in self.before.cameras]
+        before = [scene_camera(each, z_up(up)) for each in self.before.cameras]
         return replace(scene, data=scene.data | {"before": before})

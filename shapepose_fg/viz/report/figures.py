@@ -80,7 +80,7 @@ class Curve:
 
 
 @dataclass(frozen=True)
-class CameraFigures:
+class CameraStatistics:
     """Statistics of one camera's detections."""
 
     name: str
@@ -106,7 +106,7 @@ class CameraFigures:
     have it."""
 
 
-def camera_figures(people: Reconstruction) -> list[CameraFigures]:
+def camera_figures(people: Reconstruction) -> list[CameraStatistics]:
     """One entry for each camera; empty if the result has no observations."""
     table = people.observations
     if table is None:
@@ -118,7 +118,7 @@ def camera_figures(people: Reconstruction) -> list[CameraFigures]:
         gate, error = table.gate[..., view], px[..., view]
         more = told.get(name, CameraEntry())
         made.append(
-            CameraFigures(
+            CameraStatistics(
                 name,
                 int((gate != Gate.NOT_SEEN).sum()),
                 {each: int((gate == each).sum()) for each in Gate if each != Gate.NOT_SEEN},

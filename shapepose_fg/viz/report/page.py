@@ -15,7 +15,7 @@ from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.results.track_summary import TrackSummary
 from shapepose_fg.viz.report.facts import told_by
 from shapepose_fg.viz.report.figures import KINDS, Curve, camera_figures, known_counts, overall
-from shapepose_fg.viz.report.scene import Scene
+from shapepose_fg.viz.report.scene import PageScene
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -28,7 +28,7 @@ def page_text(
     title: str,
     people: Reconstruction,
     tracks: Sequence[TrackSummary],
-    scene: Scene | None,
+    scene: PageScene | None,
     remarks: Sequence[str],
     curves: Mapping[int, Sequence[Curve]],
 ) -> str:
@@ -63,7 +63,7 @@ def page_text(
     )
 
 
-def filled(name: str, scene: Scene | None, **values: object) -> str:
+def filled(name: str, scene: PageScene | None, **values: object) -> str:
     """Fill in one of the pages in data/, and embed the `scene` and everything that the page needs.
 
     Texts of the input are escaped, and the page's Content-Security-Policy forbids all scripts

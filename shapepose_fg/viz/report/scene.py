@@ -28,7 +28,7 @@ its 12,488 vertices, which a page can draw in every frame."""
 
 
 @dataclass(frozen=True)
-class Scene:
+class PageScene:
     """What the 3D scene of a report page draws, and in which frames of the recording."""
 
     data: dict[str, Any]
@@ -41,7 +41,7 @@ class Scene:
     """Number of frames of the recording."""
 
 
-def scene_of(take: Take, arrays: SmplArrays | None, most_bytes: int) -> Scene:
+def scene_of(take: Take, arrays: SmplArrays | None, most_bytes: int) -> PageScene:
     """The scene with at most about `most_bytes`; if necessary, only every second, third ... frame
     is used.
 
@@ -81,13 +81,13 @@ def scene_of(take: Take, arrays: SmplArrays | None, most_bytes: int) -> Scene:
         "joint_names": take.people.joint_names.tolist(),
         "bones": bones_of(tuple(take.people.joint_names.tolist())).tolist(),
         "people": [{"id": int(who), "colour": PALETTE[who % len(PALETTE)]} for who in take.persons],
-        "cameras": [camera_of(camera, axes) for camera in cameras],
+        "cameras": [scene_camera(camera, axes) for camera in cameras],
         "floor": _floor(joints),
         "view": _view(joints, centres),
     }
     if arrays is not None:
         scene |= _bodies(take, arrays, axes, index[frame], person, pack)
-    return Scene(scene, every, len(index), len(take.frames))
+    return PageScene(scene, every, len(index), len(take.frames))
 
 
 @dataclass(frozen=True)
@@ -164,7 +164,7 @@ def _view(joints: Array, centres: Array) -> dict[str, Any]:
     return box | {"reach": max(reach, 1.0), "cameras": float(away)}
 
 
-def camera_of(camera: Camera, axes: Array) -> dict[str, Any]:
+def scene_camera(camera: Camera, axes: Array) -> dict[str, Any]:
     """A camera in the page's axes; the columns of `turn` are its right, down and forward axes."""
     width, height = camera.image_size
     return {

@@ -19,7 +19,7 @@ from shapepose_fg.io.export.take import Take
 from shapepose_fg.results.track_summary import list_tracks
 from shapepose_fg.viz.report.figures import Curve, angle_curves
 from shapepose_fg.viz.report.page import page_text
-from shapepose_fg.viz.report.scene import Scene, scene_of
+from shapepose_fg.viz.report.scene import PageScene, scene_of
 
 MOST_ROWS = 40_000
 """Maximum number of rows that check and report use, about 400 MB: of longer results, only every
@@ -56,7 +56,7 @@ def write_report(
         remarks.append(f"{CAMERAS} is missing: cameras are not drawn, and {up} is assumed to be up")
     else:
         up = rig.up
-    scene: Scene | None = None
+    scene: PageScene | None = None
     if len(people) > 0:
         if fps is None and not _timed(people):
             fps = ASSUMED_FPS

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import chi2
 
 from shapepose_fg.body.fitting.descent import (
-    BodyState,
+    DescentState,
     LearnedDescent,
     NetworkInputs,
     gradient_scale,
@@ -143,7 +143,7 @@ def test_training_and_fits_take_the_same_steps(frame):
     people, points = trainer.source.draw(20, generator), trainer.source.model.points
     targets, start, *_ = prepared(people, frame, SMALL, generator)
     given = (value.double().numpy() for value in (targets.xyz, targets.information))
-    plain = BodyState(*(value.double().numpy() for value in vars(start).values()))
+    plain = DescentState(*(value.double().numpy() for value in vars(start).values()))
     descent = LearnedDescent(points, ALL, trainer.network.finished(), SMALL.kernel_scale)
     inputs = NetworkInputs(points, ALL, SMALL.kernel_scale)
     ours = unroll(inputs, trainer.network.eval(), start, targets)
