@@ -10,8 +10,8 @@ from functools import cache
 import numpy as np
 
 from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.shipped_numbers import shipped_numbers
 from shapepose_fg.estimation.body_window import Marginals
-from shapepose_fg.estimation.noise_law import shipped_covariances
 
 USUAL_M = 0.01
 """Standard deviation of people whom all views see, metres."""
@@ -40,7 +40,7 @@ class Lasting:
     @cache
     def measured(cls) -> "Lasting":
         """The numbers that ship, measured by `scripts/fit_covariances.py`."""
-        return cls(**shipped_covariances()["lasting"])
+        return cls(**shipped_numbers("estimation", "covariances")["lasting"])
 
     def factor(self, share: Array | float, alone: Array | float) -> Array | float:
         """Factor on the variances of a window, for the share of errors that last, and how many
@@ -67,7 +67,7 @@ class Doubt:
     @cache
     def measured(cls) -> "Doubt":
         """The numbers that ship, measured by `scripts/fit_covariances.py`."""
-        return cls(**shipped_covariances()["doubt"])
+        return cls(**shipped_numbers("estimation", "covariances")["doubt"])
 
     def in_frames(self, sigma_m: Array, rejected: Array) -> Array:
         """(T,) factors on variances in single frames, which show less of who is who."""
