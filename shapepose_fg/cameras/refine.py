@@ -33,7 +33,7 @@ from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import FrameTimes
 
-_ROUNDS = 4
+ROUNDS = 4
 """Maximum number of rounds, each with people associated by the cameras of the round before."""
 _UNKNOWN = 0.8
 """Ratio of posterior to prior standard deviation above which a parameter is undetermined."""
@@ -151,11 +151,11 @@ def refine(
     fit = partial(
         settle,
         now=start,
-        rounds=_ROUNDS,
+        rounds=ROUNDS,
         given=start,
         times=times,
         freedom=freedom,
-        told=Steps(progress, 3 * _ROUNDS),
+        told=Steps(progress, 3 * ROUNDS),
         reference=reference,
     )
     found = fit(footage)

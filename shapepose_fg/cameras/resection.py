@@ -16,7 +16,7 @@ from shapepose_fg.cameras.sightings import (
     same_frame,
 )
 from shapepose_fg.core.arrays import Array, Index
-from shapepose_fg.core.camera import Views
+from shapepose_fg.core.camera import HALF_PIXEL, Views
 from shapepose_fg.core.decompositions import nearest_rotation
 from shapepose_fg.core.rows import Rows
 
@@ -24,7 +24,7 @@ _ROUNDS = 4
 """Number of rounds of matching and fitting."""
 _STEPS = 4
 """Number of steps between matchings."""
-CORNER = np.array([-0.5, -0.5])
+CORNER = -np.array([HALF_PIXEL, HALF_PIXEL])
 """Coordinates of a picture's corner, px; the origin is the centre of the first pixel."""
 
 

@@ -9,7 +9,8 @@ from shapepose_fg.core.arrays import Array
 from shapepose_fg.estimation.frame_graph import WindowGraph
 
 UNDETERMINED_M = 10.0
-"""Standard deviation, metres, above which a joint is undetermined, in its worst direction."""
+"""Standard deviation, metres, above which a joint is undetermined, in its worst direction; also
+that of weak priors on joints, since one behind its cameras would make a system singular."""
 
 
 def state_covariances(graphs: Sequence[WindowGraph]) -> list[Array]:

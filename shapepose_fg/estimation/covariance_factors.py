@@ -13,8 +13,6 @@ from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.shipped_numbers import shipped_numbers
 from shapepose_fg.estimation.body_window import Marginals
 
-USUAL_M = 0.01
-"""Standard deviation of people whom all views see, metres."""
 REJECTED = 0.1
 """Share of rejected evidence that means as much as a doubled variance."""
 _LASTS_S, _LASTS, _PRIOR_COUNT = 1.0, 0.4, 20.0
@@ -58,8 +56,8 @@ class Doubt:
     scale: float
     """Factor on all variances in single frames."""
     sigma: float
-    """Exponent of the mean standard deviation of a person's joints in a single frame, over
-    `USUAL_M`."""
+    """Exponent of the mean standard deviation of a person's joints in a single frame, in
+    centimetres."""
     rejected: float
     """Exponent of one plus the share of evidence that gates reject, over `REJECTED`."""
 
@@ -71,7 +69,7 @@ class Doubt:
 
     def in_frames(self, sigma_m: Array, rejected: Array) -> Array:
         """(T,) factors on variances in single frames, which show less of who is who."""
-        return self.scale * (sigma_m / USUAL_M) ** self.sigma * self.of_rejected(rejected)
+        return self.scale * (sigma_m / 1e-2) ** self.sigma * self.of_rejected(rejected)
 
     def of_rejected(self, rejected: Array) -> Array:
         """Factors on variances for shares of rejected evidence."""

@@ -21,6 +21,7 @@ from shapepose_fg.core.run_summary import covered_frames, has_identities
 from shapepose_fg.core.skeleton import SMPL_24
 from shapepose_fg.core.storage.files import MIDDLE, read_bytes, read_json
 from shapepose_fg.core.storage.npz import NpzFile, read_npz
+from shapepose_fg.core.trajectory import MOST_METRES
 from shapepose_fg.core.world_axes import z_up
 from shapepose_fg.evaluation.metrics import PlainPeople
 from shapepose_fg.evaluation.shelf import SHELF_JOINTS, read_shelf_ground_truth
@@ -31,8 +32,6 @@ _PANOPTIC = (
     "RKnee RAnkle LEye LEar REye REar"
 ).split()
 """Joint order of CMU Panoptic (`joints19`)."""
-_LARGEST = 1e6
-"""Limit of positions, m, and angles, rad; beyond it a file is damaged."""
 _SIZE_M = (0.1, 5.0)
 """Diagonal of the box around the joints of a person, m; another median means another unit."""
 _CELL, _FLOATS, _MATRIX, _COMPRESSED = 1, (6, 7), 14, 15
@@ -128,7 +127,7 @@ def _table(place: object, rows: list[tuple[int, int, Array]], names: tuple[str, 
     size = np.linalg.norm(box[np.isfinite(box).all(axis=1) & box.any(axis=1)], axis=1)
     median = float(np.median(size)) if len(size) > 0 else 1.0
     largest = np.abs(joints[~np.isnan(joints)]).max(initial=0)
-    if not (_SIZE_M[0] < median < _SIZE_M[1] and largest < _LARGEST):
+    if not (_SIZE_M[0] < median < _SIZE_M[1] and largest < MOST_METRES):
         raise InputError(
             f"{place}: joints must be metres, but people are {median:.3g} m large and up to "
             f"{largest:.3g} m from the origin; check the unit"
@@ -216,7 +215,7 @@ def _amass(files: list[Path], turn: Array, fps: float | None, body: Path | None)
             or (betas.ndim, rates.size) != (1, 1)
             or any(each.dtype.kind not in "fiu" for each in (poses, trans, betas, rates))
             or numbers.dtype.kind not in "iu"
-            or not all((np.abs(each) < _LARGEST).all() for each in (poses, trans, betas))
+            or not all((np.abs(each) < MOST_METRES).all() for each in (poses, trans, betas))
         ):
             raise InputError(
                 f"{file}: must hold finite poses (F, 66 or more), trans (F, 3) and betas (10 or "
