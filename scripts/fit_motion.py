@@ -31,6 +31,8 @@ FPS = 30.0
 """Frame rate of the recordings, Hz; others are passed over."""
 EDGES_M_S = (0.0, 0.1, 0.25, 0.5, 1.0, 1.5, 2.0, 3.0, 5.0)
 """Bounds between the ranges of speeds in which densities are averaged, m/s."""
+AROUND_S = 0.1
+"""Time before and after a step over which a speed is measured, s."""
 GAP = 6
 """Half the duration of a gap that motion bridges, frames."""
 LAG = 3
@@ -93,9 +95,11 @@ def _steps(joints: Array) -> tuple[Array, Array, Array]:
     that bridge gaps.
     """
     turned = 1.5 * np.square(np.diff(joints, 2, axis=0)).mean(axis=-1) * FPS**3
-    at = np.arange(1, len(joints) - 1)
-    first, last = np.maximum(at - 3, 0), np.minimum(at + 4, len(joints) - 1)
-    speed = np.linalg.norm(joints[last] - joints[first], axis=-1) * FPS / (last - first)[:, None]
+    times_s = np.arange(len(joints)) * (1 / FPS)
+    first = np.searchsorted(times_s, times_s[1:-1] - AROUND_S)
+    last = np.searchsorted(times_s, times_s[2:] + AROUND_S, side="right") - 1
+    speed = np.linalg.norm(joints[last] - joints[first], axis=-1)
+    speed /= (times_s[last] - times_s[first])[:, None]
     velocity, h = np.gradient(joints, 1 / FPS, axis=0), 2 * GAP / FPS
     start, end = slice(0, -2 * GAP), slice(2 * GAP, None)
     middle = (joints[start] + joints[end]) / 2 + h / 8 * (velocity[start] - velocity[end])
@@ -139,7 +143,7 @@ def foot_motion(clips: list[Array]) -> dict[str, list]:
             log_likelihood += likely
         sigma, first = np.sqrt(energy / count), count / count.sum()
         turns = both / both.sum(axis=1, keepdims=True)
-        if log_likelihood - before < 1e-4 * abs(log_likelihood):
+        if log_likelihood - before < 1e-6 * abs(log_likelihood):
             break
     leaves = 1 - np.diag(turns)
     found = FootMotion(

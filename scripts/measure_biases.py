@@ -12,13 +12,12 @@ import argparse
 from itertools import product
 from pathlib import Path
 
-from shapepose_fg.cameras.check.biases import COMMON
+from shapepose_fg.cameras.check.biases import COMMON, LEVELS
 from shapepose_fg.cameras.check.evidence import Look, gather
 from shapepose_fg.cameras.check.small_errors import Problem
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
 
-LEVELS = (0.0025, 0.005, 0.01, 0.02, 0.04)
 RATIOS = (0.3, 1.0, 3.0)
 """Standard deviations of shifts and scalings, relative to that of a joint's bias."""
 
@@ -34,10 +33,10 @@ def main() -> None:
     rig = read_rig(arguments.calibration, up=arguments.up)
     detections = read_detections(arguments.detections, rig)
     problem = Problem.of(Look.given(gather(detections, range(len(detections)), len(rig)), rig))
-    found = []
+    found, levels = [], [level / 2 for level in LEVELS]
     for shift, larger in product(RATIOS, RATIOS):
-        marginals = problem.residuals.marginals(problem.given, LEVELS, shift, larger, COMMON)
-        for (level, common), each in zip(product(LEVELS, COMMON), marginals, strict=True):
+        marginals = problem.residuals.marginals(problem.given, levels, shift, larger, COMMON)
+        for (level, common), each in zip(product(levels, COMMON), marginals, strict=True):
             found.append((each.log, level, shift * level, larger * level, common * level))
     best = max(found)[0]
     print("log likelihood  joint  shift  enlargement  common")

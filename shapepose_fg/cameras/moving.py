@@ -18,7 +18,7 @@ from scipy.special import gammaincinv
 from shapepose_fg.body.model.rotation import hat
 from shapepose_fg.cameras.bundle import Adjusted, Freedom, Undetermined, dilution
 from shapepose_fg.cameras.parameters import POSE, Q, by_parameters, placing, seen_by
-from shapepose_fg.cameras.people import MIN_DEPTH_M, Footage, People
+from shapepose_fg.cameras.people import Footage, People
 from shapepose_fg.cameras.relative_pose import LOOK_S
 from shapepose_fg.cameras.sightings import Sightings, follow, median_of
 from shapepose_fg.cameras.synchronise import WHOLE_S
@@ -29,6 +29,7 @@ from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.trajectory import Trajectory
 from shapepose_fg.estimation.alternation_covariances import UNDETERMINED_M
+from shapepose_fg.estimation.gated_views import MIN_DEPTH_M
 from shapepose_fg.estimation.trajectory_graph import correlated
 
 _LEAST_S, _LEAST_WAY_M = 4.0, 0.4

@@ -25,6 +25,7 @@ from shapepose_fg.cameras.check.findings import SURE, Finding, Kind
 from shapepose_fg.cameras.check.small_errors import Problem
 from shapepose_fg.cameras.parameters import CENTRE, FOCAL, MOVE, TURN, Q, difference
 from shapepose_fg.cameras.people import LEAST_PEOPLE, Footage, missed_px
+from shapepose_fg.cameras.resection import ROUNDS
 from shapepose_fg.cameras.stature import build_of
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig, Views
@@ -33,8 +34,6 @@ from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import FrameTimes
 
-ROUNDS = 4
-"""Maximum number of rounds, each with people associated by the cameras of the round before."""
 _UNKNOWN = 0.8
 """Ratio of posterior to prior standard deviation above which a parameter is undetermined."""
 

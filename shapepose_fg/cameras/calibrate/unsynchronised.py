@@ -15,7 +15,7 @@ from shapepose_fg.cameras.calibrate.from_people import (
 )
 from shapepose_fg.cameras.calibrate.levelling import Measured
 from shapepose_fg.cameras.offsets.from_heights import offsets_without_poses
-from shapepose_fg.cameras.refine import ROUNDS
+from shapepose_fg.cameras.resection import ROUNDS
 from shapepose_fg.cameras.sightings import Sightings
 from shapepose_fg.cameras.synchronise import WHOLE_S, Synchronised, offsets
 from shapepose_fg.cameras.tracks import at_regular_times, next_of, on_one_clock
