@@ -39,6 +39,8 @@ LAG = 3
 """Frames between two velocities of a foot that have no position in common."""
 START_M_S = (0.03, 0.15, 1.0)
 """Standard deviations of speeds in the three states before the first iteration, m/s."""
+ROUNDS = 40
+"""Number of iterations of expectation maximisation."""
 
 
 def main() -> None:
@@ -125,14 +127,13 @@ def foot_motion(clips: list[Array]) -> dict[str, list]:
     feet = feet_of(BODY_25.joints)
     seen = [(joints[2:] - joints[:-2])[:, feet] * FPS / 2 for joints in clips]
     K, sigma = len(START_M_S), np.array(START_M_S)
-    first, turns, log_likelihood = np.full(K, 1 / K), 0.02 + (1 - 0.02 * K) * np.eye(K), -np.inf
-    while True:
+    first, turns = np.full(K, 1 / K), 0.02 + (1 - 0.02 * K) * np.eye(K)
+    for _ in range(ROUNDS):
         energy, count, both, pairs, together = (np.zeros(n) for n in (K, K, (K, K), K, K))
-        before, log_likelihood = log_likelihood, 0.0
         for velocity in seen:
             squared = np.square(velocity).sum(axis=-1)[..., None]
             log = -3 * np.log(sigma) - 0.5 * squared / sigma**2
-            share, step, likely = _expected(log, first, turns)
+            share, step = _expected(log, first, turns)
             stays = share[:-LAG] * share[LAG:]
             product = (velocity[:-LAG] * velocity[LAG:]).sum(axis=-1)[..., None]
             energy += (share * squared).sum(axis=(0, 1)) / 3
@@ -140,36 +141,33 @@ def foot_motion(clips: list[Array]) -> dict[str, list]:
             count, both, together = (
                 count + share.sum(axis=(0, 1)), both + step, together + stays.sum(axis=(0, 1))
             )  # fmt: skip
-            log_likelihood += likely
         sigma, first = np.sqrt(energy / count), count / count.sum()
         turns = both / both.sum(axis=1, keepdims=True)
-        if log_likelihood - before < 1e-6 * abs(log_likelihood):
-            break
     leaves = 1 - np.diag(turns)
+    correlation = np.clip(pairs / together / sigma**2, 1e-3, 0.999)
     found = FootMotion(
-        speed_m_s=sigma.round(3),
-        lasts_s=(1 / (FPS * leaves)).round(2),
-        first=first.round(2),
-        turns=(np.where(np.eye(K), 0.0, turns) / leaves[:, None]).round(2),
-        correlation_s=(
-            -LAG / FPS / np.log(np.clip(pairs / together / sigma**2, 1e-3, 0.999))
-        ).round(2),
+        speed_m_s=sigma,
+        lasts_s=1 / (FPS * leaves),
+        first=first,
+        turns=np.where(np.eye(K), 0.0, turns) / leaves[:, None],
+        correlation_s=-LAG / FPS / np.log(correlation),
     )
-    return {name: each.tolist() for name, each in vars(found).items()}
+    return {
+        name: each.round(3 if name == "speed_m_s" else 2).tolist()
+        for name, each in vars(found).items()
+    }
 
 
-def _expected(log: Array, first: Array, turns: Array) -> tuple[Array, Array, float]:
-    """(T, C, K) probabilities of the states, (K, K) numbers of transitions, and the log-likelihood
-    of C sequences with log-densities `log` (T, C, K).
+def _expected(log: Array, first: Array, turns: Array) -> tuple[Array, Array]:
+    """(T, C, K) probabilities of the states, and (K, K) numbers of transitions, of C sequences
+    with log-densities `log` (T, C, K).
     """
-    highest = log.max(axis=-1, keepdims=True)
-    seen = np.exp(log - highest)
-    forward, backward, scale = np.empty_like(seen), np.ones_like(seen), highest.copy()
+    seen = np.exp(log - log.max(axis=-1, keepdims=True))
+    forward, backward = np.empty_like(seen), np.ones_like(seen)
     prediction = np.broadcast_to(first, seen[0].shape)
     for t, here in enumerate(seen):
         joint = prediction * here
-        total = joint.sum(axis=1, keepdims=True)
-        forward[t], scale[t] = joint / total, scale[t] + np.log(total)
+        forward[t] = joint / joint.sum(axis=1, keepdims=True)
         prediction = forward[t] @ turns
     for t in range(len(seen) - 2, -1, -1):
         later = (seen[t + 1] * backward[t + 1]) @ turns.T
@@ -177,7 +175,7 @@ def _expected(log: Array, first: Array, turns: Array) -> tuple[Array, Array, flo
     share = forward * backward
     step = forward[:-1, :, :, None] * turns * (seen[1:] * backward[1:])[:, :, None]
     step /= step.sum(axis=(2, 3), keepdims=True)
-    return share / share.sum(axis=2, keepdims=True), step.sum(axis=(0, 1)), float(scale.sum())
+    return share / share.sum(axis=2, keepdims=True), step.sum(axis=(0, 1))
 
 
 if __name__ == "__main__":

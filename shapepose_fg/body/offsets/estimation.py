@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shapepose_fg.body.fitting.energy import BATCH, BodyEnergy, EnergyTargets, robust_weight
+from shapepose_fg.body.fitting.energy import BodyEnergy, EnergyTargets, robust_weight
 from shapepose_fg.body.fitting.evidence import Evidence, weigh
 from shapepose_fg.body.fitting.fitter import BodyConfig, BodyFit, JointTargets
 from shapepose_fg.body.fitting.fitters import SmplFitter
@@ -33,6 +33,8 @@ from shapepose_fg.core.arrays import Array, Real
 from shapepose_fg.core.bounds import Metres, Settings
 from shapepose_fg.core.skeleton import BODY_25
 
+_CHUNK = 128
+"""Number of rows per batch of linearisations."""
 _POSE_WIDENING = 3.0
 """Factor on the standard deviations of the pose prior for this estimation. No prior has the exact
 distribution of poses, and its error would look like an offset, the same in hundreds of rows."""
@@ -98,8 +100,8 @@ def _solved(
         np.zeros(size),
         np.zeros((size - 75, size - 75)),
     )
-    for start in range(0, len(rows), BATCH):
-        part = rows[start : start + BATCH]
+    for start in range(0, len(rows), _CHUNK):
+        part = rows[start : start + _CHUNK]
         centred = evidence.xyz[part] - evidence.centre[part, None]
         seen = EnergyTargets(centred, evidence.information[part])
         here = _eliminate(
