@@ -123,11 +123,16 @@ def _by_speed(density: Array, speed: Array) -> tuple[float, float]:
 
 
 def foot_motion(clips: list[Array]) -> dict[str, list]:
-    """The fields of `FootMotion`; each joint of a foot is a sequence of its own."""
+    """The fields of `FootMotion`, from clips of at least a second; each joint of a foot is a
+    sequence of its own.
+    """
     feet = feet_of(BODY_25.joints)
-    seen = [(joints[2:] - joints[:-2])[:, feet] * FPS / 2 for joints in clips]
+    long = (joints[:, feet] for joints in clips if len(joints) >= FPS)
+    long = (joints[:, feet] for joints in clips if len(joints) >= FPS)
+    seen = [(joints[2:] - joints[:-2]) * FPS / 2 for joints in long]
     K, sigma = len(START_M_S), np.array(START_M_S)
     first, turns = np.full(K, 1 / K), 0.02 + (1 - 0.02 * K) * np.eye(K)
+    correlation = np.zeros(K)
     for _ in range(ROUNDS):
         energy, count, both, pairs, together = (np.zeros(n) for n in (K, K, (K, K), K, K))
         for velocity in seen:
@@ -143,19 +148,17 @@ def foot_motion(clips: list[Array]) -> dict[str, list]:
             )  # fmt: skip
         sigma, first = np.sqrt(energy / count), count / count.sum()
         turns = both / both.sum(axis=1, keepdims=True)
+        correlation = np.clip(pairs / together / sigma**2, 1e-3, 0.999)
     leaves = 1 - np.diag(turns)
-    correlation = np.clip(pairs / together / sigma**2, 1e-3, 0.999)
     found = FootMotion(
-        speed_m_s=sigma,
+        speed_m_s=np.array([float(f"{each:.3g}") for each in sigma]),
         lasts_s=1 / (FPS * leaves),
         first=first,
         turns=np.where(np.eye(K), 0.0, turns) / leaves[:, None],
         correlation_s=-LAG / FPS / np.log(correlation),
     )
-    return {
-        name: each.round(3 if name == "speed_m_s" else 2).tolist()
-        for name, each in vars(found).items()
-    }
+    digits = {"speed_m_s": 3}
+    return {name: each.round(digits.get(name, 2)).tolist() for name, each in vars(found).items()}
 
 
 def _expected(log: Array, first: Array, turns: Array) -> tuple[Array, Array]:
