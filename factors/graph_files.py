@@ -397,7 +397,9 @@ def _array(numbers: Any, shape: tuple[int, ...]) -> Array:
         shape = (min(found.size, _LARGEST_VECTOR),)
     # Maximum absolute value of a number in a file.
     if found.shape != shape or not (np.abs(found) <= 1e15).all():
-        raise ValueError(f"numbers must be finite and of the shape {shape}, got {found.shape}")
+        raise ValueError(
+            f"numbers must be finite and have the shape {shape}, got the shape {found.shape}"
+        )
     return found
 
 

@@ -152,8 +152,8 @@ def isotropic_models(
 
 
 def check_covariances(covariances: NDArray[np.float64]) -> None:
-    """ValueError unless every one of `covariances` (D, N, N) is finite, symmetric and positive
-    definite.
+    """Raise ValueError unless every one of `covariances` (D, N, N) is finite, symmetric and
+    positive definite.
     """
     if covariances.ndim != 3 or covariances.shape[1] != covariances.shape[2]:
         raise ValueError(f"covariances must be square matrices (D, N, N), got {covariances.shape}")

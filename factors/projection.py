@@ -37,7 +37,7 @@ def make_calibration(K: ArrayLike) -> gtsam.Cal3_S2:
     """Make GTSAM's calibration from the intrinsic matrix `K` (3, 3), pixels."""
     matrix = np.asarray(K, dtype=np.float64)
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
-        raise ValueError(f"K must be a finite (3, 3) matrix, got {matrix.shape}")
+        raise ValueError(f"K must be a (3, 3) matrix of finite numbers, got {matrix.tolist()}")
     return gtsam.Cal3_S2(matrix[0, 0], matrix[1, 1], matrix[0, 1], matrix[0, 2], matrix[1, 2])
 
 

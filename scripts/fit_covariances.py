@@ -1,7 +1,7 @@
-"""Fit how much larger covariances are than those of the graph (`Doubt` and `Lasting` of
-`estimation/covariance_factors.py`) to the errors in simulated recordings, and the tails of these
-errors (`error_tails` of `estimation/uncertainty.py`), and average the noise laws learnt from them
-(`estimation/noise_law.py`).
+"""Fit the ratio of reported covariances to those of the graph (`AssociationUncertainty` and
+`CorrelatedErrors` of `estimation/reported_covariances.py`) to the errors in simulated recordings,
+and the tails of these errors (`error_tails` of `results/uncertainty.py`), and average the noise
+laws learnt from them (`estimation/noise_law.py`).
 
     python scripts/fit_covariances.py --mocap cmu_smpl24.npz --output covariances.json
 
@@ -34,14 +34,14 @@ from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.estimation import body_solution
 from shapepose_fg.estimation.body_window import Marginals
-from shapepose_fg.estimation.covariance_factors import (
-    Doubt,
-    Lasting,
-    covariance_factors,
-    signs_of_doubt,
-    signs_of_lasting,
-)
 from shapepose_fg.estimation.noise_law import NoiseLaw
+from shapepose_fg.estimation.reported_covariances import (
+    AssociationUncertainty,
+    CorrelatedErrors,
+    association_features,
+    correlation_features,
+    covariance_factors,
+)
 from shapepose_fg.evaluation.metrics import Matches, match_people
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.pipeline import reconstruct
@@ -65,8 +65,9 @@ FRAMES, FPS, NEW = 120, 30.0, 9
 FAR = 30.0
 """Squared Mahalanobis distance beyond which the loss grows only logarithmically."""
 REJECTED_POWER = 1.5
-"""`Doubt.rejected`. It is not fitted: simulated people say 3.4, with which regions of recorded
-people (MVOR) are far too wide, since real detectors have more guesses that gates reject."""
+"""`AssociationUncertainty.rejected`. It is not fitted: 3.4 fits simulated people, but then regions
+of recorded people (MVOR) are far too wide, since real detectors have more guesses that gates
+reject."""
 SHARES = (0.7, 1.0)
 """Shares in the log score of joints that are seen by one view, and by two or more."""
 
@@ -90,15 +91,15 @@ def main() -> None:
         windows += (errors_over_time(each, scene.keypoints) for each in solved)
     new = [part for seed in range(NEW) for part in new_errors(seed)]
     columns = [np.concatenate(column) for column in zip(*frames, strict=True)]
-    doubt = fitted(*columns)
-    lasting = fitted_over_time(windows, new, doubt)
+    association = fitted(*columns)
+    correlated = fitted_over_time(windows, new, association)
     content = {
         "about": f"scripts/fit_covariances.py: {len(columns[0])} joints of simulated people in "
         f"single frames, {sum(len(squared) for squared, *_ in windows)} over time",
         "noise": mean_law(laws),
-        "doubt": asdict(doubt),
-        "lasting": asdict(lasting),
-        "tails": tails_of([part for part, _ in widened(windows, lasting, doubt)]),
+        "association_uncertainty": asdict(association),
+        "correlated_errors": asdict(correlated),
+        "tails": tails_of([part for part, _ in widened(windows, correlated, association)]),
     }
     arguments.output.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
@@ -156,12 +157,12 @@ def squared_errors(marginals: Marginals, truth: np.ndarray) -> tuple[Matches, np
 
 
 def errors_in_frames(marginals: Marginals, truth: np.ndarray) -> Columns:
-    """For joints that views see: squared distance, number of views, and the person's signs of
-    doubt.
+    """For joints that views see: squared distance, number of views, and the person's
+    `association_features`.
     """
     found, squared = squared_errors(marginals, truth)
     views = marginals.window.last.evidence.inlier[found.row].sum(axis=-1)
-    sigma_m, told, used = signs_of_doubt(marginals)
+    sigma_m, told, used = association_features(marginals)
     rejected = 1 - used / np.maximum(told, 1e-9)
     signs = (np.repeat(each[found.row, None], 25, 1) for each in (sigma_m, rejected))
     seen = views > 0
@@ -170,13 +171,13 @@ def errors_in_frames(marginals: Marginals, truth: np.ndarray) -> Columns:
 
 def errors_over_time(marginals: Marginals, truth: np.ndarray) -> Columns:
     """For joints that views see: squared distances; for the window: share of rejected evidence, and
-    signs of lasting errors.
+    `correlation_features`.
     """
     found, squared = squared_errors(marginals, truth)
     seen = marginals.window.last.evidence.inlier[found.row].any(axis=-1)
-    _, told, used = signs_of_doubt(marginals)
+    _, told, used = association_features(marginals)
     rejected = 1 - used.sum() / max(told.sum(), 1e-9)
-    return squared[seen], rejected, *map(np.array, signs_of_lasting(marginals))
+    return squared[seen], rejected, *map(np.array, correlation_features(marginals))
 
 
 def new_errors(seed: int) -> Iterator[Columns]:
@@ -194,24 +195,27 @@ def new_errors(seed: int) -> Iterator[Columns]:
 
 def fitted(
     squared: np.ndarray, views: np.ndarray, sigma_m: np.ndarray, rejected: np.ndarray
-) -> Doubt:
+) -> AssociationUncertainty:
     """The numbers of least loss, scaled for 95 %."""
     share = np.where(views > 1, SHARES[1] / (views > 1).sum(), SHARES[0] / (views == 1).sum())
 
     def loss(numbers: np.ndarray) -> float:
-        factor = Doubt(np.exp(numbers[0]), numbers[1], REJECTED_POWER).in_frames(sigma_m, rejected)
+        model = AssociationUncertainty(np.exp(numbers[0]), numbers[1], REJECTED_POWER)
+        factor = model.in_frames(sigma_m, rejected)
         return float((share * (limited(squared / factor) + 3 * np.log(factor))).sum())
 
     numbers = minimize(loss, (0.0, 1.0), method="Nelder-Mead").x
     power = float(numbers[1])
-    off = squared / Doubt(1.0, power, REJECTED_POWER).in_frames(sigma_m, rejected)
+    off = squared / AssociationUncertainty(1.0, power, REJECTED_POWER).in_frames(sigma_m, rejected)
     order = np.argsort(off, kind="stable")
     at = np.searchsorted(np.cumsum(share[order]) / share.sum(), 0.95)
     scale = off[order][at] / chi2.ppf(0.95, 3)
-    return Doubt(round(float(scale), 2), round(power, 2), REJECTED_POWER)
+    return AssociationUncertainty(round(float(scale), 2), round(power, 2), REJECTED_POWER)
 
 
-def fitted_over_time(windows: list[Columns], new: list[Columns], doubt: Doubt) -> Lasting:
+def fitted_over_time(
+    windows: list[Columns], new: list[Columns], association: AssociationUncertainty
+) -> CorrelatedErrors:
     """The numbers of least loss over windows of recordings and of people with new errors, half
     each, scaled for 95 % of the joints in recordings.
     """
@@ -219,24 +223,24 @@ def fitted_over_time(windows: list[Columns], new: list[Columns], doubt: Doubt) -
     def loss(numbers: np.ndarray) -> float:
         total = 0.0
         for parts in (windows, new):
-            each = widened(parts, Lasting(*np.exp(numbers)), doubt)
+            each = widened(parts, CorrelatedErrors(*np.exp(numbers)), association)
             each = [(limited(part) + 3 * np.log(by)).sum() for part, by in each]
             total += sum(each) / sum(len(squared) for squared, *_ in parts)
         return total
 
     numbers = minimize(loss, (0.0, 0.0), method="Nelder-Mead").x
-    best = Lasting(*np.exp(numbers))
-    every = np.concatenate([part for part, _ in widened(windows, best, doubt)])
+    best = CorrelatedErrors(*np.exp(numbers))
+    every = np.concatenate([part for part, _ in widened(windows, best, association)])
     scale = np.quantile(every, 0.95) / chi2.ppf(0.95, 3)
-    return Lasting(*np.round(np.exp(numbers) * scale, 2).tolist())
+    return CorrelatedErrors(*np.round(np.exp(numbers) * scale, 2).tolist())
 
 
 def widened(
-    parts: list[Columns], lasting: Lasting, doubt: Doubt
+    parts: list[Columns], correlated: CorrelatedErrors, association: AssociationUncertainty
 ) -> Iterator[tuple[np.ndarray, float]]:
     """Squared distances by window, under the widened covariances, and the factor."""
-    for squared, rejected, share, alone in parts:
-        factor = lasting.factor(share, alone) * doubt.of_rejected(rejected)
+    for squared, rejected, share, ratio in parts:
+        factor = correlated.factor(share, ratio) * association.of_rejected(rejected)
         yield squared / factor, float(factor)
 
 

@@ -6,7 +6,7 @@ from drawing import COLOURS, save
 
 from shapepose_fg import reconstruct
 from shapepose_fg.core.frame_times import FrameTimes
-from shapepose_fg.estimation.uncertainty import distances
+from shapepose_fg.results.uncertainty import distances
 from shapepose_fg.simulation import built_in_scene, simulate
 
 scene = built_in_scene(people=3, frames=60)

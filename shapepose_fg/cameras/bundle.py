@@ -25,7 +25,7 @@ from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.decompositions import nearest_rotation, rotation_angle
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import FrameTimes
-from shapepose_fg.estimation.alternation_covariances import UNDETERMINED_M
+from shapepose_fg.estimation.frame_graph import UNDETERMINED_M
 from shapepose_fg.estimation.trajectory_graph import correlated, optimised
 
 LENS = [9, 10, 11, 12]

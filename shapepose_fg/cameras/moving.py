@@ -28,7 +28,7 @@ from shapepose_fg.core.decompositions import nearest_rotation, rigid, rotation_a
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.trajectory import Trajectory
-from shapepose_fg.estimation.alternation_covariances import UNDETERMINED_M
+from shapepose_fg.estimation.frame_graph import UNDETERMINED_M
 from shapepose_fg.estimation.gated_views import MIN_DEPTH_M
 from shapepose_fg.estimation.trajectory_graph import correlated
 

@@ -155,7 +155,8 @@ class Pairs:
     frame: Index
     """(M,) frame of each."""
     third: Index
-    """(M, V) sighting of every other camera nearest to the person's projection; -1 for none."""
+    """(M, V) for each other camera, the sighting nearest to the person's projection; -1 for
+    none."""
     third_error: Array
     """(M, V) median distance of the sighting in `third`, as a share of its size; inf for none."""
 

@@ -162,7 +162,7 @@ class RunOptions:
     )
 
     def check(self) -> None:
-        """InputError if options contradict each other."""
+        """Raise InputError if options contradict each other."""
         if self.workers is not None and self.cluster not in (None, "local"):
             raise InputError(
                 f"--workers and --cluster {self.cluster}: processes are either of this machine "
@@ -408,7 +408,9 @@ def next_reconstruct(options: Mapping[str, object]) -> str:
 
 
 def refuse_missing(places: Mapping[str, Path | None]) -> None:
-    """InputError if one of the options, by name, has no value from the user or from a project."""
+    """Raise InputError if one of the options, by name, has no value from the user or from a
+    project.
+    """
     missing = [name for name, place in places.items() if place is None]
     if missing:
         listed = " and ".join(

@@ -180,7 +180,7 @@ class Rig:
     def __post_init__(self) -> None:
         names = [camera.name for camera in self.cameras]
         if len(names) == 0:
-            raise ValueError("a rig needs a camera")
+            raise ValueError("a rig must have at least one camera")
         if len(set(names)) != len(names):
             raise ValueError(f"camera names must differ, got {names}")
         if self.up not in ("x", "-x", "y", "-y", "z", "-z"):

@@ -65,7 +65,7 @@ def thinned(
     Returns indices (M,) of the vertices that remain, triangles (G, 3) of these, and for each vertex
     (N,) the one that represents it. The grid has cells of `cell_m`, metres, and starts at `corner`.
     In each cell, the vertex nearest to the mean represents all; triangles that become degenerate or
-    duplicate are removed. With `cell_m` 0 all remain.
+    duplicate are removed. With `cell_m` 0, all remain.
     """
     if cell_m <= 0:
         every = np.arange(len(vertices))

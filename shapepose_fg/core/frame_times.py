@@ -119,7 +119,7 @@ class FrameTimes:
         )
 
     def check(self, frames: int, views: int) -> None:
-        """ValueError if the shape is not that of a recording of `frames` frames and `views`
+        """Raise ValueError if the shape is not that of a recording of `frames` frames and `views`
         cameras.
         """
         if len(self) != frames:

@@ -185,8 +185,8 @@ class Reconstruction(Table):
         return replace(self, **columns, observations=table)
 
     def check_ranges(self) -> None:
-        """ValueError for impossible values, and for a joint or body that is marked as known but is
-        not.
+        """Raise ValueError for impossible values, and for a joint or body that is marked as known
+        but is not.
         """
         super().check_ranges()
         ok, known = self.status == Status.OK, self.known != Known.UNKNOWN
@@ -304,7 +304,7 @@ class OpenedReconstruction(ExitStack):
     """
 
     def __init__(self, path: Path) -> None:
-        """InputError if there is no result, or if its files are of two runs."""
+        """Open the result `path`; InputError if there is none, or if its files are of two runs."""
         file = path / PEOPLE if path.is_dir() else path
         table = file.with_name(OBSERVATIONS)
         self._observed: SavedTable[ObservationTable] | None = None
@@ -377,8 +377,8 @@ class OpenedReconstruction(ExitStack):
 
 
 def check_files(people: Path, observations: Path | None) -> None:
-    """InputError if these new files of a result, before they are moved to their places, cannot be
-    read.
+    """Raise InputError if these new files of a result, before they are moved to their places,
+    cannot be read.
     """
     with SavedTable(people, Reconstruction, _UNREADABLE) as rows, ExitStack() as opened:
         table = None if observations is None else ObservationTable.open(observations)

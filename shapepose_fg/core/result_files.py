@@ -1,5 +1,9 @@
 """The files of a result (people.npz, observations.npz and run.json): written together with a common
 id, and opened.
+
+A run also leaves cameras.json (`rig_file.py`), report.html (`viz/report/`), and, depending on the
+input, moments.csv and synchronised.csv (below). While it is unfinished, its windows are in a
+folder of parts (`pipeline/runs/`). docs/results.md describes all files.
 """
 
 import hashlib
@@ -116,7 +120,7 @@ def write_result(
 
 
 def check_id(people_id: object, other_id: object, file: Path) -> None:
-    """InputError if `file` is from another run than the people.npz beside it.
+    """Raise InputError if `file` is from another run than the people.npz beside it.
 
     An id is text, an array with this text, or None in files of earlier versions, which are accepted
     unchecked.
@@ -150,8 +154,8 @@ class SavedTable(ExitStack, Generic[T]):
     """An opened people.npz or observations.npz: a table of the class `kind`."""
 
     def __init__(self, file: Path, kind: type[T], cure: str) -> None:
-        """InputError, with the `cure`, if the file cannot be read, or if a required array is
-        missing.
+        """Open the table; InputError, with the `cure`, if the file cannot be read, or if a required
+        array is missing.
         """
         super().__init__()
         self.file, self.kind, self.cure = file, kind, cure
@@ -215,8 +219,8 @@ class SavedTable(ExitStack, Generic[T]):
 
 
 def check_memory(what: str, needed: int, options: str) -> None:
-    """InputError if more bytes of memory are `needed` than are free; `options` are the options that
-    select a part.
+    """Raise InputError if more bytes of memory are `needed` than are free; `options` are the
+    options that select a part.
     """
     import psutil
 

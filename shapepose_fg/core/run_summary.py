@@ -187,7 +187,7 @@ def has_identities(run: Mapping[str, Any]) -> bool:
 
 
 def check_frames(run: Mapping[str, Any]) -> None:
-    """ValueError if a run says that it covered frames of which there cannot be so many."""
+    """Raise ValueError if the number of frames that a run claims to cover is impossible."""
     spans = covered_frames(run) or []
     # The length of a range may be too large for `len`.
     count = sum(span.stop - span.start for span in spans)

@@ -14,8 +14,8 @@ LONGEST_NAME = 64
 
 
 def check_joint_names(names: Iterable[str]) -> None:
-    """ValueError for a name that would break the lines of text files, or that spreadsheets read as
-    a formula.
+    """Raise ValueError for a name that would break the lines of text files, or that spreadsheets
+    read as a formula.
     """
     for name in names:
         if not (0 < len(name) <= LONGEST_NAME and name.isprintable() and name[0] not in "=+-@"):

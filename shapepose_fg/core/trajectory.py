@@ -83,7 +83,8 @@ class Trajectory:
             covariance = np.asarray(self.covariance, dtype=np.float64)
             if covariance.shape != (len(time_s), 6, 6) or not np.isfinite(covariance).all():
                 raise refuse(
-                    f"covariance must be finite and {(len(time_s), 6, 6)}, got {covariance.shape}"
+                    f"covariance must have finite numbers and the shape {(len(time_s), 6, 6)}, "
+                    f"got the shape {covariance.shape}"
                 )
             if np.abs(covariance).max(initial=0.0) > MOST_VARIANCE:
                 raise refuse(

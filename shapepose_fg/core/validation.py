@@ -81,7 +81,7 @@ def describe(value: object) -> str:
 
 def numbers(value: object, name: str, cure: str, *, may_lack: bool = False) -> Array:
     """One or more numbers: of a list, whose rows have equal lengths, or a single one. InputError
-    naming the entry that is none. With `may_lack` an entry may be NaN.
+    naming the entry that is none. With `may_lack`, an entry may be NaN.
     """
     found = np.zeros(0, dtype=object)
     with suppress(ValueError):  # rows of different lengths

@@ -101,8 +101,8 @@ def _with_opencv(file: Path, content: bytes, device: str) -> tuple[Any, ...]:
 
 
 def _try_elsewhere(file: Path, content: bytes) -> None:
-    """InputError if OpenCV, run in another process, crashes or hangs with a network, as it may with
-    damaged files.
+    """Raise InputError if OpenCV, run in another process, crashes or hangs with a network, as it
+    may with damaged files.
     """
     if not sys.executable:
         return

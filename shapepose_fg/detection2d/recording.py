@@ -182,8 +182,8 @@ def _write_times(run: DetectionRun) -> None:
 
 
 def _refuse_others(run: DetectionRun, unfinished: Path) -> None:
-    """InputError where the output folder has other detections, or an unfinished run with other
-    settings.
+    """Raise InputError where the output folder has other detections, or an unfinished run with
+    other settings.
     """
     names = [each.camera.name for each in run.cameras]
     if Path(FOOTAGE).stem in names:

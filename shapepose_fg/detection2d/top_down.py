@@ -118,8 +118,8 @@ class TopDownNetwork:
         )
         if skeleton is None:
             raise InputError(
-                f"{network.file}: no known skeleton has {count} joints; describe it in a TOML "
-                "file of the network"
+                f"{network.file}: no known skeleton has {count} joints; describe the "
+                "network in a TOML file (docs/detection.md)"
             )
         keypoints = range(len(skeleton)) if skeleton.keypoints is None else skeleton.keypoints
         names = ["" if joint < 0 else skeleton.joints[joint] for joint in keypoints]

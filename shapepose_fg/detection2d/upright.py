@@ -66,7 +66,7 @@ class UprightView:
         """The view of a `region` rotated clockwise by `roll_deg`, about `long_side` pixels along
         its longer side.
 
-        Without `long_side` the scale is 1. Rolls under `LEVEL_DEG` from a multiple of 90 degrees
+        Without `long_side`, the scale is 1. Rolls under `LEVEL_DEG` from a multiple of 90 degrees
         are rotated by that multiple. Both sides are the nearest multiples of `multiple`, so that
         the axes' scales differ by a few per cent. A network with inputs of `only_size` (width,
         height) gets the region in the middle of such a picture.

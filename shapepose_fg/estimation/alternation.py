@@ -15,11 +15,10 @@ from shapepose_fg.core.camera import Views
 from shapepose_fg.core.notes import Problem
 from shapepose_fg.core.observations import Observations, window_rows
 from shapepose_fg.core.reconstruction import Known
-from shapepose_fg.estimation.alternation_covariances import state_covariances
 from shapepose_fg.estimation.camera_pose_uncertainty import carried_covariance
 from shapepose_fg.estimation.draft import MODEL_SIGMA_M, first_places
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
-from shapepose_fg.estimation.frame_graph import WindowGraph
+from shapepose_fg.estimation.frame_graph import FrameGraph, state_covariances
 from shapepose_fg.estimation.gated_views import (
     ViewEvidence,
     linearise,
@@ -56,10 +55,10 @@ def alternate(
     """
     X = first = first_places(observations, views, fitter, config)
     sigmas = observation_sigmas(observations, X, views, config.observations, config.joints)
-    people = list[WindowGraph]()
+    people = list[FrameGraph]()
     for row in np.concatenate([np.empty(0, np.intp), *window_rows(observations)])[:, None]:
         given = observations.rows(row), sigmas[row], views.rows(row)
-        people.append(WindowGraph(*given, config, row, first[row]))
+        people.append(FrameGraph(*given, config, row, first[row]))
     if len(functions) > 0:
         add_factors(people, functions)
     evidence = linearise(observations, sigmas, X, views, config.observations)
@@ -97,7 +96,7 @@ def body_constraints(fit: BodyFit, pulled: Mask, sigma_m: float) -> JointTargets
 
 
 def _solved(
-    people: Sequence[WindowGraph],
+    people: Sequence[FrameGraph],
     evidence: ViewEvidence,
     of_body: JointTargets,
     config: EstimatorConfig,
@@ -125,7 +124,7 @@ def _solution(
     X: Array,
     evidence: ViewEvidence,
     fit: BodyFit,
-    people: Sequence[WindowGraph],
+    people: Sequence[FrameGraph],
     enough: Mask,
     config: EstimatorConfig,
 ) -> WindowSolution:
@@ -172,7 +171,7 @@ def _solution(
 
 
 def _problems(
-    rows: Observations, X: Array, covariance: Array, people: Sequence[WindowGraph]
+    rows: Observations, X: Array, covariance: Array, people: Sequence[FrameGraph]
 ) -> tuple[Problem, ...]:
     """Joints that could not be solved."""
     finite = np.asarray(np.isfinite(X).all(axis=2))

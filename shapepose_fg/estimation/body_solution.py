@@ -22,7 +22,6 @@ from shapepose_fg.estimation.body_window import BodyWindow, Marginals
 from shapepose_fg.estimation.camera_pose_uncertainty import carried_covariance
 from shapepose_fg.estimation.condensed_graph import gtsam_step
 from shapepose_fg.estimation.contact import feet_of
-from shapepose_fg.estimation.covariance_factors import covariance_factors
 from shapepose_fg.estimation.draft import Draft, first_bodies, first_places, joint_targets
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.factor_solution import solve_with_factors
@@ -41,6 +40,7 @@ from shapepose_fg.estimation.missed_detections import (
 )
 from shapepose_fg.estimation.motion_densities import MotionModel
 from shapepose_fg.estimation.person_graph import BodyGraph
+from shapepose_fg.estimation.reported_covariances import covariance_factors
 from shapepose_fg.estimation.user_factors import FactorFunction, add_factors, factors_of
 from shapepose_fg.estimation.window_solution import (
     PersonGraph,
@@ -69,7 +69,7 @@ def solve_bodies(
     """Joints, covariances and bodies of N rows: each track over its rows, or a row by itself;
     bodies begin at those `drafted`.
 
-    A joint's covariance is, in this order: what its views say, if its row has no body
+    A joint's covariance is, in this order: the one from its views, if its row has no body
     (`_Found.of_views`); the marginal of its person's graph, with deviations wider for unseen joints
     (`BodyWindow.of_joints`, `widen_unseen`), times the person's factor (`covariance_factors`), or
     that of the graph with user factors (`solve_with_factors`); plus errors of moving cameras
@@ -169,7 +169,7 @@ class _Found:
 
     @classmethod
     def of_views(cls, evidence: ViewEvidence, most_m: float, status: NDArray[np.str_]) -> "_Found":
-        """What the views alone say of joints, where they determine them; NaN elsewhere."""
+        """Joints and covariances from the views only, where they determine them; NaN elsewhere."""
         placed = np.asarray(evidence.sigma_m <= most_m)
         (N, J), nowhere = placed.shape, np.full((*placed.shape, 3), np.nan)
         covariance = np.full((N, J, 3, 3), np.nan)

@@ -45,7 +45,7 @@ from shapepose_fg.estimation.motion_densities import MotionModel
 DEVIATION_M = 0.007
 """Standard deviation of a detector's joint from the body's, metres per axis."""
 POSE_LASTS_S = 1.0
-"""A pose is as good as independent of the one before after so long, seconds: the pose prior counts
+"""Time after which a pose is practically independent of an earlier one, s: the pose prior counts
 once in it."""
 _AVERAGED = 0.15
 """Ratio of the covariance of a seen foot's velocity to that from the views of its two frames alone,
@@ -94,7 +94,7 @@ class BodyState(Rows):
 
 @dataclass(frozen=True)
 class Around(Rows):
-    """What the model says around a state."""
+    """The model linearised at a state."""
 
     cost: float | Array
     """E, in squared standard deviations; of single frames (T,)."""
@@ -106,13 +106,13 @@ class Around(Rows):
     bodies: Array
     """(T, J, 3) joints of the body, metres around the origin."""
     evidence: ViewEvidence
-    """What the views say around the joints X."""
+    """Measurements of the views, linearised at the joints X."""
     gain: Array
-    """(T, J, 3, 3) (1 + s² L)^-1 s² L: what share of the way from the body's joint to the views' X
-    goes."""
+    """(T, J, 3, 3) gain (1 + s² L)^-1 s² L, by which X lies between the body's joint (0) and the
+    estimate of the views (1)."""
     target: Array
-    """(T, J, 3) where the views have the joints, metres around the origin; anything where they say
-    nothing."""
+    """(T, J, 3) joints as estimated from the views only, metres around the origin; undefined where
+    these give no information."""
 
 
 class BodyWindow:
@@ -353,7 +353,7 @@ class BodyWindow:
         return self.energy.model.keypoints(self.energy.complete(state.free))
 
     def said_by(self, state: BodyState, joints: Mask) -> Array:
-        """(T, M, P) normal equations of what some `joints` (J,) say of each frame's body, without
+        """(T, M, P) normal equations of each frame's body from some `joints` (J,) only, without
         priors, around the last solution.
         """
         weighed = self.last.gain / self.variance[..., None, None] * joints[:, None, None]

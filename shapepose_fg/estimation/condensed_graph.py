@@ -63,9 +63,9 @@ def _factors(
 def frame_systems(
     window: BodyWindow, state: BodyState, joints: Mask | None = None
 ) -> tuple[Array, Array]:
-    """What each frame says of betas and pose around a state: Hessians (T, P, P) and negative
-    gradients (T, P), the root's in tangents of the world, with the priors of poses. With `joints`
-    (J,) only what these say, without priors.
+    """Information of each frame about betas and pose around a state: Hessians (T, P, P) and
+    negative gradients (T, P), the root's in tangents of the world, with the priors of poses. With
+    `joints` (J,), only the information of these joints, without priors.
     """
     system, turn, P = window.last.system, state.root, window.energy.num_free
     if joints is not None:

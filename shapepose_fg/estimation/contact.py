@@ -77,12 +77,12 @@ def standing_density(velocity: Array, covariance: Array, times_s: Array) -> Arra
 
 
 def held_in_place(targets: JointTargets, density: Array, times_s: Array) -> tuple[Array, Array]:
-    """Constraint on F joints in T frames from where the views have them in the other frames of the
-    same stance: information (T, F, 3, 3), 1/m², and information times position (T, F, 3), 1/m.
+    """Constraint on F joints in T frames from their positions in the other frames of the same
+    stance: information (T, F, 3, 3), 1/m², and information times position (T, F, 3), 1/m.
 
-    `targets` (T, F) are what the views say of joints in each frame. Between frames a joint is a
-    random walk of `density` (T - 1, F), m²/s, free where infinite. As errors of detectors last, a
-    frame counts as its share of `ALIKE_S`.
+    `targets` (T, F) are the estimates of joints from the views of each frame. Between frames a
+    joint is a random walk of `density` (T - 1, F), m²/s, free where infinite. As errors of
+    detectors are correlated over time, a frame counts as its share of `ALIKE_S`.
     """
     share = np.minimum(np.gradient(times_s) / ALIKE_S, 1.0)
     L = targets.information * share[:, None, None, None]

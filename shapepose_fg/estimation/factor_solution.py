@@ -9,9 +9,8 @@ import numpy as np
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.estimation.body_window import Marginals
 from shapepose_fg.estimation.estimator_config import WindowGraphConfig
-from shapepose_fg.estimation.graph_covariances import graph_covariances
 from shapepose_fg.estimation.minimise import NotFinite, descend
-from shapepose_fg.estimation.person_graph import BodyGraph, ordering
+from shapepose_fg.estimation.person_graph import BodyGraph, graph_covariances, ordering
 from shapepose_fg.estimation.user_factors import CoupledGraph
 from shapepose_fg.estimation.window_solution import RUNAWAY_M
 

@@ -28,8 +28,12 @@ from shapepose_fg.estimation.estimator_config import EstimatorConfig
 from shapepose_fg.estimation.minimise import NotFinite, descend, undetermined_key
 from shapepose_fg.estimation.user_factors import PersonWindow
 
+UNDETERMINED_M = 10.0
+"""Standard deviation, metres, above which a joint is undetermined, in its worst direction; also
+that of weak priors on joints, since one behind its cameras would make a system singular."""
 
-class WindowGraph(PersonWindow):
+
+class FrameGraph(PersonWindow):
     """Graph of one person in one frame, T = 1.
 
     Joints, and people, are coupled only by user factors, so that marginal covariances are cheap.
@@ -113,7 +117,7 @@ class WindowGraph(PersonWindow):
                 where = _where(error, people, self._names)
                 failure = f"the solver failed: its system is singular{where}"
         for person in people:
-            assert isinstance(person, WindowGraph)
+            assert isinstance(person, FrameGraph)
             person.set_graph(graph, values)
             person.failure = failure
             person.positions = np.full((*person.present.shape, 3), np.nan)
@@ -173,3 +177,56 @@ def cameras_of(views: Views) -> list[gtsam.PinholeCameraCal3_S2]:
     shape = np.broadcast_shapes(views.K.shape[:-2], wTc.shape[:-2])
     K, wTc = np.broadcast_to(views.K, (*shape, 3, 3)), np.broadcast_to(wTc, (*shape, 4, 4))
     return list(map(make_camera, K.reshape(-1, 3, 3), wTc.reshape(-1, 4, 4)))
+
+
+def state_covariances(graphs: Sequence[FrameGraph]) -> list[Array]:
+    """For each solved graph, covariances (1, J, 3, 3) of positions, m².
+
+    NaN for joints not in the problem, and for undetermined ones (`UNDETERMINED_M`): singular
+    systems raise no error.
+    """
+    known = dict[int, gtsam.Marginals]()
+    return [_of_graph(graph, known) for graph in graphs]
+
+
+def _of_graph(graph: FrameGraph, known: dict[int, gtsam.Marginals]) -> Array:
+    """Marginals of one person; coupled people share one graph, which is factorised once: `known` is
+    the cache.
+    """
+    found = np.full((*graph.keys.shape, 3, 3), np.nan)
+    keys = graph.keys[graph.present].tolist()
+    if graph.failure or len(keys) == 0:
+        return found
+    for make in (lambda: graph.graph, lambda: _damped(graph)):
+        try:
+            marginals = known.get(id(graph.ties)) or gtsam.Marginals(make(), graph.values)
+            of_keys = [marginals.marginalCovariance(key) for key in keys]
+        except RuntimeError:
+            known.pop(id(graph.ties), None)
+            continue
+        known[id(graph.ties)] = marginals
+        found[graph.present] = of_keys
+        return determined(found)
+    return found
+
+
+def _damped(graph: FrameGraph) -> gtsam.NonlinearFactorGraph:
+    """The problem with a prior of 100 m on all variables; results wider than 10 m are then
+    undetermined.
+    """
+    damped = gtsam.NonlinearFactorGraph(graph.graph)
+    wide = gtsam.noiseModel.Isotropic.Sigma(3, 100.0)
+    for key in (key for person in graph.ties.people for key in person.keys.ravel().tolist()):
+        if graph.values.exists(key):
+            damped.push_back(gtsam.PriorFactorPoint3(key, graph.values.atPoint3(key), wide))
+    return damped
+
+
+def determined(covariance: Array) -> Array:
+    """Return covariances (..., 3, 3), with NaN for those above `UNDETERMINED_M` in some
+    direction.
+    """
+    largest = np.trace(covariance, axis1=-2, axis2=-1)  # upper bound
+    doubtful = np.isfinite(largest) & (largest >= UNDETERMINED_M**2)
+    largest[doubtful] = np.linalg.eigvalsh(covariance[doubtful])[..., -1]
+    return np.where((largest < UNDETERMINED_M**2)[..., None, None], covariance, np.nan)

@@ -210,7 +210,7 @@ def linearise(
     """Gate observations (Eq. 2) at `points` (N, J, 3), and sum the information of the inliers about
     each joint.
 
-    `sigmas` (N, J, V) in pixels are from `observation_sigmas`. With `reach_m` a Geman-McClure
+    `sigmas` (N, J, V) in pixels are from `observation_sigmas`. With `reach_m`, a Geman-McClure
     kernel replaces gates and kernel: its weight is a quarter at this distance from the projection,
     as a length at the joint's depth, metres. `inlier` is then every observation in front of its
     camera.

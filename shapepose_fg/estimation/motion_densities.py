@@ -19,7 +19,7 @@ FORMAT = "shapepose-fg motion model 1"
 
 @dataclass(frozen=True)
 class MotionConfig(Settings):
-    """Settings of the links between frames of a person."""
+    """Settings of the motion model, and of the constraints of feet and floor."""
 
     model: str = ""
     """File of the motion model, with the entries of `estimation/data/motion.json`; empty: that

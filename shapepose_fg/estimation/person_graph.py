@@ -27,7 +27,6 @@ from shapepose_fg.core.decompositions import symmetric_root
 from shapepose_fg.estimation.body_window import BodyState, BodyWindow, Marginals
 from shapepose_fg.estimation.condensed_graph import frame_systems
 from shapepose_fg.estimation.frame_graph import cameras_of
-from shapepose_fg.estimation.graph_covariances import graph_covariances
 from shapepose_fg.estimation.in_time import moments
 from shapepose_fg.estimation.user_factors import PersonWindow
 
@@ -86,8 +85,8 @@ class BodyGraph(PersonWindow):
         return self
 
     def part(self, joints: Mask) -> None:
-        """Make the graph of the person alone with only some `joints` (J,) as variables. From each
-        frame the others are eliminated: what they say of body and shape is one factor.
+        """Make the graph of this person only, with some `joints` (J,) as variables. The others are
+        eliminated: in each frame, their information about body and shape is one factor.
         """
         window, state = self.window, self.state
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -239,7 +238,7 @@ class BodyGraph(PersonWindow):
         return found
 
     def _standing(self, scale: float, joints: Mask) -> list[gtsam.NonlinearFactor]:
-        """What other frames of a stance say of `joints` (J,) of feet."""
+        """Factors on `joints` (J,) of feet from the other frames of a stance."""
         held = self.window.standing
         frame, joint = np.nonzero(held.information.any(axis=(-1, -2)) & joints)
         roots = symmetric_root(held.information[frame, joint]) / scale
@@ -299,3 +298,34 @@ def ordering(people: Sequence[BodyGraph], values: gtsam.Values) -> gtsam.Orderin
         last = max((frame_of.get(other, -1) for keys in factors for other in keys), default=-1)
         ranks.append((last if last >= 0 else MAX_FRAME, 3, key))
     return gtsam.Ordering([*(key for _, _, key in sorted(ranks)), *shapes])
+
+
+def graph_covariances(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, ordering: gtsam.Ordering
+) -> dict[tuple[int, int], Array]:
+    """Covariance of each variable, (key, key), and of each pair that elimination in this order
+    connects, such as a body with the joints of its frame and with the next body.
+
+    `gtsam.Marginals` computes one per call. They are those of the linearised graph, computed
+    backwards over its Bayes net. Raises RuntimeError if the system is singular.
+    """
+    net = graph.linearize(values).eliminateSequential(ordering)
+    found, last, after = dict[tuple[int, int], Array](), list[int](), np.empty((0, 0))
+    for n in range(net.size() - 1, -1, -1):
+        conditional = net.at(n)
+        key, *others = conditional.keys()
+        R = np.asarray(conditional.R())
+        inverse = np.linalg.inv(R)
+        own = inverse @ inverse.T
+        if others:
+            if others != last:
+                after = np.block([[found[a, b] for b in others] for a in others])
+                last = others
+            gain = inverse @ conditional.S()
+            across = -gain @ after
+            own -= across @ gain.T
+            ends = np.cumsum([len(found[each, each]) for each in others])[:-1]
+            for other, part in zip(others, np.split(across, ends, axis=1), strict=True):
+                found[key, other], found[other, key] = part, part.T
+        found[key, key] = (own + own.T) / 2
+    return found

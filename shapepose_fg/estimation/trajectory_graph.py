@@ -31,8 +31,8 @@ from factors import (
 from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.observations import Observations
-from shapepose_fg.estimation.alternation_covariances import UNDETERMINED_M
 from shapepose_fg.estimation.camera_pose_uncertainty import POSES_LAST_S
+from shapepose_fg.estimation.frame_graph import UNDETERMINED_M
 from shapepose_fg.estimation.gated_views import (
     ObservationConfig,
     linearise,

@@ -158,7 +158,7 @@ class PersonWindow:
         self._graph, self._values = graph, gtsam.Values() if values is None else values
 
     def build(self) -> "PersonWindow":
-        """Make `graph` and `values` of the person alone."""
+        """Make `graph` and `values` of this person only."""
         self.set_graph(gtsam.NonlinearFactorGraph(), gtsam.Values())
         return self
 
@@ -245,7 +245,7 @@ class PersonWindow:
             self.ties.take_in(person.ties)
             person.touched[joint : joint + 1] |= joint >= 0
         if len(touched) == 0 and len(nodes) == 0:
-            raise ValueError(f"{whose} has no variable")
+            raise ValueError(f"{whose} has no variable; give it the keys of joints")
         self.ties.factors.append(UserFactor(item, tuple(item.keys()), name))
         self.ties.tie(nodes)
 

@@ -187,8 +187,8 @@ class PersonGraph:
 
     def coupled(self, one: tuple[int, int, int], other: tuple[int, int, int]) -> bool:
         """Whether to take the correlation of two joints (person, joint, frame) from the graph:
-        where both are in one frame, or user factors couple them. A detector's errors last longer
-        than the graph has them.
+        where both are in one frame, or user factors couple them. Over time, a
+        detector's errors are more correlated than the graph assumes.
         """
         return one[2] == other[2] or any({one[:2], other[:2]} <= p for p in self.window.ties.parts)
 

@@ -63,7 +63,7 @@ class Score:
     """What was not scored, and why, one sentence each."""
 
     def as_dict(self) -> dict[str, Any]:
-        """Everything by plain names, for JSON; None for NaN."""
+        """All scores by name, for JSON; None instead of NaN."""
 
         def plain(values: dict[Any, float]) -> dict[str, float | None]:
             return {

@@ -38,7 +38,7 @@ def score_tracks(
     Classes are `velocity`, and joints that two views or more see in that frame (`seen`), one view
     (`one_view`), none (`no_view`), and none in this frame and the nine before (`unseen`).
 
-    The frames from the first to the last of the truth are scored. Without `identities` the column
+    The frames from the first to the last of the truth are scored. Without `identities`, the column
     `person` only numbers the people of a frame; metrics over time then use the true person with
     whom a row is matched. ValueError for an identity twice in one frame.
     """  # noqa: E501

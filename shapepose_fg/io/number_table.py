@@ -61,8 +61,8 @@ def read_number_table(
 
 
 def refuse_first(path: Path, lines: Index, bad: Mask, what: What, cure: str) -> None:
-    """InputError that names the first line of a table whose row is `bad` (R,), if there is one;
-    `lines` (R,). `what` says what is wrong with it, or with a row by its number.
+    """Raise InputError naming the first line of a table whose row is `bad` (R,), if there is
+    one; `lines` (R,). `what` says what is wrong with it, or with a row by its number.
     """
     if bad.any():
         row = int(np.argmax(bad))

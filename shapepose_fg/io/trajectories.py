@@ -152,7 +152,7 @@ def _is_unit(quaternions: Array) -> bool:
 
 
 def _check_columns(path: Path, line: int, names: list[str]) -> None:
-    """InputError if these are not the columns of a trajectory."""
+    """Raise InputError if these are not the columns of a trajectory."""
     known = {*POSE, *COVARIANCE}
     odd = next((name[:20] for name in names if name not in known or names.count(name) > 1), None)
     missing = next((name for name in POSE if name not in names), None)

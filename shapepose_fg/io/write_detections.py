@@ -97,8 +97,8 @@ def write_openpose(recording: DetectionSequence, rig: Rig, folder: str | Path) -
 
 
 def refuse_leftovers(rig: Rig, folder: str | Path) -> None:
-    """InputError if `write_openpose` would mix its frames with existing ones; for checking before
-    long work.
+    """Raise InputError if `write_openpose` would mix its frames with existing ones; for checking
+    before long work.
     """
     for camera in rig.cameras:
         place = Path(folder) / camera.name
@@ -109,7 +109,7 @@ def refuse_leftovers(rig: Rig, folder: str | Path) -> None:
 
 
 def _check(recording: DetectionSequence) -> None:
-    """ValueError if a recording cannot be written in these formats."""
+    """Raise ValueError if a recording cannot be written in these formats."""
     if recording.skeleton.joints != BODY_25.joints:
         raise ValueError(f"only BODY_25 can be written, not {recording.skeleton.name}")
     if len(recording) == 0:

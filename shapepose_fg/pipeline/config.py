@@ -183,7 +183,7 @@ class PipelineConfig(Settings):
 
     @classmethod
     def fast(cls) -> "PipelineConfig":
-        """Keyframes only, eight to ten a second: two thirds of the time (docs/evaluation.md,
+        """Keyframes only, eight to ten a second: 0.6 of the time (docs/evaluation/speed.md,
         "Presets").
         """
         return cls(

@@ -53,7 +53,7 @@ def with_rows_between(
 
     `frame` (F,) are consecutive frames, at `time_s` (F,) seconds, with the mask `key` (F,) of
     keyframes. New rows have no detections; their joints come from `motion`, and their bodies are
-    interpolated. Sorted by frame and person.
+    interpolated. Rows are sorted by frame and person.
     """
     keys = np.flatnonzero(key)
     order = np.lexsort((rows.frame, rows.person))

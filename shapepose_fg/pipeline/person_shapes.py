@@ -73,7 +73,7 @@ class WindowBodies(Rows):
 
 @dataclass
 class ShapeEvidence:
-    """What rows say about a person's shape, without a prior."""
+    """Information of rows about a person's shape, without a prior."""
 
     information: Array = field(default_factory=lambda: np.zeros((10, 10)))
     """(10, 10) sum of the information of all rows on the betas."""
@@ -198,8 +198,8 @@ def bodies_with_shapes(
     floor: Floor | None,
     mapped: Mapped,
 ) -> tuple[SubjectShapes, Iterator[dict[str, Array]]]:
-    """One shape for each of the people `numbers` (`combined`), and the bodies of each part of their
-    rows with these shapes, by column.
+    """The shape of each of the people `numbers`, from all their rows (`combined`), and their bodies
+    with these shapes: for each part, the columns of its rows.
     """
     found = {number: ShapeEvidence() for number in numbers}
     for of_part in mapped(_evidence, parts()):

@@ -63,8 +63,9 @@ def solve_window(
     Rows of one track at several frames are a window, one factor graph with a body in every frame.
     With the paper's `EstimatorConfig`, or a fitter without a body model, each row is solved by
     Algorithm 1 (`estimation/alternation.py`).
+
     `views` are the cameras, by row if they move. `extra_factors`, one function or several, add
-    factors of your own to every window. Without `assigning` detections keep their people.
+    factors of your own to every window. Without `assigning`, detections are not reassigned.
     """
     if len(views) != observations.confidence.shape[2] or views.rows_known not in (
         None,

@@ -90,7 +90,7 @@ class Engine:
         """Track people through `frames`; returns the windows that can be solved now, independently
         in any process.
 
-        With `last` the recording ends, or is cut, after them.
+        With `last`, the recording ends, or is cut, after them.
         """
         following, decided = state.follow, list(state.decided)
         for frame in frames:

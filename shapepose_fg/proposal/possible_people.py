@@ -111,7 +111,7 @@ def settled(
     """Alternate assignment of detections and triangulation, `passes` times, starting at `places`
     (H, J, 3) with detections `own` (H, J, V), -1 for none.
 
-    With `exclusive` each detection is assigned to one person; else each hypothesis takes all it
+    With `exclusive`, each detection is assigned to one person; else each hypothesis takes all it
     would explain. Joints not connected to most others by plausible bones are removed: they belong
     to another person.
     """

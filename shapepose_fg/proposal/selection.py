@@ -58,7 +58,7 @@ class Evidence:
     """Evidence for and against each of H hypotheses, before any detection is assigned to others."""
 
     chosen: Index
-    """(H, J, V) the detections that each explains, -1 for none."""
+    """(H, J, V) the detections that each hypothesis explains, -1 for none."""
     worth: Array
     """(H, J, V) weight of each detection: confidence, affinity, and nearness of its ray."""
     expected: Mask

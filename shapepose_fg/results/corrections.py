@@ -121,8 +121,8 @@ def take_back(folder: str | Path, solve: Solve | None = None) -> tuple[Edit, Rec
 
 
 def refuse_corrected(folder: Path) -> None:
-    """InputError if `folder` has a result that was corrected by hand, which a new result would
-    overwrite.
+    """Raise InputError if `folder` has a result that was corrected by hand, which a new result
+    would overwrite.
     """
     there = [name for name in (CORRECTIONS, UNCORRECTED) if (folder / name).exists()]
     if len(there) > 0:

@@ -128,8 +128,8 @@ def solved_around(
     extra_factors: ExtraFactors | None = None,
 ) -> PersonGraph | None:
     """Graph of a person's window that contains this frame, solved again from the person's own
-    observations; None if it is empty. With `extra_factors` all people in the window are solved. The
-    observations must be present.
+    observations; None if it is empty. With `extra_factors`, all people in the window are solved.
+    The observations must be present.
     """
     if extra_factors is None:
         people = people.rows(

@@ -304,7 +304,7 @@ def sequence(
     """Interaction sequence `name` of `SEQUENCES` from the takes of `split`, seen by `cameras`
     cameras.
 
-    `config` replaces that of the name; `frames` its length. With `until` no segment is generated
+    `config` replaces that of the name; `frames` its length. With `until`, no segment is generated
     that begins at that frame or later; the others are as in the whole recording. Raises ValueError
     for an unknown name or split, or recordings without a take of that split.
     """

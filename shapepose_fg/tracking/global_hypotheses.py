@@ -1,11 +1,12 @@
-"""Multiple-hypothesis tracking through a block of frames: worlds, each tracked from one frame to
-both ends.
+"""Multiple-hypothesis tracking through a block of frames: global hypotheses, each tracked from one
+frame to both ends.
 
-A world is a global hypothesis: a set of tracks that share no detection. People are searched for in
-several frames, tracked from there forwards and backwards, and the tracks that explain most are
-selected (`track_selection.py`). The selected people are then joined in one world in the frames that
-show them best, and tracked again from there, so that they no longer take each other's detections.
-Alternatives are sought in the detections that people with evidence throughout do not use.
+A global hypothesis (`world` in the code) is a set of tracks that share no detection. People are
+searched for in several frames, tracked from there forwards and backwards, and the tracks that
+explain most are selected (`track_selection.py`). The selected people are then joined in one global
+hypothesis in the frames that show them best, and tracked again from there, so that they no longer
+take each other's detections. Alternatives are sought in the detections that people with evidence
+throughout do not use.
 """
 
 from collections.abc import Iterable, Sequence
@@ -26,7 +27,7 @@ from shapepose_fg.tracking.tracker import SEARCH_S, Tracker, Tracks
 Array = NDArray[np.float64]
 
 _TWINS_S = 0.1
-"""Interval between checks for duplicate worlds, s."""
+"""Interval between checks for duplicate global hypotheses, s."""
 _RESTART_S = 1.3
 """Interval between the frames from which the selected people are tracked again, s."""
 _ROUNDS = 2
@@ -39,7 +40,7 @@ _PLAIN = 0.25
 """Minimum evidence per second, over any window of `SEARCH_S`, of a person to whom no
 alternatives are sought; in simulated crowds, they are found only for people with less."""
 _SAME_M = 0.02
-"""Maximum distance between joints of two worlds with the same detections for these to
+"""Maximum distance between joints of two global hypotheses with the same detections for these to
 be merged, m."""
 _GAIN = 0.01
 """Minimum relative gain of evidence for another round."""
@@ -50,13 +51,13 @@ class Hypotheses:
     """H track hypotheses through T frames."""
 
     carried: NDArray[np.intp]
-    """(H,) index of the carried person that each continues; -1 for none."""
+    """(H,) index of the carried person that each track continues; -1 for none."""
     world: NDArray[np.intp]
-    """(H,) world of each."""
+    """(H,) global hypothesis to which each track belongs."""
     there: NDArray[np.bool_]
-    """(H, T) frames in which each is tracked."""
+    """(H, T) frames in which each track hypothesis is tracked."""
     candidate: NDArray[np.int32]
-    """(H, T, J, V) detections of each, -1 for none."""
+    """(H, T, J, V) detections of each track hypothesis, -1 for none."""
     places: Array
     """(H, T, J, 3) positions of the joints, metres; NaN where uncertain."""
     weight: NDArray[np.float32]
@@ -82,7 +83,7 @@ class Hypotheses:
 
     @classmethod
     def concatenate(cls, parts: Sequence["Hypotheses"]) -> "Hypotheses":
-        """Concatenate hypotheses; their worlds are renumbered and stay separate."""
+        """Concatenate hypotheses; their global hypotheses are renumbered and stay separate."""
         names = ("carried", "there", "candidate", "places", "weight", "price")
         columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
         first = np.cumsum([0, *(int(part.world.max(initial=-1)) + 1 for part in parts)])
@@ -96,7 +97,7 @@ class Hypotheses:
 
 @dataclass(frozen=True)
 class Seed:
-    """Start of a world: its first people and their frame."""
+    """Start of a global hypothesis: its first people and their frame."""
 
     frame: int
     """Index of the frame; -1 for the one before the first."""
@@ -206,8 +207,8 @@ def lasting(times_s: Array) -> Array:
 
 
 def _seeds(tracker: Tracker, frames: Sequence[Input]) -> list[Seed]:
-    """Further worlds: one tracked backwards from the last frame, and one from each of several
-    frames.
+    """Further global hypotheses: one tracked backwards from the last frame, and one from each of
+    several frames.
     """
     times, nobody = times_of(frames), tracker.nobody()
     none = np.zeros((0, len(tracker.skeleton), len(frames[0].rig)), dtype=np.intp)
@@ -238,7 +239,7 @@ def _newcomers(
 def _seed(
     tracker: Tracker, frames: Sequence[Input], key: int, places: Array, candidate: NDArray[np.intp]
 ) -> Seed:
-    """A world of people at `places` (A, J, 3) with their detections in a frame."""
+    """A global hypothesis of people at `places` (A, J, 3) with their detections in a frame."""
     zero = np.zeros(len(places), dtype=np.intp)
     return Seed(key, tracker.at(places, zero, zero, float(frames[key].time_s.mean())), candidate)
 
@@ -250,8 +251,8 @@ def _restarts(
     found: Hypotheses,
     chosen: SelectedTracks,
 ) -> list[Seed]:
-    """Worlds of all selected people, each from the frame of a `_RESTART_S` interval that shows them
-    best.
+    """Global hypotheses of all selected people, each from the frame of a `_RESTART_S` interval that
+    shows them best.
     """
     T = len(frames)
     placed = np.isfinite(found.places[chosen.hypothesis]).all(axis=-1).any(axis=-1)
@@ -270,7 +271,7 @@ def _restarts(
 
 
 Followed = tuple[int, Seed, NDArray[np.intp]]
-"""A world's number, its seed, and the numbers of the people in it."""
+"""A global hypothesis's number, its seed, and the numbers of the people in it."""
 
 
 def follow_worlds(tracker: Tracker, rest: Rest, seeds: Sequence[Seed], keep: int) -> Hypotheses:
@@ -372,10 +373,11 @@ def _follow(
 def _twins(
     tracks: Tracks, candidate: NDArray[np.intp]
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Rows of `tracks` (A) of duplicate worlds, and the rows of the same people in the world that
-    is kept.
+    """Rows of `tracks` (A) of duplicate global hypotheses, and the rows of the same people in the
+    one that is kept.
 
-    Duplicate worlds have the same detections (A, J, V) and the same positions of placed joints.
+    Duplicate global hypotheses have the same detections (A, J, V) and the same positions of placed
+    joints.
     """
     gone, same = np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp)
     known, kept = tracks.joints.sigma_m < LOST_M, dict[tuple[bytes, ...], NDArray[np.intp]]()
@@ -406,7 +408,7 @@ class _Log:
     def more(
         self, count: int, world: int, carried: NDArray[np.intp] | None = None
     ) -> NDArray[np.intp]:
-        """Numbers for `count` new people of a world."""
+        """Numbers for `count` new people of a global hypothesis."""
         first = len(self.carried)
         self.world += [world] * count
         self.carried += [-1] * count if carried is None else carried.tolist()
@@ -435,7 +437,7 @@ class _Log:
             self.kept.append((tracks.ids, joints))
 
     def hypotheses(self) -> Hypotheses:
-        """Everything recorded, as hypotheses."""
+        """All recorded tracks, as hypotheses."""
         H, T, (J, V) = len(self.carried), len(self.frames), self.shape
         there = np.zeros((H, T), dtype=bool)
         candidate, price = (

@@ -1,5 +1,9 @@
-"""Rows of tracked people from frames: which people are present, and when. Frames are processed in
-blocks with a short look-ahead, in bounded memory.
+"""Decides which people are present in each frame, and their identities over time. Frames are
+processed in blocks with a short look-ahead, in bounded memory.
+
+In each block, `global_hypotheses.py` tracks hypotheses of people, `track_selection.py` selects the
+tracks that explain most detections, and `_identities` here continues the identities of the last
+block. Afterwards `stitching.py` joins tracks of people who were out of sight.
 """
 
 from dataclasses import dataclass, field, replace

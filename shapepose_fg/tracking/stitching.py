@@ -117,10 +117,10 @@ class Ends:
 def stitch(ends: Ends, config: StitchingConfig, cuts_s: Sequence[float] = ()) -> dict[int, int]:
     """New identity of each track after joining: that of the earliest track of each chain.
 
-    Each track has at most one predecessor and one successor. The assignment is global: the largest
-    number of joints, and of these the likeliest by place and build. Nothing is joined across the
-    times `cuts_s`. Time and memory grow with the number of pairs in which one track begins within
-    `longest_gap_s` of another's end.
+    Each track has at most one predecessor and one successor. The assignment is global: as many
+    tracks as possible are joined, and among such assignments the one is taken that is most likely
+    by place and build. Nothing is joined across the times `cuts_s`. Time and memory grow with the
+    number of pairs in which one track begins within `longest_gap_s` of another's end.
     """
     joined = _matched(*_pairs(ends, config, cuts_s))
     names = {}

@@ -36,13 +36,13 @@ APPEARS_S = 0.125
 """Cost of a track birth or death within the observed time, s of evidence; as much as 0.3 s of
 missed detections in plain view. People rarely appear or disappear in the middle of the scene."""
 _WORLDS = 8
-"""Maximum number of worlds given priority in turn, the most promising ones."""
+"""Maximum number of global hypotheses given priority in turn, the most promising ones."""
 LEAST_S = 0.1
 """Minimum evidence of a person, in seconds during which all views see the whole person; less in
 short recordings (`_EVEN`)."""
 _ON_TRIAL = 0.25
-"""Factor of `APPEARS_S` and `LEAST_S` for people who are tracked again: in a world with the others
-they may gain evidence."""
+"""Factor of `APPEARS_S` and `LEAST_S` for people who are tracked again: in a global hypothesis with
+the others they may gain evidence."""
 _SCALE, _PRIOR = 13.7, -0.6
 """Scale and offset of the log-odds of a person's existence by evidence: logistic fit to 482 people,
 11 of them false positives or duplicates, in simulated crowds, crossings and pairs before two to
@@ -176,7 +176,7 @@ def _picture(places, known, camera, focal, a, seen, box):
 @part
 def _behind(place, known, world, limbs, seen, box, focal):
     """Whether the `place` (person, x, y, depth) is occluded by a limb, both ends known, of another
-    person of the same world.
+    person of the same global hypothesis.
     """
     a, x, y, depth = place
     for b in range(len(world)):
@@ -277,9 +277,9 @@ class EvidenceTable:
         Hypotheses with the same `world` (H,) were tracked together; `on_trial` also accepts tracks
         with slightly too little evidence. Selection is greedy: the best segment of the best
         hypothesis comes first, and its detections are evidence of no other. Alternative selections
-        give priority to the people of one world: a hypothesis that switches from one person to
-        another, always to the better visible one, beats either of the two, and leaves too little
-        for the others.
+        give priority to the people of one global hypothesis: a hypothesis that switches from one
+        person to another, always to the better visible one, beats either of the two, and leaves too
+        little for the others.
         """
         first, asked = np.zeros(len(world), dtype=bool), _ON_TRIAL if on_trial else 1.0
         if len(world) == 0:

@@ -1,9 +1,9 @@
 """Tracking from frame to frame: prediction, assignment of detections in all views, Kalman update.
 
 The detections around a track's predicted joints are its observations, whether or not stage I would
-find the person in this frame. Several worlds are tracked at once (`global_hypotheses.py`): a world
-is a global hypothesis, a set of tracks that share no detection; worlds are independent of each
-other.
+find the person in this frame. Several global hypotheses are tracked at once
+(`global_hypotheses.py`). Each is a set of tracks that share no detection, and is independent of the
+others; its number is `world` in the code.
 """
 
 from collections.abc import Callable, Sequence
@@ -35,10 +35,10 @@ NoteDropped = Callable[[str, list[int]], None]
 
 
 SEARCH_S = 0.3
-"""Interval between searches for new people in each world, and between comparisons of a track with a
-body, s; half that between searches among all detections. In a world that lacks a person, the others
-take that person's detections, so every world is searched: in crowds before three cameras this finds
-two to six more people of a hundred."""
+"""Interval between searches for new people in each global hypothesis, and between comparisons of a
+track with a body, s; half that between searches among all detections. In a global hypothesis that
+lacks a person, the others take that person's detections, so every global hypothesis is searched: in
+crowds before three cameras this finds two to six more people of a hundred."""
 _APART_M = 0.25
 """Minimum mean distance of a new person's joints from any track's, m; nearer is the same person."""
 _BIRTH_SIGMA_M = 0.04
@@ -72,14 +72,14 @@ class BodyScale:
 
 @dataclass(frozen=True)
 class Tracks(Rows):
-    """The current tracks of all worlds; arrays only, so that they can be saved."""
+    """The current tracks of all global hypotheses; arrays only, so that they can be saved."""
 
     time_s: float
     """Time of the last frame, s."""
     ids: Index
     """(A,) number of each track."""
     world: Index
-    """(A,) world of each track."""
+    """(A,) global hypothesis of each track."""
     joints: JointStates
     """(A, J) states of the joints in the last frame."""
     evident_s: Array
@@ -179,8 +179,8 @@ class Tracker:
     def newcomers(
         self, tracks: Tracks, candidate: Index, detections: Detections, rig: Rig
     ) -> tuple[Array, Index]:
-        """New people among the detections not assigned to the `tracks` of one world: positions (P,
-        J, 3), metres, NaN where unknown, and detections (P, J, V).
+        """New people among the detections not assigned to the `tracks` of one global hypothesis:
+        positions (P, J, 3), metres, NaN where unknown, and detections (P, J, V).
         """
         core, J = list(self.skeleton.core), len(self.skeleton)
         there, found, theirs = (

@@ -53,11 +53,12 @@ class Predicted:
     """(A, J) lost joints, at the position of their neighbour; they are assigned by
     affinity only."""
     world: Index | None = None
-    """(A,) world of each person; people of different worlds do not compete for detections."""
+    """(A,) global hypothesis of each person; people of different global hypotheses do not compete
+    for detections."""
 
 
 class Scored(NamedTuple):
-    """Scores of N pairs of person and detection, sorted by joint and view, then world,
+    """Scores of N pairs of person and detection, sorted by joint and view, then global hypothesis,
     then person.
     """
 

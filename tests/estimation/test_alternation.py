@@ -21,7 +21,7 @@ from shapepose_fg.estimation.estimator_config import (
     RefineConfig,
     WindowGraphConfig,
 )
-from shapepose_fg.estimation.frame_graph import WindowGraph
+from shapepose_fg.estimation.frame_graph import FrameGraph
 from shapepose_fg.estimation.gated_views import (
     ObservationConfig,
     triangulate,
@@ -266,9 +266,9 @@ def test_factors_of_one_s_own_stay_through_all_rounds(five_cameras, two_people):
     """Forearms 3 cm longer than the views say, to within 0.1 mm."""
     seen = observed(five_cameras, two_people)
     length = np.linalg.norm(two_people[:, WRIST] - two_people[:, ELBOW], axis=-1) + 0.03
-    asked: list[WindowGraph] = []
+    asked: list[FrameGraph] = []
 
-    def forearm(window: WindowGraph, keys):
+    def forearm(window: FrameGraph, keys):
         person = len(asked)
         asked.append(window)
         ends = keys[0, [ELBOW, WRIST]].tolist()
@@ -285,7 +285,7 @@ def test_factors_of_one_s_own_stay_through_all_rounds(five_cameras, two_people):
 def test_bodies_follow_what_factors_of_one_s_own_did_to_joints(five_cameras, two_people):
     """The next body is fitted to joints that the factor has moved."""
 
-    def forearm(window: WindowGraph, keys):
+    def forearm(window: FrameGraph, keys):
         ends = keys[0, [ELBOW, WRIST]].tolist()
         return [gtsam.RangeFactor3(*ends, 0.3, gtsam.noiseModel.Isotropic.Sigma(1, 1e-4))]
 
@@ -305,7 +305,7 @@ def test_rounds_end_when_no_joint_moves(five_cameras, two_people, doubtful_wrist
 
 
 def test_a_factor_on_a_joint_that_is_not_known_harms_nobody(five_cameras, two_people):
-    def forearm(window: WindowGraph, keys):
+    def forearm(window: FrameGraph, keys):
         ends = keys[0, [ELBOW, WRIST]].tolist()
         return [gtsam.RangeFactor3(*ends, 0.27, gtsam.noiseModel.Isotropic.Sigma(1, 1e-2))]
 

@@ -11,8 +11,7 @@ from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.condensed_graph import gtsam_step
 from shapepose_fg.estimation.estimator_config import WindowGraphConfig
 from shapepose_fg.estimation.factor_solution import solve_with_factors
-from shapepose_fg.estimation.graph_covariances import graph_covariances
-from shapepose_fg.estimation.person_graph import BodyGraph, ordering
+from shapepose_fg.estimation.person_graph import BodyGraph, graph_covariances, ordering
 from tests.estimation.test_body_window import _person
 
 WRIST, ELBOW, NECK = (BODY_25.index(name) for name in ("RWrist", "RElbow", "Neck"))

@@ -10,9 +10,13 @@ from shapepose_fg.estimation import body_solution
 from shapepose_fg.estimation.body_frames import BodyFrames
 from shapepose_fg.estimation.body_window import BodyState, BodyWindow
 from shapepose_fg.estimation.condensed_graph import gtsam_step
-from shapepose_fg.estimation.covariance_factors import Doubt, covariance_factors, signs_of_doubt
 from shapepose_fg.estimation.motion_densities import MotionModel
 from shapepose_fg.estimation.person_graph import BodyGraph
+from shapepose_fg.estimation.reported_covariances import (
+    AssociationUncertainty,
+    association_features,
+    covariance_factors,
+)
 from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.pipeline import reconstruct
 from shapepose_fg.simulation import built_in_scene, simulate
@@ -87,13 +91,15 @@ def test_a_person_some_of_whose_detections_are_rejected_is_less_sure() -> None:
     window.observations.xy[4, :8, 0] += 400.0  # another person's arms and head in one view
     state = solved(window, start)
     marginals = window.covariances(state)
-    sigma_m, told, used = signs_of_doubt(marginals)
+    sigma_m, told, used = association_features(marginals)
     rejected = 1 - used / told
     others = np.arange(T) != 4
     assert rejected[4] > 0.05 and (rejected[others] < 0.01).all()
     factor = covariance_factors(marginals, 1.0)
     assert factor[4] > 1.3 * factor[others].max()
-    np.testing.assert_allclose(factor, Doubt.measured().in_frames(sigma_m, rejected))
+    np.testing.assert_allclose(
+        factor, AssociationUncertainty.measured().in_frames(sigma_m, rejected)
+    )
 
 
 @pytest.mark.parametrize("less_sure", ["sigma", "rejected"])
@@ -101,7 +107,7 @@ def test_doubt_only_grows(less_sure) -> None:
     sigma_m, rejected = np.full(5, 0.02), np.full(5, 0.1)
     signs = {"sigma": sigma_m, "rejected": rejected}
     signs[less_sure] = signs[less_sure] * np.arange(1, 6)
-    factors = Doubt.measured().in_frames(signs["sigma"], signs["rejected"])
+    factors = AssociationUncertainty.measured().in_frames(signs["sigma"], signs["rejected"])
     assert (np.diff(factors) > 0).all() and factors[0] > 0
 
 

@@ -14,11 +14,14 @@ from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.body_window import BodyWindow
 from shapepose_fg.estimation.condensed_graph import gtsam_step
-from shapepose_fg.estimation.covariance_factors import Lasting, covariance_factors, signs_of_lasting
 from shapepose_fg.estimation.gated_views import ObservationConfig, observation_sigmas
-from shapepose_fg.estimation.graph_covariances import graph_covariances
 from shapepose_fg.estimation.motion_densities import MotionModel
-from shapepose_fg.estimation.person_graph import BodyGraph, ordering
+from shapepose_fg.estimation.person_graph import BodyGraph, graph_covariances, ordering
+from shapepose_fg.estimation.reported_covariances import (
+    CorrelatedErrors,
+    correlation_features,
+    covariance_factors,
+)
 
 T, CAMERAS = 12, 4
 
@@ -72,7 +75,7 @@ def _person(
 
 
 def _lasting(marginals) -> float:
-    return float(Lasting.measured().factor(*signs_of_lasting(marginals)))
+    return float(CorrelatedErrors.measured().factor(*correlation_features(marginals)))
 
 
 def test_joints_are_nearer_the_truth_than_their_views_alone() -> None:

@@ -12,9 +12,8 @@ from factors import DEFAULT_WIDTH_SIGMA, split_key
 from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.observations import Observations
-from shapepose_fg.estimation.alternation_covariances import state_covariances
 from shapepose_fg.estimation.estimator_config import EstimatorConfig, WindowGraphConfig
-from shapepose_fg.estimation.frame_graph import WindowGraph
+from shapepose_fg.estimation.frame_graph import FrameGraph, state_covariances
 from shapepose_fg.estimation.gated_views import ObservationConfig
 
 EXACT = WindowGraphConfig(max_iterations=100, tolerance=1e-12)
@@ -39,7 +38,7 @@ def message(known, xyz, covariance) -> JointTargets:
     return JointTargets(np.reshape(xyz, (-1, 25, 3)), information.reshape(-1, 25, 3, 3))
 
 
-def window_of(rig: Rig, xy, sigmas, config, kernel, frames, person=0) -> WindowGraph:
+def window_of(rig: Rig, xy, sigmas, config, kernel, frames, person=0) -> FrameGraph:
     """A person's graph of observations (T, 25, V, 2) in some frames, 0.1 s apart."""
     frame, V = np.array(frames), len(rig)
     seen = Observations(
@@ -51,7 +50,7 @@ def window_of(rig: Rig, xy, sigmas, config, kernel, frames, person=0) -> WindowG
         np.repeat(0.1 * np.arange(len(frame))[:, None], V, axis=1),
     )
     settings = EstimatorConfig(ObservationConfig(kernel=kernel or "none"), config)
-    return WindowGraph(seen, sigmas, Views.of(rig), settings)
+    return FrameGraph(seen, sigmas, Views.of(rig), settings)
 
 
 class OneFrame:

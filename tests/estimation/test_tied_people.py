@@ -11,9 +11,8 @@ from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.estimation.alternation_covariances import state_covariances
 from shapepose_fg.estimation.estimator_config import EstimatorConfig, WindowGraphConfig
-from shapepose_fg.estimation.frame_graph import WindowGraph
+from shapepose_fg.estimation.frame_graph import FrameGraph, state_covariances
 from shapepose_fg.estimation.gated_views import ObservationConfig
 from shapepose_fg.estimation.user_factors import add_factors
 
@@ -32,7 +31,7 @@ def seen(five_cameras, two_people):
     return truth, xy + np.random.default_rng(0).normal(0, 6.0, xy.shape)
 
 
-def graphs(rig, truth, xy, frames=1) -> list[WindowGraph]:
+def graphs(rig, truth, xy, frames=1) -> list[FrameGraph]:
     """A graph for each person, in so many frames of the same detections."""
     people, V = [], len(rig)
     for number in range(len(truth)):
@@ -49,11 +48,11 @@ def graphs(rig, truth, xy, frames=1) -> list[WindowGraph]:
             np.full((frames, 25, V), 6.0),
             np.repeat(truth[number][None], frames, axis=0),
         )
-        people.append(WindowGraph(seen, sigmas, Views.of(rig), settings, first=first))
+        people.append(FrameGraph(seen, sigmas, Views.of(rig), settings, first=first))
     return people
 
 
-def solve(people: list[WindowGraph], truth) -> None:
+def solve(people: list[FrameGraph], truth) -> None:
     nothing = JointTargets(np.full((1, 25, 3), np.nan), np.zeros((1, 25, 3, 3)))
     for number, person in enumerate(people):
         person.prepare(np.ones((1, 25, 5), bool), nothing, truth[number][None])

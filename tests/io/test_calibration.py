@@ -208,7 +208,7 @@ BAD_OWN = [
     (("cameras", 1, "cTw"), "remove", 'camera "b": give exactly one of wTc and cTw'),
     (("cameras", 1, "cTw", 0, 0), 0.5, 'camera "b": the rotation of cTw is not orthonormal'),
     (("cameras",), {}, "cameras must be a list, got an object"),
-    (("cameras",), [], "a rig needs a camera"),
+    (("cameras",), [], "a rig must have at least one camera"),
 ]
 
 

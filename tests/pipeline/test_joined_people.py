@@ -12,9 +12,9 @@ from factors import isotropic
 from shapepose_fg import PipelineConfig, Reconstruction, explain, reconstruct
 from shapepose_fg.cli.main import main
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.estimation.uncertainty import JointAt, distance
 from shapepose_fg.pipeline.config import WindowConfig
 from shapepose_fg.results.solve_again import Solver, solve_rows, window_solutions
+from shapepose_fg.results.uncertainty import JointAt, distance
 from shapepose_fg.simulation import built_in_scene, simulate
 
 R, L = BODY_25.index("RWrist"), BODY_25.index("LWrist")

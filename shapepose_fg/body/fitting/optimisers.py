@@ -59,8 +59,8 @@ class NetworkDescent:
     def arrive(
         self, targets: EnergyTargets, variance: Array, start: Array | None = None
     ) -> tuple[Array, Held]:
-        """Parameters (B, P) after the network's steps from the closed form, and priors centred
-        there.
+        """Parameters (B, P) after the network's steps, which begin at the closed-form solution, and
+        priors centred at them.
 
         `variance` (B, J) of each target, m², is infinite unless it is known in all directions.
         """

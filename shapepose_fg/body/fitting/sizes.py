@@ -24,7 +24,7 @@ _ROUNDS = 2
 
 def points_at_rest(body: BodyModel) -> tuple[Array, Array]:
     """All points of the mean body in T-pose, relative to its pelvis, (150,), metres, and
-    derivatives by betas, (150, 10).
+    their derivatives by the betas, (150, 10).
     """
     betas = np.concatenate((np.zeros((1, 10)), np.eye(10)))
     xyz = body.points.positions(np.tile(np.eye(3), (11, 24, 1, 1)), betas, np.zeros((11, 3)))

@@ -263,9 +263,9 @@ class _Mesh:
     template: Array
     """(Nv, 3) vertices at rest, metres."""
     shapes: Array
-    """(10, Nv * 3) derivatives by each beta, metres."""
+    """(10, Nv * 3) derivatives of the vertices by each beta, metres."""
     pose_blend: Array | None
-    """(207, Nv * 3) derivatives by each entry of R - I, metres."""
+    """(207, Nv * 3) derivatives of the vertices by each entry of R - I, metres."""
     rest_joints: Array
     """(N, 3) joints at rest, metres."""
     rest_joint_shapes: Array

@@ -38,7 +38,7 @@ class SkinnedPoints:
     offsets_shape: Array
     """(10, K, 3, 24) derivatives of `offsets` by each beta, metres."""
     offsets_pose: Array | None
-    """(207, K, 3, 24) derivatives by each entry of R - I, metres; None without pose
+    """(207, K, 3, 24) derivatives of the points by each entry of R - I, metres; None without pose
     blend shapes."""
     root: Array
     """(K, 3) metres: a_k J_0 of the mean shape."""

@@ -47,10 +47,10 @@ class SmplArrays:
     template: Array
     """(Nv, 3) vertices of the mean body in T-pose, metres, y up, facing +z."""
     shapes: Array
-    """(Nv, 3, 10) derivatives by each beta, metres."""
+    """(Nv, 3, 10) derivatives of the vertices by each beta, metres."""
     pose_blend: Array | None
-    """(Nv, 3, 207) derivatives by each entry of R - I, metres; None if the file has none or only
-    zeros."""
+    """(Nv, 3, 207) derivatives of the vertices by each entry of R - I, metres; None if the file has
+    none or only zeros."""
     joint_regressor: Array
     """(24, Nv) regressor of the joints from the shaped template."""
     weights: Array

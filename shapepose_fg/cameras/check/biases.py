@@ -86,8 +86,8 @@ class Residuals:
         return _count(self.part)
 
     def camera(self, view: int, which: list[int], share: Array | float = 1.0) -> Array:
-        """(C, n) directions of a camera's `parameters.PARAMETERS`; rotations weighted by `share`
-        (K,) per part.
+        """(C, n) changes of all columns if one of the parameters `which` of a camera changes
+        (`parameters.PARAMETERS`); `share` (K,) scales a rotation in each part of the recording.
         """
         V, K = self.size_px.shape[1], self.parts
         directions = np.zeros((V, Q - 3 + 3 * K, Q))
@@ -128,7 +128,8 @@ class Residuals:
         ]
 
     def _rows(self, views: Views) -> Array:
-        """(N, J, 2 V, n) derivatives by cameras, the joint's bias and the scaling, and residuals.
+        """(N, J, 2 V, n) derivatives of residuals by cameras, the joint's bias and the scaling, and
+        the residuals.
 
         All are weighted, with the joint's position eliminated.
         """

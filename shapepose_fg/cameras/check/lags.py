@@ -1,4 +1,4 @@
-"""Time offset of each camera against the others, of which it says whether it is significant."""
+"""Estimates the time offset of each camera against the others, and whether it is significant."""
 
 from dataclasses import dataclass
 

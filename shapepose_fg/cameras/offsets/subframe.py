@@ -1,7 +1,9 @@
-"""Time offsets of cameras with known poses to parts of a frame, from tracks of people.
+"""Estimates time offsets of cameras with known poses, with sub-frame precision, from tracks of
+people.
 
-With two cameras, rays of one person are to intersect (`Pairwise`). With more, positions and
-velocities of joints from the other cameras are compared with each camera's view (`InSpace`).
+With two cameras, the distance between the rays of one person is minimised (`Pairwise`). With more,
+each camera's view is compared with positions and velocities of joints from the other cameras
+(`InSpace`).
 """
 
 from dataclasses import dataclass, replace
@@ -66,7 +68,8 @@ class Pairwise:
     def solved(self) -> tuple[Array, Array]:
         """(2,) shifts of two cameras in frames and their covariance (2, 2); infinite where unknown.
 
-        The rays of one camera are to intersect those of the other, `shift` frames later.
+        They minimise the distance of rays of one camera to those of the other, `shift` frames
+        later.
         """
         (one, other), shift, covariance = self.tracks, self.shift.copy(), np.diag([0.0, np.inf])
         rows, track = self._matched()

@@ -74,7 +74,7 @@ def _table(value: Any, path: Path, place: str) -> dict[str, Any]:
 
 
 def _check_names(names: list[str], path: Path) -> None:
-    """InputError for names that are not valid for a folder, or that are equal on some file
+    """Raise InputError for names that are not valid for a folder, or that are equal on some file
     systems.
     """
     seen = {"batch.json": "batch.json"}

@@ -236,8 +236,8 @@ def _go_to(stream: IO[bytes], place: int) -> None:
 
 
 def _check_members(members: Sequence[zipfile.ZipInfo], size: int) -> None:
-    """ValueError for members of a zip file that `np.savez` would not write, or that are too large
-    for a file of `size` bytes.
+    """Raise ValueError for members of a zip file that `np.savez` would not write, or that are too
+    large for a file of `size` bytes.
     """
     for member in members:
         if member.flag_bits & 1:

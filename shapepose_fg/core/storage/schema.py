@@ -95,7 +95,9 @@ class Column:
         return array
 
     def check_range(self, name: str, array: NDArray[Any]) -> None:
-        """ValueError if a value is outside the column's bounds, or unknown where it must not be."""
+        """Raise ValueError if a value is outside the column's bounds, or unknown where it must not
+        be.
+        """
         if array.size == 0 or array.dtype.kind not in "iuf":
             return
         if self.finite and not np.isfinite(array).all():
@@ -114,7 +116,9 @@ class Column:
 def checked_columns(
     columns: Mapping[str, Column], arrays: Mapping[str, Any], sizes: dict[str, int]
 ) -> dict[str, NDArray[Any]]:
-    """Arrays as their `columns` say, and in range; ValueError that names the first that is not."""
+    """Arrays as described by their `columns`, and in range; ValueError that names the first that is
+    not.
+    """
     found = {name: column.checked(name, arrays[name], sizes) for name, column in columns.items()}
     for name, column in columns.items():
         column.check_range(name, found[name])
@@ -185,7 +189,7 @@ class Table(Rows):
         return super().concatenate(parts, **others)
 
     def check_ranges(self) -> None:
-        """ValueError for impossible values, such as negative frames, or joints thousands of
+        """Raise ValueError for impossible values, such as negative frames, or joints thousands of
         kilometres away.
         """
         for name, column in columns_of(type(self)).items():

@@ -126,8 +126,8 @@ def _refuse_long(path: Path, text: str) -> None:
 
 
 def _refuse_hostile(path: Path, text: str) -> None:
-    """InputError for deeply nested nodes, and for aliases: a few of them can expand to more than
-    fits into memory.
+    """Raise InputError for deeply nested nodes, and for aliases: a few of them can expand to more
+    than fits into memory.
     """
     depth = 0
     for event in yaml.parse(text, _Safe):

@@ -1,5 +1,8 @@
 """Reads calibration files as a `Rig`: recognises the format, and names values that the user must
 give because the file does not define them.
+
+A format of your own is an entry in `FORMATS`, with a function that converts the `Content` of a file
+to a `WrittenRig`, or returns None if the file has another format. `xml_files.py` is an example.
 """
 
 from collections.abc import Sequence

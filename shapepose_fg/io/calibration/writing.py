@@ -91,8 +91,8 @@ def write_pose2sim(rig: Rig, target: Path) -> None:
 
 
 def check_target(source: Path, target: Path) -> None:
-    """InputError if `target` has neither the suffix of `source`'s format nor .json (this project's
-    rig file).
+    """Raise InputError if `target` has neither the suffix of `source`'s format nor .json (this
+    project's rig file).
     """
     _, form, _ = _found(source)
     several = source.is_dir() or form.name in _SEVERAL

@@ -310,7 +310,7 @@ def _numbers(path: Path, dataset: Any) -> Array:
 
 
 def _check_size(path: Path, count: float, shape: tuple[int, ...]) -> None:
-    """InputError if the file is too small for this number of values."""
+    """Raise InputError if the file is too small for this number of values."""
     if 8 * count > max(BIG, MOST_PACKED * path.stat().st_size):
         raise InputError(
             f"{path}: its arrays {shape} are too large; export a part of the recording"

@@ -119,7 +119,7 @@ class Format:
     name: str
     """Name on the command line."""
     writer: str
-    """Module and function that writes it: `write(job: Job) -> Written`. With `rows` it is
+    """Module and function that writes it: `write(job: Job) -> Written`. With `rows`, it is
     `write(opened, rows, folder) -> Written` of an `OpenedReconstruction` and row numbers (R,), None
     for all."""
     identities: bool = True

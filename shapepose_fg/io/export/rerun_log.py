@@ -357,7 +357,7 @@ def log_pictures(
     """
     rr = optional("rerun", "view")
     if take.rig is None:
-        raise ValueError("pictures need cameras")
+        raise ValueError("pictures are only shown with cameras; cameras.json is missing")
     done, total = 0, len(pictures) * len(take.frames)
     for used, footage in pictures:
         camera = take.rig.cameras[take.rig.names.index(used.name)]

@@ -167,8 +167,8 @@ def _moved(rig: Rig, origin: Array) -> Rig:
 
 
 def _check_memory(persons: int, frames: int) -> None:
-    """InputError if the joints of all people in all frames, and one person's body, do not fit in
-    memory.
+    """Raise InputError if the joints of all people in all frames, and one person's body, do not fit
+    in memory.
     """
     what = f"people.npz: {persons} people over {frames} frames"
     check_memory(what, frames * (2 * 8 * persons + _BODY_BYTES), "--frames, --person")

@@ -65,7 +65,7 @@ class PeopleTopics:
     ) -> Iterator[Published]:
         """Yield the people of one frame; `kind` is `now` or `settled`.
 
-        With `has_bodies` also /tf and the topics of REP 155, which have one pose of each person at
+        With `has_bodies`, also /tf and the topics of REP 155, which have one pose of each person at
         a time and must be of one kind.
         """
         here = f"/people/{kind}"

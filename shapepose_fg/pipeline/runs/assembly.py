@@ -110,7 +110,7 @@ class Assembly:
     def reconstruction(self, every: int = 1, *, consume: bool = False) -> Reconstruction:
         """The result in memory, all of it or every n-th frame.
 
-        With `consume` the parts are released after reading, so that rows are not in memory twice;
+        With `consume`, the parts are released after reading, so that rows are not in memory twice;
         nothing else can be assembled afterwards.
         """
         chosen = [np.flatnonzero(frame % every == 0) for frame in self.pieces("frame")]

@@ -40,7 +40,7 @@ def open_run(
     """The folder of a run into `output` with inputs `begun`, plain values; or of the resumed one,
     with `resume`.
 
-    With `restart` the files of an interrupted run are removed. Raises InputError if there are some
+    With `restart`, the files of an interrupted run are removed. Raises InputError if there are some
     and neither is given, and if its inputs were others: the first difference is named. The caller
     must be the only run in `output`.
     """

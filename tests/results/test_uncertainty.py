@@ -15,7 +15,8 @@ from shapepose_fg.core.errors import NotDetermined
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.core.trajectory import Trajectory
-from shapepose_fg.estimation.uncertainty import (
+from shapepose_fg.results.solve_again import window_solutions
+from shapepose_fg.results.uncertainty import (
     Distance,
     JointAt,
     correlation,
@@ -26,7 +27,6 @@ from shapepose_fg.estimation.uncertainty import (
     squared_radius,
     surface_distance,
 )
-from shapepose_fg.results.solve_again import window_solutions
 from shapepose_fg.simulation import built_in_scene, simulate
 from shapepose_fg.viz.overlay.frames import surfaces
 

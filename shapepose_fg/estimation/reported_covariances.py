@@ -1,7 +1,16 @@
-"""How much larger reported covariances are than those of the graph: errors of detectors last, and
-some detections are another person's.
+"""Reported covariances of joints: the factor by which they are larger than the marginals of the
+graph, because errors of detectors are correlated over time, and some detections are another
+person's.
 
-All covariances of a graph get one factor, by which neither its solution nor its gates change.
+`solve_bodies` in `body_solution.py` makes the covariance of a joint, and lists its terms:
+
+1. the marginal of the person's graph: `BodyWindow.covariances` and `Marginals` in
+   `body_window.py`; with user factors `graph_covariances` in `person_graph.py`;
+2. times the person's factor: `covariance_factors` in this file;
+3. plus errors of the poses of moving cameras: `camera_pose_uncertainty.py`;
+4. plus the error if left and right are exchanged: `mirrored_sides.py`.
+
+One factor applies to all covariances of a graph, so its solution and its gates do not change.
 """
 
 from dataclasses import dataclass
@@ -14,44 +23,43 @@ from shapepose_fg.core.shipped_numbers import shipped_numbers
 from shapepose_fg.estimation.body_window import Marginals
 
 REJECTED = 0.1
-"""Share of rejected evidence that means as much as a doubled variance."""
+"""Unit of the share of rejected evidence: the base of `AssociationUncertainty.rejected` is 2 at
+this share."""
 _LASTS_S, _LASTS, _PRIOR_COUNT = 1.0, 0.4, 20.0
 """Time lag, s, at which residuals are compared for correlated errors; the prior share of correlated
 errors, and the prior's weight, as a number of squared standard deviations."""
 _LOOKS = 8
-"""Number of frames, evenly over the window, from which it is taken how much it averages."""
+"""Number of frames, spread evenly over the window, in which single-frame variances are computed."""
 _ANYWHERE = 1e-3
-"""Information on the place and direction of a body in a frame by itself, 1/m² and 1/rad²."""
+"""Prior information on the place and direction of a body in a single frame, 1/m² and 1/rad²."""
 
 
 @dataclass(frozen=True)
-class Lasting:
-    """How errors of detections that are new in a frame, and those that last, add up in a window."""
+class CorrelatedErrors:
+    """Weights of independent and of correlated detection errors in the covariances of a window."""
 
-    new: float
-    """Factor on the variances that errors leave which are new in every frame."""
-    lasting: float
-    """Factor on the variances that errors leave which last. It is larger, since residuals show
-    fewer of these."""
+    independent: float
+    """Factor on variances if the errors of all frames are independent."""
+    correlated: float
+    """Factor on variances if errors stay the same over the window. It is larger, because residuals
+    show less of such errors."""
 
     @classmethod
     @cache
-    def measured(cls) -> "Lasting":
+    def measured(cls) -> "CorrelatedErrors":
         """The numbers that ship, measured by `scripts/fit_covariances.py`."""
-        return cls(**shipped_numbers("estimation", "covariances")["lasting"])
+        return cls(**shipped_numbers("estimation", "covariances")["correlated_errors"])
 
-    def factor(self, share: Array | float, alone: Array | float) -> Array | float:
-        """Factor on the variances of a window, for the share of errors that last, and how many
-        times larger variances are that the same views leave in a frame by itself.
+    def factor(self, share: Array | float, ratio: Array | float) -> Array | float:
+        """Factor on the variances of a window, for the `share` of correlated errors and the `ratio`
+        of single-frame variances to those of the window (`correlation_features`).
         """
-        return self.new * (1 - share) + self.lasting * share * alone
+        return self.independent * (1 - share) + self.correlated * share * ratio
 
 
 @dataclass(frozen=True)
-class Doubt:
-    """How much less certain people are than their graphs, because some of their detections are
-    another person's.
-    """
+class AssociationUncertainty:
+    """Factors on variances because some detections of a person are another person's."""
 
     scale: float
     """Factor on all variances in single frames."""
@@ -63,12 +71,14 @@ class Doubt:
 
     @classmethod
     @cache
-    def measured(cls) -> "Doubt":
+    def measured(cls) -> "AssociationUncertainty":
         """The numbers that ship, measured by `scripts/fit_covariances.py`."""
-        return cls(**shipped_numbers("estimation", "covariances")["doubt"])
+        return cls(**shipped_numbers("estimation", "covariances")["association_uncertainty"])
 
     def in_frames(self, sigma_m: Array, rejected: Array) -> Array:
-        """(T,) factors on variances in single frames, which show less of who is who."""
+        """(T,) factors on variances in single frames, for the mean standard deviation of each row,
+        metres, and the share of rejected evidence. Without time, associations are less certain.
+        """
         return self.scale * (sigma_m / 1e-2) ** self.sigma * self.of_rejected(rejected)
 
     def of_rejected(self, rejected: Array) -> Array:
@@ -79,18 +89,20 @@ class Doubt:
 def covariance_factors(marginals: Marginals, noise: float) -> Array:
     """Factors on variances: (1,) of a person's window, or (T,) of people in single frames.
 
-    `noise` is the standard deviation of the recording's detections over the usual one. Detections
-    have it already; beyond it, such detectors have more large errors.
+    `noise` is the ratio of the standard deviation of the recording's detections to the usual one.
+    The detections are weighted by it already; this factor is for large errors, which are also more
+    frequent with such detectors.
     """
-    doubt, (sigma_m, told, used) = Doubt.measured(), signs_of_doubt(marginals)
+    association = AssociationUncertainty.measured()
+    sigma_m, told, used = association_features(marginals)
     if not marginals.window.over_time:
-        return doubt.in_frames(sigma_m, 1 - used / np.maximum(told, 1e-9))
+        return association.in_frames(sigma_m, 1 - used / np.maximum(told, 1e-9))
     rejected = 1 - used.sum(keepdims=True) / max(told.sum(), 1e-9)
-    lasting = Lasting.measured().factor(*signs_of_lasting(marginals))
-    return np.sqrt(noise) * lasting * doubt.of_rejected(rejected)
+    correlated = CorrelatedErrors.measured().factor(*correlation_features(marginals))
+    return np.sqrt(noise) * correlated * association.of_rejected(rejected)
 
 
-def signs_of_doubt(marginals: Marginals) -> tuple[Array, Array, Array]:
+def association_features(marginals: Marginals) -> tuple[Array, Array, Array]:
     """(T,) mean standard deviation of each row's joints, metres; (T,) its evidence, the weights
     w_ij of Eq. 1, and (T,) the part of it that gates do not reject.
     """
@@ -101,7 +113,7 @@ def signs_of_doubt(marginals: Marginals) -> tuple[Array, Array, Array]:
     return sigma_m, told.sum(axis=(1, 2)), used.sum(axis=(1, 2))
 
 
-def signs_of_lasting(marginals: Marginals) -> tuple[float, float]:
+def correlation_features(marginals: Marginals) -> tuple[float, float]:
     """The share of correlated errors in a window, and the ratio of the variances that the same
     views give in a single frame to those of the window.
 
@@ -124,10 +136,10 @@ def signs_of_lasting(marginals: Marginals) -> tuple[float, float]:
     kept = np.eye(3) - gain
     alone = np.trace(kept @ of_body @ kept.mT + variance * kept, axis1=-2, axis2=-1)
     over_time = np.trace(marginals.joints()[some], axis1=-2, axis2=-1)
-    return _share_lasting(marginals), float(np.exp(np.log(alone / over_time)[seen].mean()))
+    return _correlated_share(marginals), float(np.exp(np.log(alone / over_time)[seen].mean()))
 
 
-def _share_lasting(marginals: Marginals) -> float:
+def _correlated_share(marginals: Marginals) -> float:
     """Share of correlated errors in the variance of detections: the correlation of residuals that
     are `_LASTS_S` apart.
     """
