@@ -6,10 +6,10 @@ from functools import cached_property
 
 import numpy as np
 
-from shapepose_fg.cameras.people import MOST_FRAMES
 from shapepose_fg.cameras.resection import Others, match, possible_matches
 from shapepose_fg.cameras.sightings import (
     GATE,
+    MOST_FRAMES,
     Groups,
     Pairs,
     Pinhole,
