@@ -14,7 +14,6 @@ of eight people and six cameras, from recorded motions if these are available. L
 made by playing it forwards and backwards.
 """
 
-import argparse
 import json
 import math
 import os
@@ -28,9 +27,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
+from typing import Annotated
 
 from rich.console import Console
 from rich.table import Table
+from typer import BadParameter, Option, Typer
 
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.compiling import cores
@@ -83,41 +84,38 @@ class Spent:
     """Wall time of each stage, seconds, without that of stages inside it."""
 
 
-def main() -> None:
+app = Typer(add_completion=False)
+
+
+@app.command(help=__doc__)
+def main(
+    against: Annotated[str | None, Option(help="Commit to be compared with.")] = None,
+    case: Annotated[list[str] | None, Option(help=f"Some of {[*CASES]}; default: all.")] = None,
+    rounds: Annotated[int, Option(help="Counted runs of each.")] = 5,
+    data: Annotated[
+        Path,
+        Option(help="Folder with data/shelf, or with calibration.json.", envvar="SHAPEPOSE_DATA"),
+    ] = HERE.parent / "shared",
+    frames: Annotated[int | None, Option(help="Only the first frames of each recording.")] = None,
+    grow: Annotated[bool, Option("--growth", help="How time and memory grow.")] = False,
+) -> None:
     """Run the measurements and print the tables."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    data = os.environ.get("SHAPEPOSE_DATA", HERE.parent / "shared")
-    parser.add_argument(
-        "--against", metavar="COMMIT", help="compare with this commit, which is checked out beside"
-    )
-    parser.add_argument(
-        "--cases", nargs="*", default=list(CASES), choices=CASES, metavar="CASE", help=str([*CASES])
-    )
-    parser.add_argument("--rounds", type=int, default=5, help="counted runs of each")
-    parser.add_argument(
-        "--data", type=Path, default=data, help="folder with data/shelf, or with calibration.json"
-    )
-    parser.add_argument(
-        "--frames", type=int, help="the first frames of each recording only (default: all)"
-    )
-    parser.add_argument("--growth", action="store_true", help="how time and memory grow")
-    arguments = parser.parse_args()
+    for unknown in set(case or ()) - CASES.keys():
+        raise BadParameter(f"{unknown}: must be one of {', '.join(CASES)}")
     console = Console()
     console.print(_machine(), highlight=False)
-    if arguments.growth:
+    if grow:
         with tempfile.TemporaryDirectory() as work:
             return console.print(growth(Path(work)))
-    with tempfile.TemporaryDirectory() as work, _checkouts(arguments.against, Path(work)) as trees:
+    with tempfile.TemporaryDirectory() as work, _checkouts(against, Path(work)) as trees:
         made: dict[str, tuple[list[str], int]] = {}
-        for case in arguments.cases:
-            kind, more = CASES[case]
+        for name in case or CASES:
+            kind, more = CASES[name]
             if kind not in made:
-                made[kind] = _written(kind, arguments.data, Path(work) / kind, arguments.frames)
-            options, frames = made[kind]
-            spent = compare(trees, [*options, *more], Path(work), arguments.rounds)
-            console.print(_table(case if "--frames" in more else f"{case}: {frames} frames", spent))
+                made[kind] = _written(kind, data, Path(work) / kind, frames)
+            options, count = made[kind]
+            spent = compare(trees, [*options, *more], Path(work), rounds)
+            console.print(_table(name if "--frames" in more else f"{name}: {count} frames", spent))
 
 
 def compare(
@@ -302,4 +300,4 @@ def _table(title: str, spent: dict[str, list[Spent]]) -> Table:
 
 
 if __name__ == "__main__":
-    main()
+    app()

@@ -5,13 +5,12 @@ The wheel is built from the sdist, so that files missing in the sdist are notice
 reuses the dependencies of the running one (torch is a large download), but nothing from this
 folder.
 
-With --versions oldest newest, one environment is made with the oldest versions that pyproject.toml
-allows (as far as wheels for the interpreter exist), and one with the newest, without
-constraints.txt. In each, the demo and then the fast tests are run. --python python3.11 python3.13
-tests other interpreters. Exit code 1 if something fails.
+With --versions both, one environment is made with the oldest versions that pyproject.toml allows
+(as far as wheels for the interpreter exist), and one with the newest, without constraints.txt. In
+each, the demo and then the fast tests are run. --python python3.11 tests another interpreter. Exit
+code 1 if something fails.
 """
 
-import argparse
 import os
 import subprocess
 import sys
@@ -20,6 +19,9 @@ import tempfile
 import time
 import venv
 from pathlib import Path
+from typing import Annotated, Literal
+
+from typer import Option, Typer
 
 ROOT = Path(__file__).parent.parent
 USE = """
@@ -49,40 +51,37 @@ print(f"Python {platform.python_version()}", *versions, sep=", ")
 """
 
 
-def main() -> None:
+app = Typer(add_completion=False)
+
+
+@app.command(help=__doc__)
+def main(
+    versions: Annotated[
+        Literal["oldest", "newest", "both"] | None, Option(help="Versions of dependencies.")
+    ] = None,
+    python: Annotated[
+        list[str] | None, Option(help="Interpreters; by default the one that runs this.")
+    ] = None,
+    tests: Annotated[str, Option(help="Files of tests; empty: only the demo.")] = "tests",
+    folder: Annotated[
+        Path | None, Option(help="Folder in which environments stay, for the next time.")
+    ] = None,
+) -> None:
     """Create and test the environments one after the other."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--versions", nargs="+", choices=("oldest", "newest"), help="versions of dependencies"
-    )
-    parser.add_argument(
-        "--python", nargs="*", default=[sys.executable], help="interpreters; by default this one"
-    )
-    parser.add_argument(
-        "--tests", nargs="*", default=["tests"], help="files of tests; none: only the demo"
-    )
-    parser.add_argument(
-        "--folder", type=Path, help="folder in which environments stay, for the next time"
-    )
-    arguments = parser.parse_args()
     failed = False
     with tempfile.TemporaryDirectory() as temporary:
-        folder = (arguments.folder or Path(temporary)).absolute()
-        tries = [
-            (python, which) for python in arguments.python for which in arguments.versions or ()
-        ]
-        for python, which in tries or [(sys.executable, "built")]:
-            begin, place = time.monotonic(), folder / f"{Path(python).name}-{which}"
+        room = (folder or Path(temporary)).absolute()
+        wanted = {"both": ("oldest", "newest"), None: ()}.get(versions, (versions,))
+        tries = [(each, which) for each in python or [sys.executable] for which in wanted]
+        for each, which in tries or [(sys.executable, "built")]:
+            begin, place = time.monotonic(), room / f"{Path(each).name}-{which}"
             place.mkdir(parents=True, exist_ok=True)
             try:
-                said = tried(python, which, place, arguments.tests) if tries else built(place)
+                said = tried(each, which, place, tests.split()) if tries else built(place)
             except RuntimeError as error:
                 failed, said = True, f"failed: {error}"
-            print(
-                f"{python}, {which}: {said} ({(time.monotonic() - begin) / 60:.0f} min)", flush=True
-            )
+            minutes = (time.monotonic() - begin) / 60
+            print(f"{each}, {which}: {said} ({minutes:.0f} min)", flush=True)
     sys.exit(failed)
 
 
@@ -154,4 +153,4 @@ def tried(python: str, which: str, place: Path, tests: list[str]) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    app()

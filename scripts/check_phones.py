@@ -11,16 +11,16 @@ phones whose rotation and position are within theirs; for the carried phone the 
 (95 %). Run it from a clone. About three minutes per room on one core.
 """
 
-import argparse
 import contextlib
 import io
 import json
-import os
 import sys
 import tempfile
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from typer import Option, Typer
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
@@ -98,22 +98,23 @@ def measure(room: int, mocap: Mocap, folder: Path, logs: bool) -> str:
     )
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    given = os.environ.get("SHAPEPOSE_DATA", Path(__file__).parents[2] / "shared")
-    parser.add_argument("--rooms", default="0:6", help="which rooms, first:stop")
-    parser.add_argument("--logs", action="store_true", help="lenses from the phones' logs")
-    parser.add_argument("--data", type=Path, default=given)
-    arguments = parser.parse_args()
-    mocap = Mocap.load(arguments.data / "data" / "cmu_mocap" / "cmu_smpl24.npz")
+app = Typer(add_completion=False)
+
+
+@app.command(help=__doc__)
+def main(
+    rooms: Annotated[str, Option(help="Which rooms, first:stop.")] = "0:6",
+    logs: Annotated[bool, Option("--logs", help="Lenses from the phones' logs.")] = False,
+    data: Annotated[Path, Option(envvar="SHAPEPOSE_DATA")] = Path(__file__).parents[2] / "shared",
+) -> None:
+    """Measure the rooms, and print a line for each."""
+    mocap = Mocap.load(data / "data" / "cmu_mocap" / "cmu_smpl24.npz")
     print(HEAD)
     print("|---|---|---|---|---|---|---|")
-    for room in range(*map(int, arguments.rooms.split(":"))):
+    for room in range(*map(int, rooms.split(":"))):
         with tempfile.TemporaryDirectory() as folder:
-            print(measure(room, mocap, Path(folder), arguments.logs), flush=True)
+            print(measure(room, mocap, Path(folder), logs), flush=True)
 
 
 if __name__ == "__main__":
-    main()
+    app()

@@ -10,14 +10,15 @@ of files that it wrote. About a minute
 and a half per room on one core.
 """
 
-import argparse
 import csv
 import sys
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
+from typer import Option, Typer
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
@@ -44,25 +45,27 @@ from tests.cameras.check.spoiled_setups import (
 FRAMES = 150
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--rigs", default="0:20", help="which rooms, first:stop")
-    parser.add_argument("--output", type=Path, help="CSV file with a line for each check")
-    parser.add_argument("--only", choices=("faults", "biases"))
-    parser.add_argument("--read", nargs="*", type=Path, help="such files, instead of rooms")
-    arguments = parser.parse_args()
+app = Typer(add_completion=False)
+
+
+@app.command(help=__doc__)
+def main(
+    rigs: Annotated[str, Option(help="Which rooms, first:stop.")] = "0:20",
+    output: Annotated[Path | None, Option(help="CSV file with a line for each check.")] = None,
+    only: Literal["faults", "biases"] | None = None,
+    read: Annotated[list[Path] | None, Option(help="Such a file, instead of rooms.")] = None,
+) -> None:
+    """Check the rooms, and print the tables."""
     rows = list[list[object]]()
-    for file in arguments.read or ():
+    for file in read or ():
         lines = file.read_text(encoding="utf-8").splitlines()
         rows += [list[object](line) for line in csv.reader(lines)]
-    for seed in () if rows else range(*map(int, arguments.rigs.split(":"))):
+    for seed in () if rows else range(*map(int, rigs.split(":"))):
         rng = np.random.default_rng([seed, 20])
         people, cameras = int(rng.choice([1, 2, 3, 4, 6, 8])), int(rng.integers(3, 7))
         scene = built_in_scene(seed, people=people, cameras=cameras, frames=FRAMES)
         seen, room = simulate(scene, seed=seed), (seed, people, cameras)
-        for each in _faults(seen, scene, rng) if arguments.only != "biases" else ():
+        for each in _faults(seen, scene, rng) if only != "biases" else ():
             found = [
                 f for f in check_setup(each.detections, each.rig).findings if not _of_several(f)
             ]
@@ -72,12 +75,12 @@ def main() -> None:
                 [*room, "fault", each.what, first_named and len(found) == 1, named, _words(found)]
             )
             print(*rows[-1], flush=True)
-        for what, detections in _biased(seen, scene, rng) if arguments.only != "faults" else ():
+        for what, detections in _biased(seen, scene, rng) if only != "faults" else ():
             found = check_setup(detections, scene.rig).findings
             rows.append([*room, "sound", what, len(found) > 0, False, _words(found)])
             print(*rows[-1], flush=True)
-    if arguments.output is not None:
-        with arguments.output.open("w", newline="") as file:
+    if output is not None:
+        with output.open("w", newline="") as file:
             csv.writer(file).writerows(rows)
     for kind, titles in (("fault", "named first | named |"), ("sound", "accused |")):
         counts = defaultdict[str, list[list[bool]]](list)
@@ -182,4 +185,4 @@ def _biased(
 
 
 if __name__ == "__main__":
-    main()
+    app()

@@ -13,18 +13,18 @@ recordings and people whose detections have new errors in every frame count half
 hold 95 %: errors have heavier tails than a Gaussian, those of Student's t.
 """
 
-import argparse
 import json
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 from unittest.mock import patch
 
 import numpy as np
 from scipy.optimize import minimize, minimize_scalar
 from scipy.stats import chi2, f
+from typer import Option, Typer
 
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
@@ -72,17 +72,19 @@ SHARES = (0.7, 1.0)
 """Shares in the log score of joints that are seen by one view, and by two or more."""
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--mocap", type=Path, required=True, help="file of recorded motions")
-    parser.add_argument("--output", type=Path, required=True, help="JSON file to be written")
-    arguments = parser.parse_args()
-    mocap = Mocap.load(arguments.mocap)
+app = Typer(add_completion=False)
+
+
+@app.command(help=__doc__)
+def main(
+    mocap: Annotated[Path, Option(help="File of recorded motions.")],
+    output: Annotated[Path, Option(help="JSON file to be written.")],
+) -> None:
+    """Simulate all cases, and write what fits their errors."""
+    motions = Mocap.load(mocap)
     laws, frames, windows = list[NoiseLaw](), list[Columns](), list[Columns]()
     for case in CASES:
-        scene, seed = scene_of(*case, mocap), case[2]
+        scene, seed = scene_of(*case, motions), case[2]
         given = simulate(scene, seed=seed), scene.rig, FrameTimes.from_fps(FPS, len(scene))
         solved, people = solutions(*given, scene.cuts, temporal=False)
         laws.append(NoiseLaw.from_dict(people.run["noise_law"]))
@@ -101,7 +103,7 @@ def main() -> None:
         "correlated_errors": asdict(correlated),
         "tails": tails_of([part for part, _ in widened(windows, correlated, association)]),
     }
-    arguments.output.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    output.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
 def mean_law(laws: list[NoiseLaw]) -> dict:
@@ -263,4 +265,4 @@ def limited(squared: np.ndarray) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    main()
+    app()

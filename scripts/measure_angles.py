@@ -6,12 +6,13 @@ writes the tables into the page between the marks `<!-- angles -->` and `<!-- en
 `<!-- elbows -->` and `<!-- end -->`. About a minute per recording on one core.
 """
 
-import argparse
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from typer import Option, Typer
 
 from shapepose_fg.biomechanics.joint_angles import NAMES, joint_angles
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
@@ -125,15 +126,16 @@ def table(measured: dict[str, tuple[Array, Array]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+app = Typer(add_completion=False)
+
+
+@app.command(help=__doc__)
+def main(
+    mocap: Annotated[Path, Option(help="File of recorded motions.")],
+    update: Annotated[bool, Option("--update", help="Write the tables into the page.")] = False,
+) -> None:
     """Measure, print and perhaps write the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--mocap", type=Path, required=True, help="file of recorded motions")
-    parser.add_argument("--update", action="store_true", help="write the table into the page")
-    given = parser.parse_args(arguments)
-    measured = {name: measure(scene) for name, scene in scenes(Mocap.load(given.mocap))}
+    measured = {name: measure(scene) for name, scene in scenes(Mocap.load(mocap))}
     page = PAGE.read_text(encoding="utf-8")
     for name, rows in (
         ("angles", table({name: each[:2] for name, each in measured.items()})),
@@ -142,9 +144,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         text = f"<!-- {name} -->\n\n{rows}\n\n<!-- end -->"
         print(text)
         page = re.sub(f"<!-- {name} -->.*?<!-- end -->", lambda _, t=text: t, page, flags=re.DOTALL)
-    if given.update:
+    if update:
         PAGE.write_text(page, "utf-8")
 
 
 if __name__ == "__main__":
-    main()
+    app()

@@ -8,35 +8,41 @@ person in one view, of shifts and scalings of whole people, and of the part that
 common.
 """
 
-import argparse
 from itertools import product
 from pathlib import Path
+from typing import Annotated
 
-from shapepose_fg.cameras.check.biases import COMMON, LEVELS
+from typer import Option, Typer
+
+from shapepose_fg.cameras.check.biases import COMMON
 from shapepose_fg.cameras.check.evidence import Look, gather
 from shapepose_fg.cameras.check.small_errors import Problem
+from shapepose_fg.core.bounds import Axis
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.detections import read_detections
 
+LEVELS = (0.0025, 0.005, 0.01, 0.02, 0.04)
 RATIOS = (0.3, 1.0, 3.0)
 """Standard deviations of shifts and scalings, relative to that of a joint's bias."""
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("calibration", type=Path)
-    parser.add_argument("detections", type=Path)
-    parser.add_argument("--up", help="the axis that is up, where the calibration does not say it")
-    arguments = parser.parse_args()
-    rig = read_rig(arguments.calibration, up=arguments.up)
-    detections = read_detections(arguments.detections, rig)
-    problem = Problem.of(Look.given(gather(detections, range(len(detections)), len(rig)), rig))
-    found, levels = [], [level / 2 for level in LEVELS]
+app = Typer(add_completion=False)
+
+
+@app.command(help=__doc__)
+def main(
+    calibration: Path,
+    detections: Path,
+    up: Annotated[Axis | None, Option(help="World axis that points up, if unknown.")] = None,
+) -> None:
+    """Print the six most likely sizes of biases."""
+    rig = read_rig(calibration, up=up)
+    seen = read_detections(detections, rig)
+    problem = Problem.of(Look.given(gather(seen, range(len(seen)), len(rig)), rig))
+    found = []
     for shift, larger in product(RATIOS, RATIOS):
-        marginals = problem.residuals.marginals(problem.given, levels, shift, larger, COMMON)
-        for (level, common), each in zip(product(levels, COMMON), marginals, strict=True):
+        marginals = problem.residuals.marginals(problem.given, LEVELS, shift, larger, COMMON)
+        for (level, common), each in zip(product(LEVELS, COMMON), marginals, strict=True):
             found.append((each.log, level, shift * level, larger * level, common * level))
     best = max(found)[0]
     print("log likelihood  joint  shift  enlargement  common")
@@ -45,4 +51,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    app()

@@ -1,7 +1,7 @@
 """Measure the tables of docs/evaluation/people.md again.
 
     python scripts/reproduce_tables.py --mocap cmu_smpl24.npz                    # all tables: hours
-    python scripts/reproduce_tables.py --mocap cmu_smpl24.npz --cases crowd "3 cameras" --split tune
+    python scripts/reproduce_tables.py --mocap cmu_smpl24.npz --case crowd --split tune
     python scripts/reproduce_tables.py --mocap cmu_smpl24.npz --only time --update
 
 Scenes come from fixed seeds. Without `--mocap`, only recordings of two people are measured. Figures
@@ -10,7 +10,6 @@ after a change of the code. `--update` writes tables between the marks `<!-- NAM
 `<!-- end -->` of the page.
 """
 
-import argparse
 import json
 import re
 import time
@@ -18,9 +17,10 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
+from typer import Option, Typer
 
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.reconstruction import Reconstruction
@@ -182,43 +182,41 @@ def table(cases: Sequence[Case], figures: Sequence[dict[str, Any]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def main() -> None:
+app = Typer(add_completion=False)
+
+
+@app.command(help=__doc__)
+def main(
+    mocap: Annotated[Path | None, Option(help="File of recorded motions.")] = None,
+    only: Annotated[list[str] | None, Option(help="Name of a table.")] = None,
+    case: Annotated[list[str] | None, Option(help="Only cases whose names have this text.")] = None,
+    seed: Annotated[list[int] | None, Option(help="Of `who is there`: 6101 to 6105.")] = None,
+    split: Literal["tune", "report"] = "report",
+    results: Path = PAGE.parents[2] / "build" / "figures",
+    update: Annotated[bool, Option("--update", help="Write the tables into the page.")] = False,
+) -> None:
     """Measure the requested tables, and print or write them."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--mocap", type=Path, help="file of recorded motions")
-    parser.add_argument("--only", nargs="*", help="names of tables")
-    parser.add_argument("--cases", nargs="*", default=(), help="only cases with all these texts")
-    parser.add_argument("--seeds", nargs="*", type=int, default=range(6101, 6106),
-                        help="of `who is there`")  # fmt: skip
-    parser.add_argument("--split", choices=("tune", "report"), default="report")
-    parser.add_argument("--results", type=Path, default=PAGE.parents[2] / "build" / "figures")
-    parser.add_argument("--update", action="store_true", help="write the tables into the page")
-    arguments = parser.parse_args()
-    mocap = None if arguments.mocap is None else Mocap.load(arguments.mocap)
-    tables = {"who is there": who_is_there(mocap, arguments.split, arguments.seeds)}
-    if mocap is not None:
-        tables = {"time": in_time(mocap, arguments.split), "held back": held_back(mocap), **tables}
-    for name in tables if arguments.only is None else arguments.only:
-        cases = [
-            case for case in tables[name] if all(text in case.name for text in arguments.cases)
-        ]
+    motions = None if mocap is None else Mocap.load(mocap)
+    tables = {"who is there": who_is_there(motions, split, seed or range(6101, 6106))}
+    if motions is not None:
+        tables = {"time": in_time(motions, split), "held back": held_back(motions), **tables}
+    for name in only or tables:
+        cases = [each for each in tables[name] if all(text in each.name for text in case or ())]
         figures = []
-        for case in cases:
-            named = re.sub(r"[^\w+-]+", "_", f"{name} {arguments.split} {case.name}")
-            file = arguments.results / f"{named}.json"
+        for each in cases:
+            named = re.sub(r"[^\w+-]+", "_", f"{name} {split} {each.name}")
+            file = results / f"{named}.json"
             if not file.is_file():
                 file.parent.mkdir(parents=True, exist_ok=True)
-                content = json.dumps(measure(case), indent=1)
+                content = json.dumps(measure(each), indent=1)
                 file.write_text(content, encoding="utf-8")
             figures.append(json.loads(file.read_text(encoding="utf-8")))
         text = f"<!-- {name} -->\n\n{table(cases, figures)}\n\n<!-- end -->"
         print(f"{text}\n", flush=True)
-        if arguments.update:
+        if update:
             page, marks = PAGE.read_text(encoding="utf-8"), rf"<!-- {name}\b.*?<!-- end -->"
             PAGE.write_text(re.sub(marks, lambda _, t=text: t, page, flags=re.DOTALL), "utf-8")
 
 
 if __name__ == "__main__":
-    main()
+    app()

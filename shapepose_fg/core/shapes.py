@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, BinaryIO
+from typing import Annotated, Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,15 +102,12 @@ class SubjectShapes(Table):
         for any other content.
         """
         file = Path(file)
-        columns = read_npz(file, _COLUMNS, _CURE)
-        for name in _COLUMNS:
-            if name not in columns:
-                raise InputError(f"{file}: column {name} is missing; {_CURE}")
-        whose = columns["body"]
+        columns: Any = read_npz(file, _COLUMNS, _CURE)
+        whose = columns.get("body", np.zeros(0))
         if whose.shape != () or whose.dtype.kind != "U" or str(whose) != body:
             raise InputError(
                 f"{file}: these are shapes of another body model, and betas of one model do not "
                 "fit another; give their model with --body, or another file"
             )
         with naming(file, _CURE):
-            return cls(columns["names"], columns["betas"], columns["information"], body)
+            return cls(columns.get("names"), columns.get("betas"), columns.get("information"), body)

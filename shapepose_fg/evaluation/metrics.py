@@ -294,3 +294,9 @@ def covariance_calibration(errors: Real, covariances: Real) -> CovarianceCalibra
 def share(part: float, whole: float) -> float:
     """`part` / `whole`; NaN where `whole` is 0."""
     return float(part / whole) if whole > 0 else float("nan")
+
+
+def known_mean(values: Array) -> float:
+    """Mean of the finite values; NaN if there are none."""
+    known = values[np.isfinite(values)]
+    return float(known.mean()) if len(known) > 0 else float("nan")

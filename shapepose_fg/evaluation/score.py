@@ -19,6 +19,7 @@ from shapepose_fg.evaluation.metrics import (
     MAX_DISTANCE_M,
     PlainPeople,
     covariance_calibration,
+    known_mean,
     match_people,
     mean_distance,
 )
@@ -124,9 +125,9 @@ def score(people: PlainPeople, truth: PlainPeople, frames: Iterable[int] | None 
     inside = covariance_calibration(matched - true, covariance).coverage
     tracks = track_metrics(tracked) if people.identified else None
     figures = dict.fromkeys(FIGURES, float("nan")) | {
-        "pcp": _mean(_percent(correct.sum(axis=1), count.sum(axis=1))),
-        "mpjpe_mm": 1e3 * _mean(np.linalg.norm(matched - true, axis=2)),
-        "pa_mpjpe_mm": 1e3 * _mean(np.linalg.norm(aligned(matched, true) - true, axis=2)),
+        "pcp": known_mean(_percent(correct.sum(axis=1), count.sum(axis=1))),
+        "mpjpe_mm": 1e3 * known_mean(np.linalg.norm(matched - true, axis=2)),
+        "pa_mpjpe_mm": 1e3 * known_mean(np.linalg.norm(aligned(matched, true) - true, axis=2)),
         "recall": float(_percent(np.sum(near_joints), _known(truth.joints).sum())),
         "inside_50": 100 * inside[0.5],
         "inside_95": 100 * inside[0.95],
@@ -295,9 +296,3 @@ def _known(joints: Array) -> Mask:
 def _percent(part: Any, whole: Any) -> Array:
     """100 part / whole; NaN where `whole` is 0."""
     return 100 * part / np.where(whole > 0, whole, np.nan)
-
-
-def _mean(values: Array) -> float:
-    """Mean of the known values; NaN without any."""
-    known = values[np.isfinite(values)]
-    return float(known.mean()) if len(known) > 0 else float("nan")

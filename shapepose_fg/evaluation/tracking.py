@@ -10,7 +10,12 @@ from shapepose_fg.body.model.result_body import model_of
 from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.skeleton import BODY_25
-from shapepose_fg.evaluation.metrics import covariance_calibration, match_people, metrics_of
+from shapepose_fg.evaluation.metrics import (
+    covariance_calibration,
+    known_mean,
+    match_people,
+    metrics_of,
+)
 from shapepose_fg.evaluation.track_metrics import TrackFrame, track_metrics
 
 WRISTS = [BODY_25.index("RWrist"), BODY_25.index("LWrist")]
@@ -64,13 +69,15 @@ def score_tracks(
         placed[at] = given
         fast = fast_wrist_errors(placed, true, fps)
         figures |= {
-            f"{prefix}mpjpe_mm": 1e3 * _mean(np.linalg.norm(placed - true, axis=-1)),
-            f"{prefix}acceleration_error": _mean(acceleration_errors(placed, true, follows, fps)),
+            f"{prefix}mpjpe_mm": 1e3 * known_mean(np.linalg.norm(placed - true, axis=-1)),
+            f"{prefix}acceleration_error": known_mean(
+                acceleration_errors(placed, true, follows, fps)
+            ),
             f"{prefix}fast_wrist_error_mm": 1e3 * np.median(fast) if len(fast) > 0 else np.nan,
         }
     views, error = views_used(found), found.joints - true[at]
     moving = found.velocity - velocities(true, fps)[at]
-    figures["velocity_error"] = _mean(np.linalg.norm(moving, axis=-1))
+    figures["velocity_error"] = known_mean(np.linalg.norm(moving, axis=-1))
     classes = {
         "seen": views >= 2,
         "one_view": views == 1,
@@ -165,9 +172,3 @@ def frames_unseen(seen: Mask, frame: Whole, identity: Whole) -> NDArray:
     count = np.empty(last.shape, dtype=np.intp)
     count[order] = place - np.maximum.accumulate(last, axis=0)
     return count
-
-
-def _mean(values: Array) -> float:
-    """Mean of the known values; NaN where there are none."""
-    known = values[np.isfinite(values)]
-    return float(known.mean()) if len(known) > 0 else float("nan")

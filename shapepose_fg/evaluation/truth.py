@@ -21,10 +21,10 @@ from shapepose_fg.core.run_summary import covered_frames, has_identities
 from shapepose_fg.core.skeleton import SMPL_24
 from shapepose_fg.core.storage.files import MIDDLE, read_bytes, read_json
 from shapepose_fg.core.storage.npz import NpzFile, read_npz
-from shapepose_fg.core.trajectory import MOST_METRES
 from shapepose_fg.core.world_axes import z_up
 from shapepose_fg.evaluation.metrics import PlainPeople
 from shapepose_fg.evaluation.shelf import SHELF_JOINTS, read_shelf_ground_truth
+from shapepose_fg.io.amass import LARGEST, read_amass
 from shapepose_fg.io.export.motion_files import OPEN_BODY
 
 _PANOPTIC = (
@@ -127,7 +127,7 @@ def _table(place: object, rows: list[tuple[int, int, Array]], names: tuple[str, 
     size = np.linalg.norm(box[np.isfinite(box).all(axis=1) & box.any(axis=1)], axis=1)
     median = float(np.median(size)) if len(size) > 0 else 1.0
     largest = np.abs(joints[~np.isnan(joints)]).max(initial=0)
-    if not (_SIZE_M[0] < median < _SIZE_M[1] and largest < MOST_METRES):
+    if not (_SIZE_M[0] < median < _SIZE_M[1] and largest < LARGEST):
         raise InputError(
             f"{place}: joints must be metres, but people are {median:.3g} m large and up to "
             f"{largest:.3g} m from the origin; check the unit"
@@ -197,50 +197,35 @@ def _amass(files: list[Path], turn: Array, fps: float | None, body: Path | None)
     """AMASS's motions, a person per file (`person_3_...`, else in the order of names); `turn` (3,
     3) is the rotation from z up to the world.
     """
-    keys = ("poses", "trans", "betas", "frames", "body", "mocap_framerate", "mocap_frame_rate")
     model = BodyModel.default() if body is None else BodyModel.load(body)
     rows = list[tuple[int, int, Array]]()
     for place, file in enumerate(files):
-        data = read_npz(file, keys, "download it again")
-        if body is None and str(data.get("body")) != OPEN_BODY:
+        motion = read_amass(file)
+        if body is None and motion.body != OPEN_BODY:
             raise InputError(f"{file}: its shape belongs to SMPL; give that model with --body")
-        poses, trans, betas = (data.get(key, np.zeros(0)) for key in keys[:3])
-        count = len(poses) if poses.ndim == 2 else 0
-        numbers = data.get("frames", np.arange(count))
-        rates = data.get("mocap_framerate", data.get("mocap_frame_rate", np.array(np.nan)))
-        if (
-            count == 0
-            or poses.shape[1] < 66
-            or (trans.shape, numbers.shape) != ((count, 3), (count,))
-            or (betas.ndim, rates.size) != (1, 1)
-            or any(each.dtype.kind not in "fiu" for each in (poses, trans, betas, rates))
-            or numbers.dtype.kind not in "iu"
-            or not all((np.abs(each) < MOST_METRES).all() for each in (poses, trans, betas))
-        ):
-            raise InputError(
-                f"{file}: must hold finite poses (F, 66 or more), trans (F, 3) and betas (10 or "
-                "more), and whole frames (F) and one mocap_framerate, if any; give AMASS motions"
-            )
         # Values of a pose of SMPL-X, whose shape differs from SMPL's.
-        if poses.shape[1] == 165:
+        if motion.poses.shape[1] == 165:
             raise InputError(
                 f"{file}: its shape belongs to SMPL-X; download the motion as SMPL+H instead"
             )
-        rate = float(rates.item())
-        step = 1.0 if "frames" in data or fps is None or not rate > fps else rate / fps
-        at = np.rint(np.arange(0, count - 0.5, step)).astype(np.intp)
-        number = numbers[at] if step == 1 else np.arange(len(at))
+        named, rate = motion.frames[0] >= 0, motion.fps
+        step = 1.0 if named or fps is None or not rate > fps else rate / fps
+        at = np.rint(np.arange(0, len(motion.poses) - 0.5, step)).astype(np.intp)
+        number = motion.frames[at] if named else np.arange(len(at))
         pose = np.zeros((len(at), 72))
-        pose[:, :66] = poses[at, :66]
+        pose[:, :66] = motion.poses[at, :66]
         shape = np.zeros(10)
-        shape[: len(betas)] = betas[:10]
+        shape[: len(motion.betas)] = motion.betas[:10]
         with naming(file, "download it again"):
             posed = BodyParameters(
-                np.tile(shape, (len(at), 1)), pose[:, :3], pose[:, 3:].reshape(-1, 23, 3), trans[at]
+                np.tile(shape, (len(at), 1)),
+                pose[:, :3],
+                pose[:, 3:].reshape(-1, 23, 3),
+                motion.trans[at],
             )
             joints = model.keypoints(posed) @ turn.T
-        named = re.search(r"person_(\d{1,9})", file.stem)
-        who = int(named[1]) if named else place
+        called = re.search(r"person_(\d{1,9})", file.stem)
+        who = int(called[1]) if called else place
         rows += [(int(n), who, xyz) for n, xyz in zip(number, joints, strict=True)]
     return _table(files[0].parent, rows, model.keypoint_names)
 

@@ -7,7 +7,6 @@ relative to SMPL's T-pose, y up, row 0 the global orientation; `trans` (N, 3) th
 `parents` (24,).
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,15 +17,25 @@ from scipy.spatial.transform import Rotation
 from shapepose_fg.body.model.smpl_file import SMPL_PARENTS
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.decompositions import rotation_angle
-from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.errors import naming
 from shapepose_fg.core.storage.npz import read_npz
+from shapepose_fg.core.storage.schema import Column, checked_columns
 from shapepose_fg.simulation.limbs import ARMS
 
-_OF_CLIP = (
-    "seq_start seq_len fps names subject action tier wrist_valid toe_valid leg_m floor_y".split()
-)
-_ARRAYS = {"poses": ("N", 24, 3), "trans": ("N", 3), **dict.fromkeys(_OF_CLIP, ("S",))}
-_ARRAYS |= {"pairs": ("K", 2), "parents": (24,)}
+_OF_CLIP = {
+    **dict.fromkeys(("seq_start", "seq_len", "tier"), Column("S", np.int64)),
+    "fps": Column("S", least=1e-3, finite=True),
+    "leg_m": Column("S", least=0.1, finite=True),
+    "floor_y": Column("S", finite=True),
+    **dict.fromkeys(("wrist_valid", "toe_valid"), Column("S", np.bool_)),
+    **dict.fromkeys(("names", "subject", "action"), Column("S", np.str_)),
+}
+_ARRAYS = _OF_CLIP | {
+    "poses": Column("N 24 3", np.float32, finite=True),
+    "trans": Column("N 3", np.float32, finite=True),
+    "pairs": Column("K 2", np.int64),
+    "parents": Column("24", np.int64),
+}
 
 COLLARS, SHOULDERS, *_ = zip(*ARMS, strict=True)
 """Left and right collar, and shoulder, as indices of SMPL's joints."""
@@ -108,15 +117,16 @@ class Mocap:
     @classmethod
     def load(cls, path: str | Path) -> "Mocap":
         """Read the recordings in `path` (.npz); raises InputError if it is unusable."""
-        arrays = read_npz(Path(path), _ARRAYS, "copy the recorded motions again")
-        for problem in _problems(arrays):
-            raise InputError(f"{path}: {problem}")
+        cure = "give motions in SMPL's structure"
+        arrays = read_npz(Path(path), _ARRAYS, cure)
+        with naming(path, cure):
+            arrays = checked_columns(_ARRAYS, arrays, {})
+            _check(arrays)
         names, subjects, actions = (
             tuple(map(str, arrays[name])) for name in ("names", "subject", "action")
         )
         pairs = tuple((int(lead), int(follow)) for lead, follow in arrays["pairs"])
-        lengths, tiers = (arrays[name].astype(np.int64) for name in ("seq_len", "tier"))
-        return cls(names, subjects, actions, lengths, tiers, pairs, arrays)
+        return cls(names, subjects, actions, arrays["seq_len"], arrays["tier"], pairs, arrays)
 
     def clip(self, index: int) -> Clip:
         """Clip `index`, with glitches of single markers interpolated."""
@@ -167,32 +177,16 @@ def _bridged(rotations: Array, pelvis: Array, fps: float) -> tuple[Array, Array]
     )
 
 
-def _problems(arrays: dict[str, NDArray]) -> Iterator[str]:
-    """Problems of the file with cures."""
-    missing = [name for name in _ARRAYS if name not in arrays]
-    if missing:
-        yield f"array {missing[0]!r} is missing; give motions in SMPL's structure"
-    sizes = {"N": len(arrays["poses"]), "S": len(arrays["seq_start"]), "K": len(arrays["pairs"])}
-    for name, shape in _ARRAYS.items():
-        expected = tuple(sizes[size] if isinstance(size, str) else size for size in shape)
-        if arrays[name].shape != expected:
-            yield f"{name} must be {expected}, is {arrays[name].shape}; write the file again"
-    for name in ("poses", "trans", "fps", "leg_m", "floor_y"):
-        if not np.isfinite(arrays[name]).all():
-            yield f"{name} holds values that are not finite; write the file again"
-    if not ((arrays["fps"] > 0).all() and (arrays["leg_m"] > 0.1).all()):
-        yield "fps and leg_m must be positive; write the file again"
-    start, length = arrays["seq_start"].astype(np.int64), arrays["seq_len"].astype(np.int64)
-    if not ((start >= 0) & (length > 0) & (start + length <= sizes["N"])).all():
-        yield "seq_start and seq_len go beyond the last frame; write the file again"
-    pairs = arrays["pairs"].astype(np.int64)
-    if (
-        not ((pairs >= 0) & (pairs < sizes["S"])).all()
-        or (length[pairs[:, 0]] != length[pairs[:, 1]]).any()
-    ):
-        yield "pairs must name two clips of one length each; write the file again"
+def _check(arrays: dict[str, NDArray]) -> None:
+    """ValueError if clips or pairs lie outside the file, or if its bodies are not SMPL's."""
+    start, length, pairs = arrays["seq_start"], arrays["seq_len"], arrays["pairs"]
+    if not ((start >= 0) & (length > 0) & (start + length <= len(arrays["poses"]))).all():
+        raise ValueError("seq_start and seq_len go beyond the last frame")
+    inside = ((pairs >= 0) & (pairs < len(start))).all()
+    if not inside or (length[pairs[:, 0]] != length[pairs[:, 1]]).any():
+        raise ValueError("pairs must name two clips of one length each")
     if tuple(arrays["parents"].tolist()) != SMPL_PARENTS:
-        yield "parents are not SMPL's tree; give motions in SMPL's structure"
+        raise ValueError("parents are not SMPL's tree")
 
 
 def shoulder_rhythm(rotations: Array) -> Array:

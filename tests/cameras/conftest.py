@@ -105,7 +105,7 @@ def once() -> Callable[[Callable], Callable]:
 
 
 def _is_progress(argument: object) -> bool:
-    return callable(argument[1] if isinstance(argument, tuple) else argument)
+    return callable(argument[-1] if isinstance(argument, tuple) and argument else argument)
 
 
 LATE_S = np.array([0.0, 2.513, -1.22, 4.0])

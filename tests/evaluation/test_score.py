@@ -343,7 +343,8 @@ def test_amass_of_our_own_export(truth, tmp_path):
         ({"joints": np.full((2, 17, 3), np.nan), "layout": "coco"}, "no person in any frame"),
         ({"joints": np.zeros((2, 17, 3)), "layout": "coco", "frames": np.ones(3, int)}, "frames"),
         ({"other": np.zeros(3)}, r"\(T, P, J, 3\)"),
-        ({"poses": np.zeros((2, 6)), "trans": np.zeros((2, 3))}, "SMPL"),
+        ({"poses": np.zeros((2, 6)), "trans": np.zeros((2, 3))}, r"\(F, 66 or more\)"),
+        ({"poses": np.zeros((2, 66)), "trans": np.zeros((2, 3))}, "SMPL"),
     ],
 )
 def test_unusable_truths_are_one_sentence(tmp_path, arrays, message):

@@ -59,10 +59,8 @@ def test_kept_figures_are_not_measured_again_and_the_page_is_updated(
     page.write_text("before\n<!-- who is there @old -->\nold\n<!-- end -->\nafter\n")
     monkeypatch.setattr(script, "measure", measure)
     monkeypatch.setattr(script, "PAGE", page)
-    words = ["", "--only", "who is there", "--seeds", "7", "--results", str(tmp_path), "--update"]
-    monkeypatch.setattr("sys.argv", words)
-    script.main()
-    script.main()
+    for _ in range(2):
+        script.main(only=["who is there"], seed=[7], results=tmp_path, update=True)
     assert measured == ["7 two people, with time", "7 two people, without time"]
     text = page.read_text()
     assert text.startswith("before\n<!-- who is there -->") and text.endswith("end -->\nafter\n")

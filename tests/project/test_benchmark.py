@@ -79,18 +79,7 @@ def test_two_commits_are_timed_alternately(script, monkeypatch, capsys, tmp_path
     if git.returncode != 0:
         pytest.skip("not a git checkout")
     commit = git.stdout.strip()
-    options = [
-        "--against",
-        commit,
-        "--cases",
-        "one frame",
-        "--rounds",
-        "2",
-        "--data",
-        str(tmp_path),
-    ]
-    monkeypatch.setattr(sys, "argv", ["benchmark.py", *options, "--frames", "2"])
-    script.main()
+    script.main(commit, case=["one frame"], rounds=2, data=tmp_path, frames=2)
     assert taken == ["against", "here"] * 3, "a round warms up"
     printed = capsys.readouterr().out
     for part in (

@@ -5,6 +5,7 @@ lead on.
 import pickle
 import re
 import shlex
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -94,23 +95,32 @@ def matrix_text(frame: Detections, first: np.ndarray, second: np.ndarray) -> str
     return " ".join(f"{value:.4f}" for value in matrix[np.ix_(first, second)].ravel())
 
 
+@pytest.fixture(scope="module")
+def six_frames(tmp_path_factory) -> tuple[Scene, Path]:
+    """Six frames of the scene, and their reader's folder."""
+    scene, folder = built_in_scene(frames=6), tmp_path_factory.mktemp("reader")
+    a_reader_s_folder(scene, folder)
+    return scene, folder
+
+
 @pytest.fixture
-def recording(tmp_path, monkeypatch) -> Scene:
-    """A reader's folder with six frames of the scene."""
+def recording(six_frames, tmp_path, monkeypatch) -> Scene:
+    """The working directory is a copy of the reader's folder with six frames of the scene."""
+    scene, folder = six_frames
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
-    return a_reader_s_folder(built_in_scene(frames=6))
+    return scene
 
 
-def a_reader_s_folder(scene: Scene) -> Scene:
-    """Write calibration.json, detections/ and settings.toml here; returns the scene."""
-    Path("settings.toml").write_text(toml_text(PipelineConfig()))
+def a_reader_s_folder(scene: Scene, folder: Path) -> None:
+    """Write calibration.json, detections/ and settings.toml into a folder."""
+    (folder / "settings.toml").write_text(toml_text(PipelineConfig()))
     seen = simulate(scene)
-    write_rig(scene.rig, "calibration.json")
-    Path("detections").mkdir()
+    write_rig(scene.rig, folder / "calibration.json")
+    (folder / "detections").mkdir()
     for view, camera in enumerate(scene.rig.cameras):
         text = association_text(seen, view, camera.image_size)
-        Path("detections", f"{camera.name}.txt").write_text(text)
-    return scene
+        (folder / "detections" / f"{camera.name}.txt").write_text(text)
 
 
 @pytest.mark.slow
@@ -280,7 +290,8 @@ def test_commands_of_pages_run_in_a_reader_s_folder(tmp_path, monkeypatch, capsy
     those that reconstruct it in another way last.
     """
     monkeypatch.chdir(tmp_path)
-    scene = a_reader_s_folder(built_in_scene(frames=20))
+    scene = built_in_scene(frames=20)
+    a_reader_s_folder(scene, tmp_path)
     truth_of(scene).save("truth")
     known = ("reconstruct", "report", "explain", "tracks", "evaluate", "export")
 

@@ -63,10 +63,10 @@ def test_a_file_is_read(tiny_mocap: Mocap):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"poses": None}, "'poses' is missing"),
+        ({"poses": None}, "poses is missing"),
         ({"poses": np.zeros((510, 23, 3))}, "poses must be"),
-        ({"leg_m": np.zeros(6)}, "must be positive"),
-        ({"trans": np.full((510, 3), np.nan)}, "not finite"),
+        ({"leg_m": np.zeros(6)}, "leg_m must be at least 0.1"),
+        ({"trans": np.full((510, 3), np.nan)}, "trans must be finite"),
         ({"seq_len": np.full(6, 200)}, "beyond the last frame"),
         ({"pairs": np.array([[0, 7]])}, "pairs must name"),
         ({"pairs": np.array([[0, 2]])}, "pairs must name"),

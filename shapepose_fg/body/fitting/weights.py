@@ -63,10 +63,11 @@ class FitterWeights:
         those of the package.
         """
         shipped = FitterWeights.default()
+        if fingerprint(model) == shipped.body:
+            return shipped
         kept = adapted_file(model)
         # `Path.is_file` raises if the user's cache is not accessible.
-        own = fingerprint(model) != shipped.body and os.path.isfile(kept)  # noqa: PTH113
-        return FitterWeights.load(kept) if own else shipped
+        return FitterWeights.load(kept) if os.path.isfile(kept) else shipped  # noqa: PTH113
 
     def spread_of(self, names: tuple[str, ...]) -> Array:
         """(J,) factors `spread` for the named keypoints."""
@@ -152,10 +153,7 @@ def fingerprint(model: BodyModel) -> str:
     """Identifies a body model: SHA-256 of template, shapes and joint regressor, rounded
     to float32.
     """
-    digest = hashlib.sha256()
-    for array in (model.arrays.template, model.arrays.shapes, model.arrays.joint_regressor):
-        digest.update(np.ascontiguousarray(array, dtype=np.float32).tobytes())
-    return digest.hexdigest()
+    return model.arrays.fingerprint
 
 
 def adapted_file(model: BodyModel) -> Path:

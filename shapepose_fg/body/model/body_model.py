@@ -89,12 +89,11 @@ class BodyModel:
         arrays: SmplArrays,
         offsets: KeypointOffsets | None = None,
         keypoint_names: tuple[str, ...] = BODY_25.joints,
-        contracted: SkinnedPoints | None = None,
+        same: "BodyModel | None" = None,
     ):
         """Build it from validated arrays; most callers want `default` or `load`.
 
-        `contracted` is the result of `_contract` for the same arrays, if it is available: it is the
-        main cost here.
+        `same` is a model of the same arrays, if there is one: what costs most here is shared.
         """
         self.arrays = arrays
         """Arrays of the file, in float64."""
@@ -103,7 +102,8 @@ class BodyModel:
         `vertices` and `joints`."""
         self.keypoint_names = keypoint_names
         """(K,) names of the keypoints, some of `BODY_POINTS`."""
-        self._contracted = _contract(arrays) if contracted is None else contracted
+        self._same = same
+        self._contracted = _contract(arrays) if same is None else same._contracted
         self.points = _moved(self._contracted, self.keypoint_offsets)
         """All `BODY_POINTS`: BODY_25's keypoints, the top of the head, the 24 joints."""
         self.keypoint_points = self.points.part(list(slots(keypoint_names)))
@@ -138,7 +138,7 @@ class BodyModel:
 
     def _with(self, **changed: Any) -> "BodyModel":
         kept = {"offsets": self.keypoint_offsets, "keypoint_names": self.keypoint_names}
-        return BodyModel(self.arrays, **(kept | changed), contracted=self._contracted)
+        return BodyModel(self.arrays, **(kept | changed), same=self._same or self)
 
     @property
     def faces(self) -> NDArray[np.int64]:
@@ -238,6 +238,8 @@ class BodyModel:
     @cached_property
     def _mesh(self) -> "_Mesh":
         """The large arrays, computed at the first use of vertices."""
+        if self._same is not None:
+            return self._same._mesh
         arrays = self.arrays
         shapes = arrays.shapes.transpose(2, 0, 1)  # (10, Nv, 3)
         rest, rest_shapes = (

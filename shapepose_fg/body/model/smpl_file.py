@@ -1,6 +1,8 @@
 """Reads body models in SMPL's file format, `.npz` or the official `.pkl`, and validates them."""
 
+import hashlib
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -59,6 +61,14 @@ class SmplArrays:
     """(25, Nv) regressor of BODY_25 keypoints from the posed vertices."""
     faces: NDArray[np.int64]
     """(F, 3) vertex indices of the triangles."""
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """SHA-256 of template, shapes and joint regressor, rounded to float32."""
+        digest = hashlib.sha256()
+        for array in (self.template, self.shapes, self.joint_regressor):
+            digest.update(np.ascontiguousarray(array, dtype=np.float32).tobytes())
+        return digest.hexdigest()
 
 
 def read_smpl_file(path: Path, keypoint_regressor: Real | None = None) -> SmplArrays:

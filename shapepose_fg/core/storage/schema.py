@@ -72,7 +72,9 @@ class Column:
         keeps its own width.
         """
         wanted = np.dtype(self.dtype)
-        if value is None and self.missing is not None:
+        if value is None:
+            if self.missing is None:
+                raise ValueError(f"column {name} is missing")
             value = np.full(self.shape(sizes), self.missing, dtype=wanted)
         array = np.asarray(value)
         for axis, length in zip(self._lengths, array.shape, strict=False):
@@ -117,9 +119,11 @@ def checked_columns(
     columns: Mapping[str, Column], arrays: Mapping[str, Any], sizes: dict[str, int]
 ) -> dict[str, NDArray[Any]]:
     """Arrays as described by their `columns`, and in range; ValueError that names the first that is
-    not.
+    not, or that is missing.
     """
-    found = {name: column.checked(name, arrays[name], sizes) for name, column in columns.items()}
+    found = {
+        name: column.checked(name, arrays.get(name), sizes) for name, column in columns.items()
+    }
     for name, column in columns.items():
         column.check_range(name, found[name])
     return found

@@ -17,8 +17,8 @@ from shapepose_fg.core.arrays import Array, Mask, Whole
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import SMPL_24, smpl_joints
 from shapepose_fg.core.storage.files import files_below
-from shapepose_fg.core.storage.npz import read_npz
 from shapepose_fg.core.storage.schema import Column, Table
+from shapepose_fg.io.amass import read_amass
 from shapepose_fg.simulation.mocap import Clip, Mocap, shoulder_rhythm
 
 Split = Literal["train", "validation", "test"]
@@ -188,10 +188,13 @@ def _of_clip(clip: Clip) -> _Recording:
 
 def _read_amass(path: Path) -> _Recording:
     """One AMASS file, decimated to about 30 Hz and rotated to y up, without hands."""
-    poses, fps = _amass_arrays(path)
+    motion = read_amass(path)
+    if not 0 < motion.fps < np.inf:
+        raise InputError(f"{path}: mocap_framerate must be one positive number; correct it")
+    poses = motion.poses
     # Approximate frame rate to which AMASS recordings are decimated, Hz: every k-th frame,
     # without interpolation.
-    step = max(1, round(fps / 30.0))
+    step = max(1, round(motion.fps / 30.0))
     kept = np.zeros((len(poses[::step]), 24, 3))
     kept[:, :_SHARED] = poses[::step, : 3 * _SHARED].reshape(-1, _SHARED, 3)
     # Rotation from AMASS, z up, to SMPL's own frame, y up.
@@ -199,28 +202,3 @@ def _read_amass(path: Path) -> _Recording:
         Rotation.from_rotvec([-np.pi / 2, 0.0, 0.0]) * Rotation.from_rotvec(kept[:, 0])
     ).as_rotvec()
     return path.parent.name, "walk" in path.stem.lower(), kept.astype(np.float32)
-
-
-def _amass_arrays(path: Path) -> tuple[Array, float]:
-    """`poses` (T, 66 or more) and frame rate of an AMASS file, validated."""
-    rates = ("mocap_framerate", "mocap_frame_rate")
-    arrays = read_npz(path, ("poses", *rates), "copy it again")
-    rate = next((name for name in rates if name in arrays), None)
-    if rate is None or "poses" not in arrays:
-        missing = "poses" if rate is not None else rates[0]
-        raise InputError(f"{path}: array {missing!r} is missing; give motions in AMASS's format")
-    if any(arrays[name].dtype.kind == "U" for name in ("poses", rate)):
-        raise InputError(
-            f"{path}: poses and {rate} must be numbers; give motions in AMASS's format"
-        )
-    poses, fps = arrays["poses"].astype(np.float64), arrays[rate].astype(np.float64)
-    if poses.ndim != 2 or len(poses) == 0 or poses.shape[1] < 3 * _SHARED or poses.shape[1] % 3:
-        raise InputError(
-            f"{path}: poses must be (T, 66 or more), got {poses.shape}; give motions in AMASS's "
-            "format"
-        )
-    if not np.isfinite(poses).all():
-        raise InputError(f"{path}: poses holds values that are not finite; leave the file out")
-    if fps.size != 1 or not np.isfinite(fps).all() or fps.item() <= 0:
-        raise InputError(f"{path}: {rate} must be one positive number; correct it")
-    return poses, float(fps.item())

@@ -242,10 +242,11 @@ def test_a_camera_that_is_listed_twice_is_named(recording, room):
 
 @pytest.mark.slow
 def test_mistakes_of_all_cameras_are_named(recording, room):
-    everybody = tuple(range(5))
+    everybody = tuple(range(3))
+    seen, three = some_cameras(recording, room, everybody)
     for detections, rig, kind in (
-        (recording, inverted(room, everybody), Kind.INVERTED),
-        (resized(recording, everybody, 0.5), room, Kind.RESIZED),
+        (seen, inverted(three, everybody), Kind.INVERTED),
+        (resized(seen, everybody, 0.5), three, Kind.RESIZED),
     ):
         found = only_finding(detections, rig)
         assert (found.kind, found.cameras) == (kind, everybody)

@@ -145,11 +145,11 @@ def test_cmu_subjects_keep_their_part_in_amass(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"poses": None}, "'poses' is missing"),
-        ({"mocap_framerate": None}, "'mocap_framerate' is missing"),
-        ({"poses": np.zeros((5, 63))}, r"poses must be \(T, 66 or more\)"),
-        ({"poses": np.zeros((0, 156))}, "poses must be"),
-        ({"poses": np.full((5, 66), np.nan)}, "not finite"),
+        ({"poses": None}, "poses is missing"),
+        ({"mocap_framerate": None}, "mocap_framerate must be one positive number"),
+        ({"poses": np.zeros((12, 63))}, r"poses must be \(F, 66 or more\)"),
+        ({"poses": np.zeros((0, 156)), "trans": np.zeros((0, 3))}, "poses must be"),
+        ({"poses": np.full((12, 66), np.nan)}, "poses must be finite"),
         ({"mocap_framerate": 0.0}, "one positive number"),
         ({"poses": np.array([{}, {}])}, "cannot be read"),  # pickled objects
     ],

@@ -268,7 +268,12 @@ def test_what_cannot_be_trained_on_is_one_sentence_at_once(short, capsys, option
     poses = np.zeros((5, 156))
     poses[:, 3:66] = PosePrior.default().sample(np.random.default_rng(0), 5)[:, :21].reshape(5, 63)
     (short / "few" / "01").mkdir(parents=True)
-    np.savez(short / "few" / "01" / "stand_poses.npz", poses=poses, mocap_framerate=30.0)
+    np.savez(
+        short / "few" / "01" / "stand_poses.npz",
+        poses=poses,
+        trans=poses[:, :3],
+        mocap_framerate=30.0,
+    )
     assert train(*options) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ") and sentence in error and "Traceback" not in error
