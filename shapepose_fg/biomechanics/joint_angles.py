@@ -15,6 +15,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from shapepose_fg.body.fitting.energy import BATCH
 from shapepose_fg.body.fitting.priors import NUM_ANGLES, PosePrior
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.body.model.result_body import model_of
@@ -79,10 +80,6 @@ _WEIGHT = 2.0
 `scripts/measure_angles.py`)."""
 _STEP = 1e-4
 """Step of the central differences, rad."""
-_BLOCK = 256
-"""Number of rows that are processed together, to limit memory."""
-
-
 OPENSIM = (
     AngleDefinition("pelvis", ("tilt", "list", "rotation"), "ZXY", (1, 1, 1), ("pelvis",),
                     ("world", "pelvis"), False),
@@ -170,8 +167,8 @@ def joint_angles(
     degrees = np.full((len(people), len(names)), np.nan)
     covariance = np.full((*degrees.shape, len(names)), np.nan)
     model = model.with_keypoints(tuple(people.joint_names.tolist()))
-    for start in range(0, len(there), _BLOCK):
-        rows = there[start : start + _BLOCK]
+    for start in range(0, len(there), BATCH):
+        rows = there[start : start + BATCH]
         part = people.rows(rows)
         posed = BodyParameters(*(getattr(part, name) for name in BODY))
         betas, local, rotations = _rotations(part, model, posed)

@@ -25,7 +25,8 @@ from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.decompositions import nearest_rotation, rotation_angle
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import FrameTimes
-from shapepose_fg.estimation.trajectory_graph import ANYWHERE_M, correlated, optimised
+from shapepose_fg.estimation.frame_graph import UNDETERMINED_M
+from shapepose_fg.estimation.trajectory_graph import correlated, optimised
 
 LENS = [9, 10, 11, 12]
 """Parameters of a camera beside `parameters.PARAMETERS`: k1 k2 p1 p2."""
@@ -158,7 +159,7 @@ def adjust(
     depth = np.moveaxis(rig.project(moved)[1], 0, 2)[person, joint, view]
     for each in dict.fromkeys(joints[place] for place in np.flatnonzero(depth <= 0).tolist()):
         graph.addPriorPoint3(
-            each, found.atPoint3(each), gtsam.noiseModel.Isotropic.Sigma(3, ANYWHERE_M)
+            each, found.atPoint3(each), gtsam.noiseModel.Isotropic.Sigma(3, UNDETERMINED_M)
         )
     information = (
         _information(graph, found, list(dict.fromkeys(joints)), view.tolist(), rig) / dilution

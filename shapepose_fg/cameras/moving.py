@@ -18,19 +18,20 @@ from scipy.special import gammaincinv
 from shapepose_fg.body.model.rotation import hat
 from shapepose_fg.cameras.bundle import Adjusted, Freedom, Undetermined, dilution
 from shapepose_fg.cameras.parameters import POSE, Q, by_parameters, placing, seen_by
-from shapepose_fg.cameras.people import MIN_DEPTH_M, Footage, People
+from shapepose_fg.cameras.people import Footage, People
+from shapepose_fg.cameras.relative_pose import LOOK_S
 from shapepose_fg.cameras.sightings import Sightings, follow, median_of
+from shapepose_fg.cameras.synchronise import WHOLE_S
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.camera import Camera, Rig, Views
 from shapepose_fg.core.decompositions import nearest_rotation, rigid, rotation_angle, symmetric_root
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.trajectory import Trajectory
-from shapepose_fg.estimation.trajectory_graph import ANYWHERE_M, correlated
+from shapepose_fg.estimation.frame_graph import UNDETERMINED_M
+from shapepose_fg.estimation.gated_views import MIN_DEPTH_M
+from shapepose_fg.estimation.trajectory_graph import correlated
 
-_STEP_S, _LONGEST_S = 0.2, 180.0
-"""Time between the moments at which people are placed, and duration used of a longer recording,
-s."""
 _LEAST_S, _LEAST_WAY_M = 4.0, 0.4
 """Minimum common duration of two tracks, s, and standard deviation of the person's position in it,
 m."""
@@ -80,7 +81,7 @@ class Placed(Rows):
     time_s: Array
     """(P,) time of each, seconds."""
     moment: Index
-    """(P,) number of the moment, `_STEP_S` apart."""
+    """(P,) number of the moment, `LOOK_S` apart."""
     points: Array
     """(P, J, 3) core joints, metres; NaN where unknown."""
     velocity: Array
@@ -106,7 +107,7 @@ class Placed(Rows):
         one, other = (pair[np.diff(track[order]) == 0] for pair in (order[:-1], order[1:]))
         before, after = np.arange(len(moment)), np.arange(len(moment))
         before[other], after[one] = one, other
-        lasts = np.maximum(time_s[after] - time_s[before], _STEP_S / 2)[:, None, None]
+        lasts = np.maximum(time_s[after] - time_s[before], LOOK_S / 2)[:, None, None]
         velocity = np.nan_to_num((points[after] - points[before]) / lasts)
         spread = np.zeros((*points.shape, 0)) if spread is None else spread
         return cls(time_s, moment, points, velocity, track, spread)
@@ -119,8 +120,8 @@ class Placed(Rows):
         frames at `time_s` (T, V), NaN for missing ones.
         """
         first = float(np.sort(np.nanmin(time_s, axis=0))[1])
-        last = min(float(np.sort(np.nanmax(time_s, axis=0))[-2]), first + _LONGEST_S)
-        moments = np.arange(first, last, _STEP_S)
+        last = min(float(np.sort(np.nanmax(time_s, axis=0))[-2]), first + WHOLE_S)
+        moments = np.arange(first, last, LOOK_S)
         number = np.full(time_s.shape, -1)
         for own, of_moment in zip(time_s.T, number.T, strict=True):
             frame = _nearest(own, moments)
@@ -347,8 +348,8 @@ class Filmed:
     def _registered(self, placed: Placed, most_s: float) -> list[Start]:
         """Approximate starts from pairs of tracks; `agreeing` is a score."""
         depth = _depth(self.rays, placed.points)
-        moment = np.rint((self.own_s - self.own_s[0]) / _STEP_S).astype(np.intp)
-        frames = _nearest(self.own_s, self.own_s[0] + _STEP_S * np.arange(moment.max() + 1))
+        moment = np.rint((self.own_s - self.own_s[0]) / LOOK_S).astype(np.intp)
+        frames = _nearest(self.own_s, self.own_s[0] + LOOK_S * np.arange(moment.max() + 1))
         frames = frames[frames >= 0]
         frame, person = np.nonzero(np.isfinite(depth[frames]))
         frame = frames[frame]
@@ -359,7 +360,7 @@ class Filmed:
             for track in range(placed.track.max(initial=-1) + 1)
             if _lasts(grid := placed.grid(track, length))
         ]
-        begin, found = float((placed.time_s - _STEP_S * placed.moment)[0]), list[Start]()
+        begin, found = float((placed.time_s - LOOK_S * placed.moment)[0]), list[Start]()
         for bTc in _QUARTERS:
             oTc = (self._oTb @ bTc)[frame]
             own = points @ oTc[:, :3, :3].mT + oTc[:, None, :3, 3]
@@ -368,8 +369,8 @@ class Filmed:
             spectra = [_Spectrum.of(grid) for grid in grids if _lasts(grid)]
             for one, other in product(fixed, spectra):
                 lags, wTo, score = one.over(other)
-                offset = _STEP_S * lags + begin - self.own_s[0]
-                score = np.where(np.abs(offset) <= most_s + _STEP_S, score, 0.0)
+                offset = LOOK_S * lags + begin - self.own_s[0]
+                score = np.where(np.abs(offset) <= most_s + LOOK_S, score, 0.0)
                 for _ in range(_PEAKS):
                     if score[at := int(score.argmax())] > 0:
                         found.append(
@@ -428,7 +429,7 @@ class Filmed:
             lens.centre_px / self.camera.K[0, 0],
         )
         clock = [float(most_s > 0)]
-        sigmas = [_TILT_RAD, _TILT_RAD, 1.0, *[ANYWHERE_M] * 3, unit, *[centre] * 2, *clock]
+        sigmas = [_TILT_RAD, _TILT_RAD, 1.0, *[UNDETERMINED_M] * 3, unit, *[centre] * 2, *clock]
         for near_m in _NEAR_M:
             rows, frame, person, away, _ = self._matched(start, placed, near_m)
             used = away < near_m
@@ -697,7 +698,7 @@ class _Spectrum:
         R = nearest_rotation(both)
         agreed = np.einsum("lij,lij->l", R, both)
         left = np.maximum(spread[0] + spread[1] - 2 * agreed, 0.0)
-        least = _LEAST_S / _STEP_S * self.known.shape[1] / 2
+        least = _LEAST_S / LOOK_S * self.known.shape[1] / 2
         score = count * np.clip(1 - left / _AGREE_M**2, 0.0, None)
         score[(count < least) | (spread[0] < _LEAST_WAY_M**2)] = 0.0
         t = p + self.centre - np.einsum("lij,lj->li", R, q + other.centre)
@@ -707,7 +708,7 @@ class _Spectrum:
 
 def _lasts(grid: Array) -> bool:
     """Whether a track is long enough to be registered."""
-    return bool(np.isfinite(grid[..., 0]).any(axis=1).sum() >= _LEAST_S / _STEP_S)
+    return bool(np.isfinite(grid[..., 0]).any(axis=1).sum() >= _LEAST_S / LOOK_S)
 
 
 def _nearest(own: Array, times: Array) -> Index:
@@ -718,7 +719,7 @@ def _nearest(own: Array, times: Array) -> Index:
     after = np.searchsorted(own[there], times).clip(1, len(there) - 1)
     nearer = times - own[there[after - 1]] < own[there[after]] - times
     frame = there[after - nearer]
-    return np.where(np.abs(own[frame] - times) <= _STEP_S / 2, frame, -1)
+    return np.where(np.abs(own[frame] - times) <= LOOK_S / 2, frame, -1)
 
 
 def _depth(rays: Array, points: Array) -> Array:

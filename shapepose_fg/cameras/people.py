@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from shapepose_fg.cameras.sightings import GATE, Pairs, Sightings, size_of
+from shapepose_fg.cameras.sightings import GATE, MOST_FRAMES, Pairs, Sightings, size_of
 from shapepose_fg.cameras.tracks import OneClock, seen_at
 from shapepose_fg.cameras.triangulation import left_out, observed, triangulate
 from shapepose_fg.core.arrays import Array, Index, Mask
@@ -15,19 +15,16 @@ from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.skeleton import Skeleton
-from shapepose_fg.estimation.gated_views import ObservationConfig, observation_sigmas
+from shapepose_fg.estimation.gated_views import MIN_DEPTH_M, ObservationConfig, observation_sigmas
 from shapepose_fg.estimation.trajectory_graph import WEAKEST_M
 
 LEAST_PEOPLE = 10
 """Minimum number of people, one per frame, from which a camera is adjusted."""
 _LEAST_STEP_S = 0.1
 """Minimum time between used frames, s: errors of nearer ones are correlated (0.8)."""
-MOST_FRAMES = 100
 _MOST_SIGHTINGS = 5_000
 """Maximum number of sightings; more of them, or of frames, cost time and add little information,
 because errors within a second are correlated."""
-MIN_DEPTH_M = 0.3
-"""Minimum depth of a used joint, m."""
 
 
 @dataclass(frozen=True)

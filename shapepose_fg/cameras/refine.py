@@ -25,6 +25,7 @@ from shapepose_fg.cameras.check.findings import SURE, Finding, Kind
 from shapepose_fg.cameras.check.small_errors import SmallErrors
 from shapepose_fg.cameras.parameters import CENTRE, FOCAL, MOVE, TURN, Q, difference
 from shapepose_fg.cameras.people import LEAST_PEOPLE, Footage, missed_px
+from shapepose_fg.cameras.resection import ROUNDS
 from shapepose_fg.cameras.stature import build_of
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.camera import Rig, Views
@@ -33,8 +34,6 @@ from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import FrameTimes
 
-_ROUNDS = 4
-"""Maximum number of rounds, each with people associated by the cameras of the round before."""
 _UNKNOWN = 0.8
 """Ratio of posterior to prior standard deviation above which a parameter is undetermined."""
 
@@ -151,11 +150,11 @@ def refine(
     fit = partial(
         settle,
         now=start,
-        rounds=_ROUNDS,
+        rounds=ROUNDS,
         given=start,
         times=times,
         freedom=freedom,
-        told=Steps(progress, 3 * _ROUNDS),
+        told=Steps(progress, 3 * ROUNDS),
         reference=reference,
     )
     found = fit(footage)

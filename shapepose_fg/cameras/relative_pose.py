@@ -19,7 +19,7 @@ from shapepose_fg.cameras.triangulation import KERNEL
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.decompositions import basis_across
 
-_LOOK_S = 0.2
+LOOK_S = 0.2
 """Interval between compared frames, s: people's joints move by more than a detector's error."""
 _MOST_LOOKS = 80
 """Maximum number of frames for scoring hypotheses."""
@@ -126,7 +126,7 @@ def relative(one: CameraTracks, other: CameraTracks, fps: float) -> Relative | N
     frames = np.intersect1d(one.frame, other.frame)
     if len(frames) == 0:
         return None
-    looks = np.unique((frames // max(1, round(_LOOK_S * fps))) * max(1, round(_LOOK_S * fps)))
+    looks = np.unique((frames // max(1, round(LOOK_S * fps))) * max(1, round(LOOK_S * fps)))
     looks = looks[np.unique(np.linspace(0, len(looks) - 1, _MOST_LOOKS).astype(np.intp))]
     seen = Together(one, other, looks)
     guesses = _guesses(one, other, seen)
@@ -197,7 +197,7 @@ def _settled(E: Array, seen: Together, fps: float, looks: Index) -> Relative | N
         share = (
             float(ahead[np.isfinite(points[..., 0])].mean()) if np.isfinite(points).any() else 0.0
         )
-        step = float(np.median(np.diff(looks))) / fps if len(looks) > 1 else _LOOK_S
+        step = float(np.median(np.diff(looks))) / fps if len(looks) > 1 else LOOK_S
         best = Relative(R, t, score * max(0.0, 2 * share - 1), len(a) * step, points)
         kept = new
     return best

@@ -16,15 +16,15 @@ from shapepose_fg.cameras.sightings import (
     same_frame,
 )
 from shapepose_fg.core.arrays import Array, Index
-from shapepose_fg.core.camera import Views
+from shapepose_fg.core.camera import HALF_PIXEL, Views
 from shapepose_fg.core.decompositions import nearest_rotation
 from shapepose_fg.core.rows import Rows
 
-_ROUNDS = 4
-"""Number of rounds of matching and fitting."""
+ROUNDS = 4
+"""Maximum number of rounds, each with people associated by the cameras of the round before."""
 _STEPS = 4
 """Number of steps between matchings."""
-CORNER = np.array([-0.5, -0.5])
+CORNER = -np.array([HALF_PIXEL, HALF_PIXEL])
 """Coordinates of a picture's corner, px; the origin is the centre of the first pixel."""
 
 
@@ -217,7 +217,7 @@ def refined(others: Others, seen: Sightings, camera: Pinhole, columns: list[int]
     """The camera with some of its parameters (`PARAMETERS`) fitted to the people that
     it matches.
     """
-    for _ in range(_ROUNDS):
+    for _ in range(ROUNDS):
         found = match(others, seen, camera)
         if len(found.person) == 0:
             return camera

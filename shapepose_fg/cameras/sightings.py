@@ -19,6 +19,8 @@ from shapepose_fg.proposal.people_2d import group_people
 
 MIN_JOINTS = 5
 """Minimum number of core joints in view for a person to be used."""
+MOST_FRAMES = 100
+"""Maximum number of frames used, spread over the recording."""
 MIN_SIGHTINGS = 20
 """Minimum number of people seen for any statement on a camera or on the order of joints."""
 

@@ -16,6 +16,7 @@ from annotated_types import Interval
 from shapepose_fg.cli.terminal import note
 from shapepose_fg.core.bounds import Axis, Unit, interval_of, violated
 from shapepose_fg.core.errors import InputError, naming
+from shapepose_fg.core.frame_times import LEAST_FPS, MOST_FPS
 
 if TYPE_CHECKING:
     from shapepose_fg.core.camera import Rig
@@ -29,7 +30,7 @@ INPUT, TIME, RESULT, RUN, DRAW = "Input", "Time", "Result", "Run", "Drawing"
 """Headings under which `--help` lists options."""
 REQUIRED: Any = MISSING
 """Placeholder for the default of a required option."""
-Hertz = Annotated[float, Interval(ge=0.01, le=1e5)]
+Hertz = Annotated[float, Interval(ge=LEAST_FPS, le=MOST_FPS)]
 """A frame rate, Hz."""
 Workers = Annotated[int, Interval(ge=1, le=64)]
 """A number of processes, or of recordings at once."""

@@ -17,6 +17,9 @@ from shapepose_fg.core.trajectory import MOST_METRES, Carried, Trajectory
 _MOST_PIXELS, _MOST_DISTORTION, _LONGEST_NAME = 1_000_000, 1e6, 200
 """Upper bounds of the size of a picture, pixels, of distortion coefficients, and of the length of a
 name. Real values are smaller; larger ones would cause overflows."""
+HALF_PIXEL = 0.5
+"""Distance of a pixel's centre from its edge, px: pixel coordinates are 0 at the centre of the
+first pixel, in some formats at its corner."""
 LONGEST_READOUT_S = 0.1
 """Longest readout time that is accepted, s: rolling shutters take 5 to 30 ms."""
 

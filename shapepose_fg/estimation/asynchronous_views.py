@@ -11,12 +11,9 @@ import numpy as np
 
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Views
+from shapepose_fg.core.frame_sets import AT_ONCE_S
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.in_time import velocities
-
-_AT_ONCE_S = 1e-3
-"""Difference of exposure times, s, below which views are synchronised: a hand at 5 m/s moves by 5
-mm."""
 
 
 def leads(observations: Observations, views: Views) -> Array:
@@ -27,7 +24,7 @@ def leads(observations: Observations, views: Views) -> Array:
     the other.
     """
     time_s = observations.time_s
-    apart = np.ptp(time_s, axis=1, keepdims=True) > _AT_ONCE_S
+    apart = np.ptp(time_s, axis=1, keepdims=True) > AT_ONCE_S
     of_view = np.where(apart, time_s - time_s.mean(axis=1, keepdims=True), 0.0)
     lead_s = np.repeat(of_view[:, None], observations.xy.shape[1], axis=1)
     if np.any(views.readout_s):

@@ -3,35 +3,52 @@ step.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Annotated
 
 import numpy as np
 
 from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.decompositions import principal_axes
+from shapepose_fg.core.shipped_numbers import shipped_numbers
+from shapepose_fg.core.storage.schema import Column, Table
 from shapepose_fg.estimation.in_time import SPEED_S
 
 FEET = ("Ankle", "Heel", "BigToe", "SmallToe")
 """Joints that may stand, independently on either side: toes stand while the heel rises."""
-SPEEDS_M_S = np.array([0.017, 0.116, 1.62])
-"""Standard deviation of the speed per axis of a foot's joint that stands, that rotates or slides,
-and that moves. These and the next four are a hidden Markov model of CMU motion capture, training
-subjects, 30 frames a second, fitted by expectation maximisation to velocities over two frames of
-ankles, heels and toes (code: 77ab725)."""
-LASTS_S = np.array([0.63, 0.35, 0.57])
-"""Mean duration of each state, seconds."""
-FIRST = np.array([0.29, 0.37, 0.34])
-"""Stationary probability of each state."""
-NEXT = np.array([[0.0, 0.99, 0.01], [0.42, 0.0, 0.58], [0.01, 0.99, 0.0]])
-"""Transition probabilities between the states."""
-CORRELATION_S = np.array([0.06, 0.1, 0.5])
-"""Correlation time of the speed within each state, seconds."""
 ALIKE_S = 0.25
 """Frames within this time count as one look of the views at a standing foot, seconds: detectors'
 errors last."""
 FREE_M2_S = 0.003
 """Density above which a step is unconstrained: at 30 frames a second it corresponds to 1 cm. With
 0.02 salsa and crowds of four cameras are 0.05 to 0.1 mm worse, with 0.001 standing feet move."""
+
+
+@dataclass(frozen=True)
+class FootMotion(Table):
+    """Hidden Markov model of a foot's joint with K = 3 states: it stands, rotates or slides, moves.
+
+    `scripts/fit_motion.py` fits it to motion capture.
+    """
+
+    speed_m_s: Annotated[Array, Column("K")]
+    """(K,) standard deviation of the speed per axis."""
+    lasts_s: Annotated[Array, Column("K")]
+    """(K,) mean duration of each state, seconds."""
+    first: Annotated[Array, Column("K")]
+    """(K,) stationary probability of each state."""
+    turns: Annotated[Array, Column("K K")]
+    """(K, K) probabilities of the next state when one ends."""
+    correlation_s: Annotated[Array, Column("K")]
+    """(K,) correlation time of the speed within each state, seconds."""
+
+    @classmethod
+    @cache
+    def measured(cls) -> "FootMotion":
+        """The numbers that ship with the package."""
+        return cls(**shipped_numbers("estimation", "motion")["feet"])
 
 
 def feet_of(joints: Sequence[str]) -> Index:
@@ -54,7 +71,8 @@ def standing_density(velocity: Array, covariance: Array, times_s: Array) -> Arra
         np.nan_to_num(velocity), np.where(known[..., None, None], covariance, np.eye(3))
     )
     probability = smoothed(np.where(known[..., None], log, 0.0), times_s)
-    density = probability @ (2 * SPEEDS_M_S**2 * CORRELATION_S)
+    feet = FootMotion.measured()
+    density = probability @ (2 * feet.speed_m_s**2 * feet.correlation_s)
     return (density[1:] + density[:-1]) / 2
 
 
@@ -90,7 +108,7 @@ def log_densities(velocity: Array, covariance: Array) -> Array:
     """(T, F, K) log-density of velocities under each state, up to a constant."""
     values, axes = principal_axes(covariance)
     along = np.einsum("tfia,tfi->tfa", axes, velocity)
-    variance = np.maximum(values, 0.0)[..., None] + SPEEDS_M_S**2
+    variance = np.maximum(values, 0.0)[..., None] + FootMotion.measured().speed_m_s ** 2
     return -0.5 * (along[..., None] ** 2 / variance + np.log(variance)).sum(axis=2)
 
 
@@ -101,13 +119,13 @@ def smoothed(log: Array, times_s: Array) -> Array:
     `log` (T, F, K) are log-densities of the observations. Frames within `SPEED_S`, over which
     velocities are measured, count as one.
     """
-    dt = np.diff(times_s)
+    dt, feet = np.diff(times_s), FootMotion.measured()
     share = np.minimum(np.gradient(times_s) / SPEED_S, 1.0)[:, None, None]
     seen = np.exp(np.maximum(log - log.max(axis=2, keepdims=True), -600.0) * share)
-    stays = np.exp(-dt[:, None] / LASTS_S)
-    turn = stays[..., None] * np.eye(len(FIRST)) + (1 - stays)[..., None] * NEXT
+    stays = np.exp(-dt[:, None] / feet.lasts_s)
+    turn = stays[..., None] * np.eye(len(feet.first)) + (1 - stays)[..., None] * feet.turns
     forward, backward = np.empty_like(seen), np.ones_like(seen)
-    forward[0] = FIRST * seen[0]
+    forward[0] = feet.first * seen[0]
     for t in range(1, len(seen)):
         told = forward[t - 1] @ turn[t - 1] * seen[t]
         forward[t] = told / told.sum(axis=1, keepdims=True)

@@ -29,7 +29,8 @@ from shapepose_fg.estimation.minimise import NotFinite, descend, undetermined_ke
 from shapepose_fg.estimation.user_factors import PersonWindow
 
 UNDETERMINED_M = 10.0
-"""Standard deviation, metres, above which a joint is undetermined, in its worst direction."""
+"""Standard deviation, metres, above which a joint is undetermined, in its worst direction; also
+that of weak priors on joints, since one behind its cameras would make a system singular."""
 
 
 class FrameGraph(PersonWindow):

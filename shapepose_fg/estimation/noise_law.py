@@ -10,7 +10,6 @@ changes it little.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -20,6 +19,7 @@ from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.observations import Observations
+from shapepose_fg.core.shipped_numbers import shipped_numbers
 from shapepose_fg.core.storage.files import read_json
 from shapepose_fg.estimation.gated_views import (
     ObservationConfig,
@@ -43,13 +43,6 @@ _PRIOR_COUNT = 30.0
 """Weight of the shipped law in each range of scores, as a number of detections."""
 _ROUNDS = 40
 """Number of iterations of expectation maximisation."""
-
-
-@cache
-def shipped_covariances() -> dict[str, Any]:
-    """The numbers that `scripts/fit_covariances.py` measured."""
-    with as_file(files("shapepose_fg.estimation") / "data" / "covariances.json") as path:
-        return read_json(path)
 
 
 @dataclass(frozen=True)
@@ -80,7 +73,7 @@ class NoiseLaw:
     @cache
     def shipped(cls) -> "NoiseLaw":
         """The mean law of simulated recordings (`scripts/fit_covariances.py`)."""
-        return cls.from_dict(shipped_covariances()["noise"])
+        return cls.from_dict(shipped_numbers("estimation", "covariances")["noise"])
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> "NoiseLaw":

@@ -19,11 +19,9 @@ from functools import cache
 import numpy as np
 
 from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.shipped_numbers import shipped_numbers
 from shapepose_fg.estimation.body_window import Marginals
-from shapepose_fg.estimation.noise_law import shipped_covariances
 
-USUAL_M = 0.01
-"""Standard deviation of people whom all views see, metres."""
 REJECTED = 0.1
 """Unit of the share of rejected evidence: the base of `AssociationUncertainty.rejected` is 2 at
 this share."""
@@ -50,7 +48,7 @@ class CorrelatedErrors:
     @cache
     def measured(cls) -> "CorrelatedErrors":
         """The numbers that ship, measured by `scripts/fit_covariances.py`."""
-        return cls(**shipped_covariances()["correlated_errors"])
+        return cls(**shipped_numbers("estimation", "covariances")["correlated_errors"])
 
     def factor(self, share: Array | float, ratio: Array | float) -> Array | float:
         """Factor on the variances of a window, for the `share` of correlated errors and the `ratio`
@@ -66,8 +64,8 @@ class AssociationUncertainty:
     scale: float
     """Factor on all variances in single frames."""
     sigma: float
-    """Exponent of the mean standard deviation of a person's joints in a single frame, over
-    `USUAL_M`."""
+    """Exponent of the mean standard deviation of a person's joints in a single frame, in
+    centimetres."""
     rejected: float
     """Exponent of one plus the share of evidence that gates reject, over `REJECTED`."""
 
@@ -75,13 +73,13 @@ class AssociationUncertainty:
     @cache
     def measured(cls) -> "AssociationUncertainty":
         """The numbers that ship, measured by `scripts/fit_covariances.py`."""
-        return cls(**shipped_covariances()["association_uncertainty"])
+        return cls(**shipped_numbers("estimation", "covariances")["association_uncertainty"])
 
     def in_frames(self, sigma_m: Array, rejected: Array) -> Array:
         """(T,) factors on variances in single frames, for the mean standard deviation of each row,
         metres, and the share of rejected evidence. Without time, associations are less certain.
         """
-        return self.scale * (sigma_m / USUAL_M) ** self.sigma * self.of_rejected(rejected)
+        return self.scale * (sigma_m / 1e-2) ** self.sigma * self.of_rejected(rejected)
 
     def of_rejected(self, rejected: Array) -> Array:
         """Factors on variances for shares of rejected evidence."""

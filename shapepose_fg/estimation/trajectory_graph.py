@@ -32,6 +32,7 @@ from shapepose_fg.core.arrays import Array, Index, Mask, Whole
 from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.estimation.camera_pose_uncertainty import POSES_LAST_S
+from shapepose_fg.estimation.frame_graph import UNDETERMINED_M
 from shapepose_fg.estimation.gated_views import (
     ObservationConfig,
     linearise,
@@ -55,9 +56,6 @@ whose detector has Shelf's statistics (0.8 after a frame, 0.35 after a second, 0
 _AVERAGED_S = 1.0
 """Time, s, over which an odometry of 1 % is more accurate than people's constraints on a pose;
 errors average out over it."""
-ANYWHERE_M = 10.0
-"""Standard deviation of a weak prior on joints, m; one behind its cameras would make the system
-singular."""
 _GAUGE = np.diag([1e-5**2] * 3 + [1e-4**2] * 3)
 """Without a static camera, the world is the first carrier's initial frame; this is its prior
 covariance."""
@@ -268,7 +266,7 @@ class TrajectoryGraph:
         there = chosen.any(axis=2)
         joints = self._joint_keys[there].tolist()
         deque(map(self.values.insert, joints, points[there]), maxlen=0)
-        near = isotropic(3, ANYWHERE_M)
+        near = isotropic(3, UNDETERMINED_M)
         deque(map(self.graph.addPriorPoint3, joints, points[there], [near] * len(joints)), maxlen=0)
         for factor in self._own(self, self.keys) if self._own is not None else ():
             self.graph.add(factor)

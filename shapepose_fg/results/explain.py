@@ -29,12 +29,11 @@ from shapepose_fg.results.explanation import (
     ViewReason,
 )
 from shapepose_fg.results.solve_again import Solver, solved_around
+from shapepose_fg.tracking.view_assignment import FARTHEST_M
 
 OFF_SIGMA = 3.0
 """Distance of a detection from the prediction by all else, in standard deviations, above which it
 is reported: one in 90 exceeds it by chance."""
-_NEAR_M = 0.5
-"""Distance from a joint, m, within which an unassigned detection is reported."""
 _APART = 0.5
 """Ratio of the distances from another person's joint and this one's below which a detection is the
 other's."""
@@ -308,7 +307,7 @@ def _refused(
                 f"{off:.0f} px off. It was not used."
             )
             joined.append(Finding(cause, (name,), f"Camera {name} {words}"))
-        elif not whose and off * depth[view] < _NEAR_M * views.focal[0, view]:
+        elif not whose and off * depth[view] < FARTHEST_M * views.focal[0, view]:
             words = f"Camera {name} has an unassigned detection {off:.0f} px off."
             beside.append((off, Finding(cause, (name,), words)))
     return joined + [each for _, each in sorted(beside, key=lambda one: one[0])]

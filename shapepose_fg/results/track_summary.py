@@ -41,8 +41,9 @@ class TrackSummary:
     """Walked distance, m, summed over half seconds; steps under 5 cm are ignored."""
 
 
-_TOGETHER = 40_000
-"""Maximum number of rows of a saved result in memory at once, plus those of one person."""
+MOST_ROWS = 40_000
+"""Maximum number of rows of a saved result that are in memory at once, about 400 MB, plus those of
+one person."""
 
 
 def list_saved_tracks(
@@ -50,7 +51,7 @@ def list_saved_tracks(
 ) -> list[TrackSummary]:
     """`list_tracks` of a saved result, loading a few people at a time."""
     numbers, counts = np.unique(opened.person, return_counts=True)
-    group = (np.cumsum(counts) - counts) // _TOGETHER
+    group = (np.cumsum(counts) - counts) // MOST_ROWS
     return [
         track
         for n in np.unique(group)

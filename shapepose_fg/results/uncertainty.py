@@ -18,10 +18,10 @@ from shapepose_fg.core.camera import Rig, Views
 from shapepose_fg.core.decompositions import principal_axes, symmetric_root
 from shapepose_fg.core.errors import NotDetermined
 from shapepose_fg.core.reconstruction import BODY, Reconstruction
+from shapepose_fg.core.shipped_numbers import shipped_numbers
 from shapepose_fg.estimation.camera_pose_uncertainty import POSES_LAST_S, reported_with_poses
 from shapepose_fg.estimation.gated_views import ObservationConfig
 from shapepose_fg.estimation.in_time import moments
-from shapepose_fg.estimation.noise_law import shipped_covariances
 from shapepose_fg.estimation.window_solution import PersonGraph
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ def error_tails() -> float:
     """Degrees of freedom of Student's t, by which joints' errors are distributed: most are smaller
     than their covariance says and a few far larger. Measured by `scripts/fit_covariances.py`.
     """
-    return float(shipped_covariances()["tails"])
+    return float(shipped_numbers("estimation", "covariances")["tails"])
 
 
 def squared_radius(share: float) -> float:

@@ -18,7 +18,7 @@ from shapepose_fg.core.storage.files import read_json
 _FILE = Path(__file__).parent / "data" / "detector.json"
 _MIRROR = np.array(BODY_25.mirror)
 
-JOINT_GROUP = np.unique(np.minimum(np.arange(25), _MIRROR), return_inverse=True)[1]
+_, JOINT_GROUP = np.unique(np.minimum(np.arange(len(_MIRROR)), _MIRROR), return_inverse=True)
 """(25,) the row of each joint in tables by joint: left and right share one, G = 14 rows."""
 _LIMBS = np.array(BODY_25.limbs)
 _LIMB_NAMES = [min(tuple(limb), tuple(_MIRROR[limb].tolist())) for limb in _LIMBS.tolist()]

@@ -12,9 +12,10 @@ from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.compiled import kernel, part
 from shapepose_fg.core.kernel_geometry import ROBUST, project, triangulated
 from shapepose_fg.estimation.gated_views import MIN_DEPTH_M, ObservationConfig
+from shapepose_fg.estimation.in_time import KNOWN_M
 from shapepose_fg.estimation.kernels import add_detection
 from shapepose_fg.proposal.nearby import FrameArrays
-from shapepose_fg.tracking.motion_filter import TRUSTED_M, Bones, JointStates, sigma
+from shapepose_fg.tracking.motion_filter import Bones, JointStates, sigma
 from shapepose_fg.tracking.plausibility import tear
 from shapepose_fg.tracking.view_assignment import FARTHEST_M
 
@@ -142,7 +143,7 @@ def _measure(mean, covariance, lost, candidate, confident, arrays, trust, bones,
                     )
                     _move(mean[a, j], covariance[a, j], at, L, g, M, gain)
                 _update(mean[a, j], covariance[a, j], L, M, gain)
-            trusted[j], seen_by[j] = sigma(covariance[a, j]) < TRUSTED_M, inlier[j].sum()
+            trusted[j], seen_by[j] = sigma(covariance[a, j]) < KNOWN_M, inlier[j].sum()
         tear(
             mean[a],
             trusted,

@@ -13,15 +13,12 @@ from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.compiled import kernel, part
 from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.skeleton import Skeleton
+from shapepose_fg.estimation.in_time import KNOWN_M
 
 LOST_M = 0.2
 """Standard deviation, m, above which the place of a joint is not known. If it is predicted, the
 joint is lost, and searched for around its parent; a joint seen by one view is not lost, however
 uncertain its depth."""
-TRUSTED_M = 0.1
-"""Standard deviation, m, below which a joint's bone lengths are checked, and below which it is not
-lost in the next frame however long the interval: at 10 frames per second the unknown velocity of a
-new person's joints alone adds 20 cm."""
 _FOLLOW_S = 0.25
 """Time constant with which the velocity of a joint that is not well seen approaches that of the
 person, s."""
@@ -157,7 +154,7 @@ def _predict(
     right, left, velocity = bones.hips[0], bones.hips[1], np.empty(3)
     for a in range(people):
         # Without information the velocity is 0; else the joint would drift along a ray.
-        certain = 1 / TRUSTED_M**2
+        certain = 1 / KNOWN_M**2
         velocity[0] = velocity[1] = velocity[2] = 0.0
         for j in range(joints):
             if core[j]:
@@ -194,7 +191,7 @@ def _predict(
                     covariance_after[a, j, row, column] = covariance_after[a, j, column, row] = (
                         total
                     )
-            lost[a, j] = _across(covariance_after[a, j]) > LOST_M and was_m > TRUSTED_M
+            lost[a, j] = _across(covariance_after[a, j]) > LOST_M and was_m > KNOWN_M
             any_placed = any_placed or (core[j] and not lost[a, j])
         for j in order:
             lost[a, j] = lost[a, j] and any_placed  # else no parent is placed

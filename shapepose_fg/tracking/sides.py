@@ -20,6 +20,7 @@ from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.detections import Input
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.draft import MODEL_SIGMA_M
+from shapepose_fg.estimation.gated_views import MIN_DEPTH_M
 from shapepose_fg.estimation.mirrored_sides import DOUBTED
 from shapepose_fg.proposal.people_2d import group_people
 from shapepose_fg.tracking.motion_filter import LOST_M, JointStates
@@ -78,7 +79,9 @@ class _Compared:
         view, joint = found.view[rows], found.joint[rows]
         xy, depth = rig.project(joints.position)  # (V, A, J, 2), (V, A, J)
         unit_px = (
-            rig.focal_px[:, None, None] / np.maximum(depth, 0.2) * np.hypot(_NEAR_M, joints.sigma_m)
+            rig.focal_px[:, None, None]
+            / np.maximum(depth, MIN_DEPTH_M)
+            * np.hypot(_NEAR_M, joints.sigma_m)
         )
         # Sums over the joints of each part (G, parts, A), with the sides as they are, or exchanged.
         same, turned = np.zeros((2, len(groups), states.shape[1] + 1, len(ids)))

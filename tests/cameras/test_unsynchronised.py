@@ -56,7 +56,7 @@ def test_moments_of_one_clock():
 @pytest.mark.slow
 def test_people_who_stand_are_refused(rig, two_people, few_frames, monkeypatch):
     """Offsets never converge: the first round has it all."""
-    monkeypatch.setattr(unsynchronised, "_ROUNDS", 1)
+    monkeypatch.setattr(unsynchronised, "ROUNDS", 1)
     three = replace(rig, cameras=rig.cameras[:3])
     still = np.repeat(moving(two_people[0], 0.0)[None, :2], 80, axis=0)
     with pytest.raises(

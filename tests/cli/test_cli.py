@@ -357,7 +357,7 @@ def test_frames_are_half_open(recording, pipeline, text, frames):
         (["--frames", "3:3"], "--frames 3:3: not in the recording, which has 5 frames"),
         (["--frames", "-2:"], "--frames -2:: must be A:B with two frame numbers, such as 0:100"),
         (["--frames", "all"], "--frames all: must be A:B"),
-        (["--fps", "0"], "--fps 0: must be at least 0.01"),
+        (["--fps", "0"], "--fps 0: must be at least 0.001"),
         (["--readout", "20"], "--readout 20: must be 0 to 0.1 seconds, such as 0.02"),
         (["--fps", "nan"], "--fps nan: must"),
         (

@@ -183,7 +183,7 @@ def test_a_part_is_exported_listed_and_shown_as_the_whole_would_be(folder, resul
     take = read_take(folder, up="z", frames=range(30, 60), persons=(0, 2))
     inside = np.isin(result.person, (0, 2)) & (result.frame >= 30) & (result.frame < 60)
     same(take.people, result.rows(inside))
-    monkeypatch.setattr("shapepose_fg.results.track_summary._TOGETHER", 500)
+    monkeypatch.setattr("shapepose_fg.results.track_summary.MOST_ROWS", 500)
     with Reconstruction.open(folder) as opened:
         listed = list_saved_tracks(opened)
     without = [

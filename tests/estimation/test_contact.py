@@ -5,10 +5,8 @@ import pytest
 
 from shapepose_fg.core.skeleton import BODY_25, COCO_17
 from shapepose_fg.estimation.contact import (
-    FIRST,
     FREE_M2_S,
-    LASTS_S,
-    NEXT,
+    FootMotion,
     feet_of,
     smoothed,
     standing_density,
@@ -56,11 +54,12 @@ def test_without_evidence_it_is_as_often_as_ever():
     """Rates and shares of the three ways to move agree: a chain that nothing is seen of keeps its
     shares.
     """
-    rate = (NEXT - np.eye(3)) / LASTS_S[:, None]
-    np.testing.assert_allclose(NEXT.sum(axis=1), 1.0)
-    np.testing.assert_allclose(FIRST @ rate, 0.0, atol=0.06)
+    feet = FootMotion.measured()
+    rate = (feet.turns - np.eye(3)) / feet.lasts_s[:, None]
+    np.testing.assert_allclose(feet.turns.sum(axis=1), 1.0)
+    np.testing.assert_allclose(feet.first @ rate, 0.0, atol=0.06)
     nothing = smoothed(np.zeros((40, 1, 3)), np.arange(40) / 30)
-    np.testing.assert_allclose(nothing[20, 0], FIRST, atol=0.05)
+    np.testing.assert_allclose(nothing[20, 0], feet.first, atol=0.05)
 
 
 def test_feet_of_skeletons():

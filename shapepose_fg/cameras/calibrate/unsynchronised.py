@@ -15,17 +15,15 @@ from shapepose_fg.cameras.calibrate.from_people import (
 )
 from shapepose_fg.cameras.calibrate.levelling import Measured
 from shapepose_fg.cameras.offsets.from_heights import offsets_without_poses
+from shapepose_fg.cameras.resection import ROUNDS
 from shapepose_fg.cameras.sightings import Sightings
 from shapepose_fg.cameras.synchronise import WHOLE_S, Synchronised, offsets
 from shapepose_fg.cameras.tracks import at_regular_times, next_of, on_one_clock
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import DetectionSequence
+from shapepose_fg.core.frame_sets import AT_ONCE_S
 from shapepose_fg.core.frame_times import FrameTimes
-
-_ROUNDS = 4
-_STILL_S = 0.001
-"""Change per round below which offsets have converged, s."""
 
 
 def calibrate_unsynchronised(
@@ -50,12 +48,12 @@ def calibrate_unsynchronised(
     V = len(rig)
     frames = frames[: round(WHOLE_S * fps)]
     sightings = at_regular_times(Sightings.of(detections, frames), time_s, fps)
-    total = 100 * (1 + _ROUNDS)
+    total = 100 * (1 + ROUNDS)
     tracks = own_tracks(sightings, rig, fps)
     paired = Steps(lambda done, pairs: progress(100 * done // pairs, total), V - 1)
     shift = offsets_without_poses(tracks, fps, most_s, paired)
     following, found, problems = next_of(sightings), None, tuple[str, ...]()
-    for turn in range(_ROUNDS):
+    for turn in range(ROUNDS):
         seen = on_one_clock(sightings, following, shift, detections.skeleton)
         times = FrameTimes.from_fps(fps, seen.frames.stop)
         begin = 100 * (1 + turn)
@@ -77,7 +75,7 @@ def calibrate_unsynchronised(
             sightings, found.rig, fps, frames, most_s, np.zeros(V), lambda *_: None
         )
         before, shift = shift, -offset * fps
-        if np.abs(shift - before).max() < _STILL_S * fps:
+        if np.abs(shift - before).max() < AT_ONCE_S * fps:
             break
     assert found is not None
     progress(total, total)

@@ -9,6 +9,7 @@ import numpy as np
 from shapepose_fg.cameras.resection import Others, match, possible_matches
 from shapepose_fg.cameras.sightings import (
     GATE,
+    MOST_FRAMES,
     Groups,
     Pairs,
     Pinhole,
@@ -26,8 +27,6 @@ from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.repeated_pictures import WithoutRepeats
 from shapepose_fg.core.skeleton import Skeleton
 
-ANCHORS = 100
-"""Number of frames used, spread over the recording."""
 MOST_LAG = 60
 """Maximum time offset searched for, frames; less in a short recording."""
 _MOST_PAIRS = 25_000
@@ -68,22 +67,22 @@ def gather(detections: DetectionSequence, frames: range, views: int) -> Evidence
         wanted = np.arange(frames.start, frames.stop)
         most = min(MOST_LAG, count // 4)
         spread = np.unique(
-            np.linspace(frames.start, frames.stop - 1, min(count, ANCHORS)).astype(np.intp)
+            np.linspace(frames.start, frames.stop - 1, min(count, MOST_FRAMES)).astype(np.intp)
         )
     else:
         most = MOST_LAG
         spread = np.unique(
-            np.linspace(frames.start + most, frames.stop - 1 - most, ANCHORS).astype(np.intp)
+            np.linspace(frames.start + most, frames.stop - 1 - most, MOST_FRAMES).astype(np.intp)
         )
         if (
-            sum(len(detections[t]) > 0 for t in spread.tolist()) < ANCHORS // 4
+            sum(len(detections[t]) > 0 for t in spread.tolist()) < MOST_FRAMES // 4
         ):  # people are present only at times
             there = np.array(
                 [t for t in frames if len(detections[t]) > 0] or [frames.start], dtype=np.intp
             )
-            spread = there[np.unique(np.linspace(0, len(there) - 1, ANCHORS).astype(np.intp))]
+            spread = there[np.unique(np.linspace(0, len(there) - 1, MOST_FRAMES).astype(np.intp))]
         # Number of frames of a longer recording with neighbours used.
-        every = max(1, ANCHORS // 16)
+        every = max(1, MOST_FRAMES // 16)
         near = [np.arange(t - most, t + most + 1) for t in spread[::every]]
         wanted = np.unique(np.concatenate([spread, *near]))
         wanted = wanted[(wanted >= frames.start) & (wanted < frames.stop)]

@@ -43,7 +43,8 @@ from shapepose_fg.pipeline.runs import manifest
 from shapepose_fg.pipeline.runs.assembly import Assembly
 from shapepose_fg.pipeline.trajectories import kept_rig
 from shapepose_fg.results.corrections import refuse_corrected
-from shapepose_fg.viz.report.writing import MOST_ROWS, REPORT, th, write_report
+from shapepose_fg.results.track_summary import MOST_ROWS
+from shapepose_fg.viz.report.writing import REPORT, th, write_report
 
 
 @dataclass(frozen=True)

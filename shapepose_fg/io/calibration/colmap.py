@@ -8,6 +8,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from shapepose_fg.core.camera import HALF_PIXEL
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.lens import Lens
 from shapepose_fg.core.storage.files import LARGE, read_text
@@ -24,9 +25,6 @@ from shapepose_fg.io.calibration.written import (
 
 FILES = ("cameras.txt", "images.txt")
 _BINARY = ("cameras.bin", "images.bin")
-HALF_PIXEL = 0.5
-"""Offset of pixel coordinates: COLMAP's (0, 0) is the corner of the first pixel, ours is its
-centre."""
 MODELS: dict[str, tuple[str, Lens]] = {
     "SIMPLE_PINHOLE": ("f cx cy", "perspective"),
     "PINHOLE": ("fx fy cx cy", "perspective"),

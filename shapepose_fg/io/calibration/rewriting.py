@@ -16,9 +16,9 @@ import numpy as np
 import yaml
 from numpy.typing import ArrayLike
 
-from shapepose_fg.core.camera import Camera, Rig
+from shapepose_fg.core.camera import HALF_PIXEL, Camera, Rig
 from shapepose_fg.core.storage.files import read_text
-from shapepose_fg.io.calibration.colmap import COLMAP, FILES, HALF_PIXEL, MODELS
+from shapepose_fg.io.calibration.colmap import COLMAP, FILES, MODELS
 from shapepose_fg.io.calibration.content import Content, load
 from shapepose_fg.io.calibration.opencv_and_ros import (
     BEND,

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.core.arrays import Array, Index
+from shapepose_fg.core.bounds import MOST_NUMBER
 from shapepose_fg.core.detections import Input
 from shapepose_fg.core.errors import naming
 from shapepose_fg.core.notes import Notes
@@ -16,6 +17,7 @@ from shapepose_fg.core.observation_table import ObservationTable
 from shapepose_fg.core.reconstruction import Reconstruction, Status
 from shapepose_fg.core.storage.kept_arrays import ANEW, KeptArrays
 from shapepose_fg.core.storage.schema import Column, columns_of
+from shapepose_fg.core.trajectory import MOST_METRES
 from shapepose_fg.pipeline.runs.chunks import Border
 from shapepose_fg.pipeline.windows import StreamState
 from shapepose_fg.tracking.identities import MOST_FRAMES, FollowState, observed, people_at
@@ -189,16 +191,19 @@ def checkpoint_arrays(checkpoint: Checkpoint) -> dict[str, NDArray[Any]]:
     return arrays
 
 
-_NUMBERS = partial(Column, dtype=np.int64, most=2**53)
+_NUMBERS = partial(Column, dtype=np.int64, most=MOST_NUMBER)
 _ROWS = {
     "track": _NUMBERS("N"),
     "candidate": Column("N J V", np.intp),
-    "initial": Column("N J 3", most=1e6),
-    "evidence": Column("N", most=1e6),
+    "initial": Column("N J 3", most=MOST_METRES),
+    "evidence": Column("N", most=MOST_METRES),
 }
 """Columns of a row that is not solved yet; the rest comes from the cameras."""
 _FOLLOWED = {"at": _NUMBERS("2"), "state.numbers": _NUMBERS("2"), "state.rows": _NUMBERS("D")}
-_FOLLOWED |= {"state.ids": _NUMBERS("A"), "state.mean": Column("A J S", most=1e6, finite=True)}
+_FOLLOWED |= {
+    "state.ids": _NUMBERS("A"),
+    "state.mean": Column("A J S", most=MOST_METRES, finite=True),
+}
 _FOLLOWED |= {"state.covariance": Column("A J S S", most=1e12, finite=True)}
 _FOLLOWED |= {f"rows.{name}": column for name, column in _ROWS.items()}
 _FOLLOWED |= {f"border.{name}": column for name, column in columns_of(Border).items()}

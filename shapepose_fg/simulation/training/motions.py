@@ -170,13 +170,20 @@ def frame_weights(length: Whole, subject: NDArray[np.str_], walking: Mask) -> Ar
     return total / length
 
 
-def _of_clip(clip: Clip) -> _Recording:
+def pose_vectors(clip: Clip) -> Array:
+    """(T, 24, 3) axis-angle rotations of a clip, with collars that follow the arms; unrecorded
+    wrists, toes and hands are zero.
+    """
     rotations = shoulder_rhythm(clip.rotations)
     vectors = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_rotvec().reshape(-1, 24, 3)
     for joints, recorded in ((_HANDS, False), (_WRISTS, clip.wrist_valid), (_TOES, clip.toe_valid)):
         if not recorded:
             vectors[:, list(joints)] = 0.0
-    return clip.subject, "walk" in clip.action.lower(), vectors.astype(np.float32)
+    return vectors
+
+
+def _of_clip(clip: Clip) -> _Recording:
+    return clip.subject, "walk" in clip.action.lower(), pose_vectors(clip).astype(np.float32)
 
 
 def _read_amass(path: Path) -> _Recording:

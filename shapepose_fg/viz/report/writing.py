@@ -16,14 +16,11 @@ from shapepose_fg.core.run_summary import has_identities
 from shapepose_fg.core.storage.files import write_atomically
 from shapepose_fg.io.calibration import read_rig
 from shapepose_fg.io.export.take import Take
-from shapepose_fg.results.track_summary import list_tracks
+from shapepose_fg.results.track_summary import MOST_ROWS, list_tracks
 from shapepose_fg.viz.report.figures import Curve, angle_curves
 from shapepose_fg.viz.report.page import page_text
 from shapepose_fg.viz.report.scene import PageScene, scene_of
 
-MOST_ROWS = 40_000
-"""Maximum number of rows that check and report use, about 400 MB: of longer results, only every
-second, third ... frame is used."""
 REPORT = "report.html"
 """File name of the report, beside people.npz."""
 SCENE_BYTES = 8_000_000
