@@ -200,9 +200,10 @@ def seen_by(views: int, confidence: float, scene: Scene) -> Observations:
 
 
 @pytest.mark.parametrize(
-    ("views", "confidence", "used"), [(6, 0.8, True), (2, 0.8, False), (6, 0.3, False)]
+    ("views", "confidence", "used"), [(6, 0.8, True), (2, 0.8, False), (6, 0.3, True)]
 )
-def test_only_what_three_views_see_well_is_learnt_from(scene, views, confidence, used):
+def test_only_what_three_views_agree_on_is_learnt_from(scene, views, confidence, used):
+    """Whatever a detector's scores are like."""
     observations = seen_by(views, confidence, scene)
     targets = confident_targets(observations, scene.rig, ObservationConfig())
     assert (np.abs(targets.information).max(axis=(2, 3)) > 0).all() == used
