@@ -1,7 +1,7 @@
 """2D joint candidates of all views of one frame, and the affinities between them."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
 
@@ -92,6 +92,21 @@ class Detections:
         begin = np.searchsorted(ends[by_end], np.arange(len(self) + 1))
         other = np.require(self.pairs[:, ::-1], np.intp).ravel()[by_end]
         return begin, other, np.repeat(np.require(self.affinity, float), 2)[by_end]
+
+    def with_sides(self, joint: Index, mirrored: Array, mirror: Index) -> "Detections":
+        """The candidates, some as the joint of the other side: `joint` (D,) is that of each or its
+        `mirror` (J,), and `mirrored` (D,) the probability that this is wrong. ValueError for
+        others.
+
+        Affinities between a candidate that changed its side and one that did not are left out.
+        """
+        first, second = self.pairs.T
+        wrong, middle = joint != self.joint, mirror[self.joint] == self.joint
+        if np.any(joint[wrong] != mirror[self.joint[wrong]]):
+            raise ValueError("its detections are of other joints")
+        whole = (wrong[first] == wrong[second]) | middle[first] | middle[second]
+        pairs, affinity = self.pairs[whole], self.affinity[whole]
+        return replace(self, joint=joint, pairs=pairs, affinity=affinity, mirrored=mirrored)
 
     def only(self, keep: Mask) -> "Detections":
         """The candidates selected by the mask `keep` (D,), and the affinities between them."""

@@ -202,7 +202,8 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
     with execution.pool(setup, len(frames)) as pool:
         beginning = book.flush()
         nobody = setup.engine(book).tracker.nobody()
-        for part in windows.after(parts.checkpoint(windows.read, frames, nobody), pool, chunk):
+        begin = parts.checkpoint(windows.read, frames, nobody, skeleton)
+        for part in windows.after(begin, pool, chunk):
             parts.append(part)
             done += part.notes.frames
             tell((done + (passes - 1) * len(frames)) // passes)

@@ -139,13 +139,8 @@ class _Compared:
                     wrong[group] = np.append(False, change)[of]
         if not wrong.any() and (mirrored == found.mirrored).all():
             return given
-        first, second = found.pairs.T
-        middle = mirror[found.joint] == found.joint
-        whole = (wrong[first] == wrong[second]) | middle[first] | middle[second]
         joint = np.where(wrong, mirror[found.joint], found.joint)
-        pairs, affinity = found.pairs[whole], found.affinity[whole]
-        held = replace(found, joint=joint, pairs=pairs, affinity=affinity, mirrored=mirrored)
-        return replace(given, detections=held)
+        return replace(given, detections=found.with_sides(joint, mirrored, mirror))
 
 
 @dataclass(frozen=True)

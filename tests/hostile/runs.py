@@ -173,7 +173,7 @@ def parts_of(
                 seal(kept, valid)
             parts = Parts(kept)
             parts.check(joints, own.rig.names, frames, times.frame_s)
-            parts.checkpoint(windows.read, frames, nobody)
+            parts.checkpoint(windows.read, frames, nobody, setup.skeleton)
             if "bodies-000000.safetensors" in valid:
                 kept_offsets(kept, Sample(setup, detections, times), Notebook())
             return Assembly(parts, joints, own.rig.names).reconstruction()

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from typing import NamedTuple
@@ -20,6 +21,7 @@ import pytest
 from shapepose_fg.body.shapes import SubjectShapes
 from shapepose_fg.cli.main import main
 from shapepose_fg.cli.stopping import Stopped
+from shapepose_fg.core.detections import Recording
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.storage.kept_arrays import InFolder
@@ -28,6 +30,7 @@ from shapepose_fg.estimation.detector_offsets import OffsetConfig
 from shapepose_fg.io.config import toml_text
 from shapepose_fg.pipeline.execution import Execution
 from shapepose_fg.pipeline.pipeline import PipelineConfig, Task, reconstruct, reconstruct_parts
+from shapepose_fg.pipeline.runs.assembly import Assembly
 from shapepose_fg.pipeline.runs.manifest import (
     check_room,
     checksum_at_start,
@@ -108,24 +111,46 @@ class Interrupted(InFolder):
             raise Stopped(signal.SIGTERM)
 
 
+def with_stops(task: Task, folder: Path) -> Assembly:
+    """The result of a run that is stopped, and goes on, until it comes to its end."""
+    for stops in range(12):
+        kept = Interrupted(folder, 4 + stops, behind=stops % 3 == 1)
+        try:
+            result = reconstruct_parts(kept, task)
+        except Stopped:
+            continue
+        assert stops >= 2
+        return result
+    raise AssertionError("the run must come to an end")
+
+
 @pytest.mark.slow
 def test_a_run_that_is_stopped_again_and_again_ends_the_same(scene, recording, whole, tmp_path):
     """Stopped around the writes of windows, of where following stands, and of bodies; a window is
     two writes.
     """
-    stops, result = 0, None
-    while result is None:
-        kept = Interrupted(tmp_path / "parts", 4 + stops, behind=stops % 3 == 1)
-        try:
-            result = reconstruct_parts(kept, Task(recording, scene.rig, CONFIG, cuts=CUTS))
-        except Stopped:
-            stops += 1
-            assert stops < 12, "the run must come to an end"
-    assert stops >= 2
+    result = with_stops(Task(recording, scene.rig, CONFIG, cuts=CUTS), tmp_path / "parts")
     result.save(tmp_path / "results")
     assert_same_files(tmp_path / "results", whole)
     people = Reconstruction.load(tmp_path / "results")
     assert people.observations is not None and "run_id" not in people.run
+
+
+@pytest.mark.slow
+def test_a_run_whose_detector_exchanges_sides_goes_on(scene, recording, tmp_path):
+    """One of three views sees everybody's left as right: its detections are exchanged before they
+    are given out, and are so when the run goes on.
+    """
+    mirror = np.array(recording.skeleton.mirror)
+    frames = [
+        replace(each, joint=np.where(each.view == 0, mirror[each.joint], each.joint))
+        for each in (recording[n] for n in range(24))
+    ]
+    config = replace(CONFIG, offsets=OffsetConfig(source="none"))
+    task = Task(Recording(recording.skeleton, frames), scene.rig, config)
+    with_stops(task, tmp_path / "parts").save(tmp_path / "results")
+    reconstruct_parts(InFolder(tmp_path / "others"), task).save(tmp_path / "whole")
+    assert_same_files(tmp_path / "results", tmp_path / "whole")
 
 
 def test_what_is_in_memory_and_what_is_in_the_files_is_the_same(dance, tmp_path):

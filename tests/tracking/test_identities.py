@@ -336,7 +336,7 @@ def test_whoever_goes_on_from_a_checkpoint_finds_the_same_bytes(
                 first = state.pending[0].frame
                 nobody = Tracks.none(tracker.skeleton)
                 state = checkpoint_of(
-                    arrays, given.__getitem__, first, range(60), nobody
+                    arrays, given.__getitem__, first, range(60), nobody, tracker.skeleton
                 ).state.follow
             state, more = follow(tracker, state, each, FollowingConfig())
             decided += more

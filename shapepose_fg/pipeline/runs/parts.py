@@ -15,6 +15,7 @@ from shapepose_fg.core.errors import naming
 from shapepose_fg.core.notes import Notes
 from shapepose_fg.core.observation_table import ObservationTable
 from shapepose_fg.core.reconstruction import Reconstruction, Status
+from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.core.storage.kept_arrays import ANEW, KeptArrays
 from shapepose_fg.core.storage.schema import Column, columns_of
 from shapepose_fg.core.trajectory import MOST_METRES
@@ -142,7 +143,7 @@ class Parts:
         return notes
 
     def checkpoint(
-        self, read: Callable[[int], Input], frames: range, nobody: Tracks
+        self, read: Callable[[int], Input], frames: range, nobody: Tracks, skeleton: Skeleton
     ) -> Checkpoint | None:
         """The tracker's state from which an interrupted run continues; None at the beginning.
 
@@ -159,7 +160,8 @@ class Parts:
         joints, size = nobody.joints.mean.shape[1:]
         found = self.kept.columns(name, columns, {"J": joints, "S": size})
         with naming(self.kept.place(name), ANEW):
-            return checkpoint_of(found, read, frames.start + self.notes().frames, frames, nobody)
+            solved = frames.start + self.notes().frames
+            return checkpoint_of(found, read, solved, frames, nobody, skeleton)
 
 
 def _are_of(rows: Reconstruction, frames: range, frame_s: Array) -> bool:
@@ -188,6 +190,9 @@ def checkpoint_arrays(checkpoint: Checkpoint) -> dict[str, NDArray[Any]]:
     arrays |= {"state.covariance": follow.people.joints.covariance}
     for name in _ROWS if len(decided) > 0 else ():
         arrays[f"rows.{name}"] = np.concatenate([getattr(rows, name) for _, rows in decided])
+    for name in _SIDES if len(decided) > 0 else ():
+        every = [getattr(given.detections, name) for given, _ in decided]
+        arrays[f"detections.{name}"] = np.concatenate(every)
     return arrays
 
 
@@ -199,13 +204,17 @@ _ROWS = {
     "evidence": Column("N", most=MOST_METRES),
 }
 """Columns of a row that is not solved yet; the rest comes from the cameras."""
-_FOLLOWED = {"at": _NUMBERS("2"), "state.numbers": _NUMBERS("2"), "state.rows": _NUMBERS("D")}
+_SIDES = {"joint": _NUMBERS("D"), "mirrored": Column("D", least=0.0, most=1.0, finite=True)}
+"""Columns of the detections of decided frames, whose sides may be exchanged; the rest comes from
+the cameras."""
+_FOLLOWED = {"at": _NUMBERS("2"), "state.numbers": _NUMBERS("2"), "state.rows": _NUMBERS("F")}
 _FOLLOWED |= {
     "state.ids": _NUMBERS("A"),
     "state.mean": Column("A J S", most=MOST_METRES, finite=True),
 }
 _FOLLOWED |= {"state.covariance": Column("A J S S", most=1e12, finite=True)}
 _FOLLOWED |= {f"rows.{name}": column for name, column in _ROWS.items()}
+_FOLLOWED |= {f"detections.{name}": column for name, column in _SIDES.items()}
 _FOLLOWED |= {f"border.{name}": column for name, column in columns_of(Border).items()}
 """Columns of `checkpoint_arrays`."""
 
@@ -216,6 +225,7 @@ def checkpoint_of(
     solved: int,
     frames: range,
     nobody: Tracks,
+    skeleton: Skeleton,
 ) -> Checkpoint:
     """Inverse of `checkpoint_arrays`.
 
@@ -237,6 +247,14 @@ def checkpoint_of(
         )
         return Checkpoint(following, next_id, border=border)
     given = {frame: read(frame) for frame in range(decided.start, following)}
+    ends = np.cumsum([0, *(len(given[frame].detections) for frame in decided)])
+    sides = [arrays.get(f"detections.{name}", np.zeros(0)) for name in _SIDES]
+    if any(len(column) != ends[-1] for column in sides):
+        raise ValueError("its detections are not those of its frames")
+    for frame, start, stop in zip(decided, ends, ends[1:], strict=False):
+        own = (column[start:stop] for column in sides)
+        seen = given[frame].detections.with_sides(*own, np.array(skeleton.mirror))
+        given[frame] = replace(given[frame], detections=seen)
     rows = {name: arrays.get(f"rows.{name}", np.zeros(0)) for name in _ROWS}
     if sum(counts) != len(rows["track"]):
         raise ValueError("its rows are not of its frames")

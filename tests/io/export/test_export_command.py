@@ -72,7 +72,7 @@ def test_options(copied, tmp_path, capsys):
             "no people in these frames; people are in frames 100 to 123",
         ),
         (["trc", "--person", "4"], "has no such person; it has 3 7"),
-        (["trc", "--fps", "0"], "--fps 0: must be at least 0.01"),
+        (["trc", "--fps", "0"], "--fps 0: must be at least 0.001"),
         (["bvh", "--fill-gaps", "-1"], "--fill-gaps -1: must not be negative"),
         (["glb", "--body", "gone.npz"], "gone.npz"),
     ],
