@@ -252,8 +252,8 @@ def checkpoint_of(
     if any(len(column) != ends[-1] for column in sides):
         raise ValueError("its detections are not those of its frames")
     for frame, start, stop in zip(decided, ends, ends[1:], strict=False):
-        own = (column[start:stop] for column in sides)
-        seen = given[frame].detections.with_sides(*own, np.array(skeleton.mirror))
+        joint, mirrored = (column[start:stop] for column in sides)
+        seen = given[frame].detections.with_sides(joint, mirrored, np.array(skeleton.mirror))
         given[frame] = replace(given[frame], detections=seen)
     rows = {name: arrays.get(f"rows.{name}", np.zeros(0)) for name in _ROWS}
     if sum(counts) != len(rows["track"]):
