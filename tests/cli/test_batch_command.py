@@ -188,7 +188,7 @@ def test_what_can_be_known_before_is_said_before(archive, tmp_path, capsys, monk
     )
     assert "--frames 3: must be A:B" in said(own + 'frames = "3"')
     assert "body.pkl: there is no such file" in said(own + 'body = "body.pkl"')
-    assert "fps must be at least 0.01, got 0" in said(own + "fps = 0")
+    assert "fps must be at least 0.001, got 0" in said(own + "fps = 0")
     (tmp_path / "out" / "a" / "people.npz").mkdir(parents=True)
     assert "people.npz: this is a folder, but a file must be written here" in said(own)
     (tmp_path / "out" / "a" / "people.npz").rmdir()
