@@ -95,10 +95,10 @@ class Detections:
 
     def with_sides(self, joint: Index, mirrored: Array, mirror: Index) -> "Detections":
         """The candidates, some as the joint of the other side: `joint` (D,) is that of each or its
-        `mirror` (J,), and `mirrored` (D,) the probability that this is wrong. ValueError for
-        others.
+        `mirror` (J,), and `mirrored` (D,) the probability that this is wrong.
 
         Affinities between a candidate that changed its side and one that did not are left out.
+        Raises ValueError for any other joint.
         """
         first, second = self.pairs.T
         wrong, middle = joint != self.joint, mirror[self.joint] == self.joint

@@ -74,8 +74,8 @@ def alternate(
     failed = _problems(observations, X, covariance, people)
     final = linearise(observations, sigmas, X, views, config.observations)
     found = Estimates.of(X, covariance, replace(final, inlier=evidence.inlier), fit)
-    found.add_other_errors(observations, np.zeros(covariance.shape), sigmas, views, config)
-    nothing = np.zeros(enough.shape + X.shape[1:2], dtype=bool)
+    found.add_other_errors(observations, sigmas, views, config, held=False)
+    nothing = np.zeros(X.shape[:2], dtype=bool)
     return found.solution(observations, people, failed, enough, nothing)
 
 

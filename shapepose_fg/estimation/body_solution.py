@@ -27,7 +27,6 @@ from shapepose_fg.estimation.factor_solution import solve_with_factors
 from shapepose_fg.estimation.gated_views import (
     ObservationConfig,
     ViewEvidence,
-    inverses,
     linearise,
     observation_sigmas,
 )
@@ -93,8 +92,7 @@ def solve_bodies(
         for each in solve_with_factors(people, config.graph):
             _put(found, each.person, each.marginals)
             found.covariance[each.person.rows] = each.covariance
-    of_body = inverses(found.fit.covariance + np.eye(3) * 1e-6)
-    found.add_other_errors(observations, of_body, sigmas, views, config)
+    found.add_other_errors(observations, sigmas, views, config, held=True)
 
     # Views that agreed on a joint, of which none is used: they contradict the body.
     against = agreed & ~found.evidence.inlier.any(axis=-1)

@@ -97,12 +97,16 @@ def draft(
         fitted.put(here, last.fitted.rows(there))
         body.put(here, last.body.rows(there))
         near[here] = body.ok[here]
-    new = np.flatnonzero(~near)
-    for reach_m in (None, *NARROWING_M):
-        asked = np.arange(N) if reach_m == NARROWING_M[-1] else new
-        given, seen_by, around = observations.rows(asked), views.rows(asked), body.rows(asked)
-        around = np.where(around.ok[:, None, None], around.joints, X[asked])
-        evidence = linearise(given, sigmas[asked], around, seen_by, config.observations, reach_m)
+    asked = new = np.flatnonzero(~near)
+    evidence = evidence.rows(new)
+    for reach_m in (None, *NARROWING_M):  # None: at triangulated joints, as above
+        if reach_m is not None:
+            asked = np.arange(N) if reach_m == NARROWING_M[-1] else new
+            given, seen_by, around = observations.rows(asked), views.rows(asked), body.rows(asked)
+            around = np.where(around.ok[:, None, None], around.joints, X[asked])
+            evidence = linearise(
+                given, sigmas[asked], around, seen_by, config.observations, reach_m
+            )
         targets = joint_targets(evidence, enough[asked])
         moved = changed_targets(fitted.rows(asked), targets, MODEL_SIGMA_M, 2.0)
         if len(moved) == 0:

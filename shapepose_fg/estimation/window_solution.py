@@ -20,7 +20,7 @@ from shapepose_fg.core.rows import Rows
 from shapepose_fg.estimation.asynchronous_views import carried_to_frames
 from shapepose_fg.estimation.camera_pose_uncertainty import carried_covariance
 from shapepose_fg.estimation.estimator_config import EstimatorConfig
-from shapepose_fg.estimation.gated_views import ViewEvidence, mean_confidence
+from shapepose_fg.estimation.gated_views import ViewEvidence, inverses, mean_confidence
 from shapepose_fg.estimation.in_time import near_in_time
 from shapepose_fg.estimation.minimise import undetermined_key
 from shapepose_fg.estimation.mirrored_sides import DOUBTED, mirrored_spread
@@ -257,16 +257,21 @@ class Estimates:
     def add_other_errors(
         self,
         rows: Observations,
-        of_body: Array,
         sigmas: Array,
         views: Views,
         config: EstimatorConfig,
+        *,
+        held: bool,
     ) -> None:
         """Add errors that graphs do not have to the covariances: poses of moving cameras, against
-        which bodies hold joints with the information `of_body` (N, J, 3, 3), and exchanged sides.
+        which bodies hold joints or not (`held`), and exchanged sides.
         """
-        bodies, gates = JointTargets(self.joints, of_body), config.observations
-        self.covariance[:] += carried_covariance(self.evidence, bodies, sigmas, views, gates)
+        if views.carried is not None:
+            of_body = np.zeros(self.covariance.shape)
+            if held:
+                of_body = inverses(self.fit.covariance + np.eye(3) * 1e-6)
+            bodies, gates = JointTargets(self.joints, of_body), config.observations
+            self.covariance[:] += carried_covariance(self.evidence, bodies, sigmas, views, gates)
         self.covariance[:] += mirrored_spread(self.joints, rows.mirrored, config.joints)
 
     def solution(

@@ -22,8 +22,10 @@ from shapepose_fg.cameras.tracks import at_regular_times, next_of, on_one_clock
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import DetectionSequence
-from shapepose_fg.core.frame_sets import AT_ONCE_S
 from shapepose_fg.core.frame_times import FrameTimes
+
+_STILL_S = 0.001
+"""Change per round below which offsets have converged, s."""
 
 
 def calibrate_unsynchronised(
@@ -75,7 +77,7 @@ def calibrate_unsynchronised(
             sightings, found.rig, fps, frames, most_s, np.zeros(V), lambda *_: None
         )
         before, shift = shift, -offset * fps
-        if np.abs(shift - before).max() < AT_ONCE_S * fps:
+        if np.abs(shift - before).max() < _STILL_S * fps:
             break
     assert found is not None
     progress(total, total)

@@ -201,7 +201,7 @@ _ROWS = {
     "track": _NUMBERS("N"),
     "candidate": Column("N J V", np.intp),
     "initial": Column("N J 3", most=MOST_METRES),
-    "evidence": Column("N", most=MOST_METRES),
+    "evidence": Column("N", most=1e6),
 }
 """Columns of a row that is not solved yet; the rest comes from the cameras."""
 _SIDES = {"joint": _NUMBERS("D"), "mirrored": Column("D", least=0.0, most=1.0, finite=True)}
