@@ -20,6 +20,10 @@ from shapepose_fg.estimation.gated_views import (
 
 _MIN_VIEWS = 3
 """Minimum number of views that agree on a joint; two that agree may both be wrong."""
+_MIN_CONFIDENCE = 0.4
+"""Minimum confidence of a detection from which an offset is estimated."""
+_MAX_SIGMA_M = 0.03
+"""Maximum standard deviation of a used joint in its worst direction, m."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +69,10 @@ def confident_targets(
     sigmas = observation_sigmas(observations, points, views, config, BODY_25.joints)
     evidence = linearise(observations, sigmas, points, views, config)
     evidence = linearise(observations, sigmas, evidence.target, views, config)
-    sure = evidence.inlier.sum(axis=-1) >= _MIN_VIEWS
+    sure = (evidence.inlier & (observations.confidence >= _MIN_CONFIDENCE)).sum(
+        axis=-1
+    ) >= _MIN_VIEWS
+    sure &= evidence.sigma_m <= _MAX_SIGMA_M
     return JointTargets(
         np.nan_to_num(evidence.target), np.where(sure[..., None, None], evidence.information, 0.0)
     )

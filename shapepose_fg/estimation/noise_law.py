@@ -37,6 +37,8 @@ GROSS_M = 0.2
 """Standard deviation of a gross error along an axis, m. It lies on another joint or person."""
 _GOOD_SCORE = 0.5
 """Minimum score of a detection in another view to be used for triangulation."""
+_AGREE_SIGMA = 3.5
+"""Maximum residual of each triangulated detection, standard deviations. Above it, they disagree."""
 _PRIOR_COUNT = 30.0
 """Weight of the shipped law in each range of scores, as a number of detections."""
 _ROUNDS = 40
@@ -178,7 +180,10 @@ class Residuals:
             sigmas = observation_sigmas(rows, points, views, config, joints)
             evidence = linearise(rows, sigmas, points, views, config)
             evidence = linearise(rows, sigmas, evidence.target, views, config)
-            there = (evidence.inlier == good).all(axis=-1)
+            off = np.nan_to_num(np.linalg.norm(evidence.residual_px, axis=-1)) / np.where(
+                good, sigmas, 1.0
+            )
+            there = (evidence.inlier == good).all(axis=-1) & (off < _AGREE_SIGMA).all(axis=-1)
             there &= every.seen[..., view] & (evidence.sigma_m < KNOWN_M)
             row, joint = np.nonzero(there)
             xy, depth, slope = views.rows(row).project(evidence.target[there][:, None])
