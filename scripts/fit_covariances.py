@@ -198,7 +198,7 @@ def new_errors(seed: int) -> Iterator[Columns]:
 def fitted(
     squared: np.ndarray, views: np.ndarray, sigma_m: np.ndarray, rejected: np.ndarray
 ) -> AssociationUncertainty:
-    """The numbers of least loss, scaled for 95 %."""
+    """The parameters of least loss, scaled so that 95 % regions hold 95 % of the joints."""
     share = np.where(views > 1, SHARES[1] / (views > 1).sum(), SHARES[0] / (views == 1).sum())
 
     def loss(numbers: np.ndarray) -> float:
@@ -218,8 +218,8 @@ def fitted(
 def fitted_over_time(
     windows: list[Columns], new: list[Columns], association: AssociationUncertainty
 ) -> CorrelatedErrors:
-    """The numbers of least loss over windows of recordings and of people with new errors, half
-    each, scaled for 95 % of the joints in recordings.
+    """The parameters of least loss over windows of recordings and of people with new errors, half
+    each, scaled so that 95 % regions hold 95 % of the joints in recordings.
     """
 
     def loss(numbers: np.ndarray) -> float:

@@ -155,7 +155,7 @@ class Pairs:
     error: Array
     """(M,) median distance of their rays, as a share of the person's size in the picture."""
     frame: Index
-    """(M,) frame of each."""
+    """(M,) frame of each pair."""
     third: Index
     """(M, V) for each other camera, the sighting nearest to the person's projection; -1 for
     none."""

@@ -161,10 +161,10 @@ def offsets(
 def chosen(
     curves: dict[tuple[int, int], Array], lags: Index, views: int, around: int
 ) -> tuple[Array, Array]:
-    """(V,) shifts relative to the first camera, and their prominence (V,).
+    """(V,) shifts in frames relative to the first camera, and their prominence (V,).
 
-    Cameras are added one by one in order of prominence, each at the offset that fits all those
-    before it: frame f of the first camera is frame f + shift of another.
+    Frame f of the first camera is frame f + shift of another. Cameras are added one by one in order
+    of prominence, each at the offset that fits all those before it.
     """
     step = int(lags[1] - lags[0]) if len(lags) > 1 else 1
     half = len(lags) // 2

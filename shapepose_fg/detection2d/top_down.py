@@ -50,7 +50,7 @@ class KeypointForm(BaseModel, extra="forbid"):
     mean: _Three = (123.675, 116.28, 103.53)
     """Mean that is subtracted from the colours (0 to 255), in their order."""
     std: tuple[_Above0, _Above0, _Above0] = (58.395, 57.12, 57.375)
-    """Standard deviation by which the colours are divided after that."""
+    """Standard deviation by which the colours are divided after subtracting the mean."""
     cells: Literal["corners", "edges"] = "corners"
     """Whether the outer cells of a heat map have their centres on the input's outer pixels, or fill
     the input."""

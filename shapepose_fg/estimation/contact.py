@@ -19,8 +19,8 @@ from shapepose_fg.estimation.in_time import SPEED_S
 FEET = ("Ankle", "Heel", "BigToe", "SmallToe")
 """Joints that may stand, independently on either side: toes stand while the heel rises."""
 ALIKE_S = 0.25
-"""Frames within this time count as one look of the views at a standing foot, seconds: detectors'
-errors last."""
+"""Time within which frames count as one measurement of a standing foot, s: detectors' errors are
+correlated as long."""
 FREE_M2_S = 0.003
 """Density above which a step is unconstrained: at 30 frames a second it corresponds to 1 cm. With
 0.02 salsa and crowds of four cameras are 0.05 to 0.1 mm worse, with 0.001 standing feet move."""

@@ -62,7 +62,7 @@ def feed(where: str | None, rig: Rig, skeleton: Skeleton, note: Note, push: Push
 
 @dataclass(frozen=True)
 class _Given:
-    """The arguments of `feed` that all senders share."""
+    """Arguments of `feed` that are the same for all senders."""
 
     rig: Rig
     skeleton: Skeleton
@@ -97,7 +97,7 @@ class _Sender:
             self._number += 1
 
     def take(self, read: Callable[[str], tuple[Any, ...] | None]) -> None:
-        """Push the result of `read`, called with the next line's name, unless None. Raises
+        """Call `read` with the name of the next line, and push its result unless it is None. Raises
         InputError as `line` does.
         """
         self._number += 1

@@ -24,7 +24,8 @@ class Execution:
     """Address of a Dask scheduler to solve on; `local` for `workers` processes of a temporary Dask
     cluster."""
     sharing: int = 1
-    """Number of runs that share the cluster: each keeps its share of work submitted."""
+    """Number of runs that share the cluster; each submits a corresponding share of the items that
+    the cluster has at a time."""
     chunk_frames: int | None = None
     """Length of chunks with people tracked in parallel, frames; identities are joined across the
     borders (`runs/chunks.py`). The result may differ if people are occluded at a border. None: no

@@ -25,7 +25,7 @@ from shapepose_fg.proposal.thinning import ThinnedFrames
 
 @dataclass(frozen=True)
 class SolvedWindows:
-    """Windows of a recording: source and solution."""
+    """Tracks people through a recording, and solves its windows."""
 
     setup: Setup
     """Data shared by all processes."""

@@ -205,4 +205,4 @@ def _call(shared: Any, work: Callable[[Any, Item], Result], item: Item) -> Resul
 
 
 def nothing() -> None:
-    """The job that starts the processes; also an initialiser."""
+    """Do nothing: the first job of a process, which starts it, and the default initialiser."""

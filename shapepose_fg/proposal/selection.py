@@ -37,7 +37,7 @@ _USUAL = 0.59
 """Mean length of bones, as a share of the maximum length: 0.53 to 0.64 for core bones of simulated
 people."""
 _SPREAD, _PHANTOMS_SPREAD = 0.08, 0.35
-"""Standard deviation of its logarithm, for people and for false positives."""
+"""Standard deviation of the logarithm of a bone's length, for people and for false positives."""
 _ASTRAY = 0.1
 """Share of people's bones distributed like those of false positives, because a joint is wrong. All
 these are from 5779 hypotheses of simulated crowds before two to six cameras."""
@@ -136,11 +136,10 @@ def choose(points: PairPoints, frame: Frame, least: float) -> tuple[PossiblePeop
 def _greedy(
     pool: PossiblePeople, people: PossiblePeople, taken: Mask, frame: Frame, least: float
 ) -> PossiblePeople | None:
-    """`people`, who use the detections `taken` (D,), and further ones from the pool, most probable
-    first.
+    """Add hypotheses from the pool to `people`, who use the detections `taken` (D,), most probable
+    first; None if there is none to add.
 
-    A hypothesis that fits as a missing part of a person completes that person. None if there is
-    none to add.
+    A hypothesis that fits as a missing part of a person completes that person.
     """
     evidence, taken, before = Evidence.of(pool, frame), taken.copy(), people
     open_ = np.ones(len(pool), dtype=bool)

@@ -385,7 +385,7 @@ def _findings(
 
 
 def _problem(people: Reconstruction, told: RunEntries, row: int, joint: int) -> str:
-    """The problem with a joint as run.json states it; empty where there was none."""
+    """The problem with a joint as run.json states it; empty if there was none."""
     here = int(people.person[row]), int(people.frame[row]), str(people.joint_names[joint])
     problems = told.people.problems
     return next(
@@ -394,8 +394,8 @@ def _problem(people: Reconstruction, told: RunEntries, row: int, joint: int) -> 
 
 
 def _checked(people: Reconstruction, told: RunEntries, row: int) -> list[Finding]:
-    """What the set-up check found wrong with single cameras, according to run.json: excluded from a
-    row's frame, doubted in it, or used nevertheless.
+    """Cameras in which the set-up check found an error, according to run.json: excluded from a
+    row's frame, doubted in it, or used nevertheless; in words.
     """
     found, frame = list[Finding](), people.frame[row]
     for spells, cause, fate in (

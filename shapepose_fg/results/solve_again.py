@@ -42,7 +42,7 @@ class Solver:
     config: PipelineConfig
     """The settings."""
     fitter: BodyFitter
-    """Fits bodies, with the detector's offsets (`run["keypoint_offsets"]`)."""
+    """Fitter of the bodies, with the detector's offsets (`run["keypoint_offsets"]`)."""
     noise: NoiseLaw = field(default_factory=NoiseLaw.shipped)
     """The detector's noise law (`run["noise_law"]`)."""
 

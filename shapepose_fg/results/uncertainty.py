@@ -50,7 +50,7 @@ _NODES, _WIDE = 24, 6.0
 """Number of nodes of the quadrature per axis, and its range in standard deviations on
 either side."""
 _SCALES = 4
-"""Number of Gaussians whose mixture Student's t is."""
+"""Number of Gaussians in the mixture that represents Student's t."""
 _STEPS = 64
 """Number of limits at which a distance's distribution is tabulated for quantiles."""
 

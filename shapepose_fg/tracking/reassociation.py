@@ -59,8 +59,8 @@ def reassociate(
 
 
 def changed(before: Observations, now: Observations) -> Mask:
-    """(N, J, V) detection slots, used before or now in the same rows, that hold another detection
-    now.
+    """(N, J, V) mask of detections that differ between the same rows `before` and `now`, where
+    either has one.
     """
     return np.asarray((before.candidate != now.candidate) & (before.seen | now.seen))
 
@@ -68,7 +68,7 @@ def changed(before: Observations, now: Observations) -> Mask:
 def _given_out(
     frame: Input, joints: Array, sigma_m: Array, skeleton: Skeleton
 ) -> tuple[Index, Array]:
-    """(P, J, V) detections assigned to one frame's people, and their probabilities."""
+    """(P, J, V) detections assigned to the people of one frame, and their probabilities."""
     predicted = Predicted(joints, sigma_m, lost=~np.isfinite(sigma_m))
     return assign_with_probability(predicted, FrameArrays.of(frame.detections, frame.rig, skeleton))
 

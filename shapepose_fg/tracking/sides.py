@@ -56,10 +56,10 @@ class _Compared:
     groups: Sequence[Index]
     """(G) indices of the detections of each 2D person."""
     who: Index
-    """(G,) number of the matched person; -1 for none."""
+    """(G,) number of the person that each 2D person matches; -1 for none."""
     log: Array
-    """(G, S) log-probability of each of the `exchanges`: which parts this view has swapped against
-    the prediction."""
+    """(G, S) log-probability that this view has swapped the sides of each combination of parts
+    (`exchanges`) against the prediction."""
 
     @classmethod
     def of(cls, given: Input, ids: Index, joints: JointStates, skeleton: Skeleton) -> "_Compared":

@@ -17,8 +17,9 @@ from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.floor import Floor, find_floor
 
 _PERSON, _KNOWN_PERSON, _COMMON = 0.07, 0.02, 0.025
-"""Standard deviations of the scale from `build_of`, as shares: of bones among adults, and among
-people of a known stature; and the error common to all people, from the detector."""
+"""Standard deviations of the scale from `build_of`, as shares of the scale: from the bones of one
+adult, from those of one person of known stature, and the error that the detector makes for all
+people."""
 _TAPE_M = 0.02
 """Standard deviation of a distance between lenses that was measured with a tape, m."""
 _CLEARLY = 1.3
@@ -114,7 +115,7 @@ def scale_of(points: Array, skeleton: Skeleton, stature_m: float | None) -> floa
 
 
 def at_once(people: People) -> int:
-    """Number of people seen at once, in all but the fullest tenth of the frames."""
+    """Number of people seen at the same time: the 90 % quantile over the frames."""
     _, counts = np.unique(people.frame, return_counts=True)
     return int(np.percentile(counts, 90)) if len(counts) > 0 else 0
 

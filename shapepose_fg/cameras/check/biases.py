@@ -56,7 +56,7 @@ class BiasedResiduals:
     xy: Array
     """(N, J, V, 2) undistorted pixels; 0 where there is none."""
     weight: Array
-    """(N, J, V) robust weight of each, 1 / pixels^2; 0 where there is none."""
+    """(N, J, V) robust weight of each detection, 1 / pixels^2; 0 where there is none."""
     size_px: Array
     """(N, V) the person's size in each picture, pixels."""
     points: Array
@@ -223,8 +223,8 @@ class BiasedResiduals:
 def _with_biases(
     seen: tuple[Array, Array, Array], views: Views, person: Index
 ) -> tuple[Structure, Array]:
-    """Triangulated joints of the arrays of `observed`, beside lasting biases, and the residuals
-    (N, J, V, 2), as shares of the size, with these; NaN where not used.
+    """Joints triangulated from the arrays of `observed`, corrected for persistent biases; and the
+    residuals (N, J, V, 2) of the uncorrected detections, as shares of the size, NaN if not used.
 
     A bias is the median residual over the frames of a person, joint and view.
     """

@@ -103,9 +103,9 @@ def _unlike(sizes: Mapping[str, tuple[int, int]], rig: Rig) -> tuple[Finding, ..
 
 
 _FITTING, _STEADY, _UNLIKELY, _NEARLY = 0.5, 0.3, 0.1, 0.5
-"""Signs of a mistake in them: a camera's score below the first, a difference of its scores between
+"""Signs of a mistake: a camera's score below the first value, a difference of its scores between
 parts of the recording above the second, a probability of small mistakes above the third, or an
-offset in time with more than this share of what makes it significant."""
+offset in time with more than the fourth as a share of what makes it significant."""
 _MOST_FINDINGS, _MOST_BIASED = 4, 3
 """Maximum number of findings, and of biased people, that are distinguished."""
 _UNFIT = 0.15

@@ -43,7 +43,7 @@ class Evidence:
     sightings: Sightings
     """Sightings in the checked frames and their neighbours."""
     around: Index
-    """(G,) the frames used whose neighbours are there, too."""
+    """(G,) the frames used whose neighbouring frames have sightings, too."""
     most_lag: int
     """Maximum time offset that can be detected, frames."""
     other_side: Index

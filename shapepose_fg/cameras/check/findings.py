@@ -63,9 +63,9 @@ class Finding:
     """The layout that fits people and the one used for reading; or the exchanged joints only, "" if
     it is not a single exchange."""
     same: str = ""
-    """What two cameras have in common, if not both: "pose" or "detections"."""
+    """Which of "pose" and "detections" two cameras have in common; empty if both."""
     instead: "tuple[Finding, ...]" = ()
-    """Alternative findings, most probable first; their `sure` are their probabilities."""
+    """Alternative findings, most probable first, with their probabilities as `sure`."""
 
 
 SURE = 0.95
@@ -73,7 +73,7 @@ SURE = 0.95
 
 
 def one_of(found: Sequence[Finding]) -> Finding:
-    """The most probable of mutually exclusive findings, with the not improbable others as
+    """The most probable of mutually exclusive findings; others that are not improbable become its
     alternatives.
     """
     sure: dict[tuple[Kind, tuple[int, ...]], float] = {}

@@ -96,9 +96,9 @@ def _listed(words: Sequence[str]) -> str:
 def _gains(flat: Array, space: Array | None, names: Sequence[str], order: Sequence[int]) -> bool:
     """Whether people fit a body significantly better with another order of their joints.
 
-    Exchanges of sides or along a limb must be significant in pictures or in space. Joints that a
-    detector sees beside where they are may fit any other order better in one of the two, so this
-    must be significant in both.
+    Exchanges of sides or along a limb must be significant in pictures or in space. Joints with
+    biased detections may fit any other order better in one of the two, so other exchanges must be
+    significant in both.
     """
 
     def gain(people: Array) -> tuple[float, float]:

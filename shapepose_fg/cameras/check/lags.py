@@ -9,7 +9,7 @@ from shapepose_fg.cameras.offsets.scan import LEAST_MISS, scan
 from shapepose_fg.cameras.sightings import GATE
 
 _CLEAR = 0.25
-"""Minimum gain of a time offset. Sound cameras have up to 0.2, late ones 0.3 to 1."""
+"""Minimum gain of a time offset. Correct cameras have up to 0.2, late ones 0.3 to 1."""
 
 
 @dataclass(frozen=True)

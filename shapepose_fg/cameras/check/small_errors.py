@@ -245,8 +245,8 @@ class SmallErrors:
         return changed(self.given, change)
 
     def off(self, usual: Array, reference: int | None = None) -> float:
-        """Probability that cameras, except `reference`, have errors of about `usual` (Q,); the
-        prior is 0.5.
+        """Probability that cameras, except `reference`, have errors of about `usual` (Q,) standard
+        deviations; the prior is 0.5.
         """
         which = np.flatnonzero(usual).tolist()
         views = [view for view in range(len(self.given)) if view != reference]

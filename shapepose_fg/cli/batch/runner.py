@@ -116,8 +116,8 @@ class BatchRunner:
                     self._done(leader, found, batch_status)
 
     def _next(self, batch_status: BatchStatus, leaders: "Sequence[Leader]") -> Entry | None:
-        """The recording to start next; if the predecessor of a recording failed, its status is set
-        to failed.
+        """The recording to start next; if the one for which a recording waits has failed, its
+        status is set to failed, too.
         """
         led = {leader.assignment.name for leader in leaders}
         found: list[Entry] = []

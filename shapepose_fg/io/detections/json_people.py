@@ -61,7 +61,7 @@ _ALL_FRAMES, _SEP_JSON = "alphapose-results.json", "sep-json"
 """AlphaPose's file with all frames, and its folder with a file per frame (--format open and
 cmu)."""
 _LISTS = ("annotations", "instance_info")
-"""Keys of the list if the file is an object: COCO's data sets, and MMPose."""
+"""Keys of the list of people in a file that is an object: COCO's data sets, and MMPose."""
 
 
 def _keypoints(person: Any, place: str, program: str) -> Array:

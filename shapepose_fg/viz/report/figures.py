@@ -52,7 +52,7 @@ class Curve:
     lines: tuple[str, ...]
     """Path of the right side, and of the left one."""
     bands: tuple[str, ...]
-    """Two standard deviations around each."""
+    """Bands of two standard deviations around each path."""
     frames: tuple[int, int]
     """The first and the last frame that are drawn."""
 
