@@ -293,7 +293,7 @@ def settle(
     given: Rig,
     times: FrameTimes,
     freedom: Freedom | Sequence[Freedom],
-    told: Callable[[int], None],
+    advance: Callable[[int], None],
     reference: int | None = None,
     scale: Callable[[Array], float] | None = None,
 ) -> Adjusted:
@@ -302,7 +302,7 @@ def settle(
 
     The prior has the `freedom` about the cameras `given`. With `scale`, a function from the
     people's joints (P, J, 3) to metres per unit, only the lenses have a prior, and the rig is
-    scaled. `told` gets the number of rounds that are done. Raises Undetermined if too few people
+    scaled. `advance` gets the number of rounds that are done. Raises Undetermined if too few people
     are seen.
     """
     adjusted: Adjusted | None = None
@@ -326,7 +326,7 @@ def settle(
             adjusted = grown(adjusted, factor)
         before, now = now, adjusted.rig
         still = apart(before, now)[0].max() < _STILL_DEG
-        told(rounds - step if still else 1)
+        advance(rounds - step if still else 1)
         if still:
             break
     assert adjusted is not None

@@ -223,9 +223,9 @@ class BodyWindow:
         if not np.isfinite(density).any():
             return
         evidence = self.last.evidence
-        told = np.where(seen[..., None, None], evidence.information[:, feet], 0.0)
-        told = JointTargets(evidence.target[:, feet], told)
-        information, pull = held_in_place(told, density, self.times_s)
+        information = np.where(seen[..., None, None], evidence.information[:, feet], 0.0)
+        targets = JointTargets(evidence.target[:, feet], information)
+        information, pull = held_in_place(targets, density, self.times_s)
         information[~seen], pull[~seen] = 0.0, 0.0
         scale = np.trace(information, axis1=-2, axis2=-1)
         known = information + 1e-9 * scale[..., None, None] * np.eye(3)
@@ -233,7 +233,7 @@ class BodyWindow:
         self.standing.xyz[:, feet] = (inverses(known) @ pull[..., None])[..., 0]
         self.walk[:, feet] = np.where(seen[1:] & seen[:-1], density, np.inf)
         # Detectors' errors last: all frames of a stance together say as much as one.
-        own = np.trace(told.information, axis1=-2, axis2=-1)
+        own = np.trace(targets.information, axis1=-2, axis2=-1)
         share = np.where(scale > 0, own / np.maximum(own + scale, 1e-9), 1.0)
         self.standing.information[:, feet] = share[..., None, None] * information
         self.sigmas_px[:, feet] /= np.sqrt(share)[..., None]
@@ -354,7 +354,7 @@ class BodyWindow:
     def _bodies(self, state: BodyState) -> Array:
         return self.energy.model.keypoints(self.energy.complete(state.free))
 
-    def said_by(self, state: BodyState, joints: Mask) -> Array:
+    def information_from(self, state: BodyState, joints: Mask) -> Array:
         """(T, M, P) normal equations of each frame's body from some `joints` (J,) only, without
         priors, around the last solution.
         """

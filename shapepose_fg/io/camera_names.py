@@ -64,7 +64,7 @@ def _one_number_each(names: Sequence[str]) -> list[tuple[str | int, ...]] | None
     return numbers if len(set(numbers)) == len(numbers) else None
 
 
-def told_by_parts(
+def match_by_parts(
     folder: Path, cameras: Sequence[str], paths: Sequence[Path], names: Sequence[str]
 ) -> tuple[list[Path], list[str]] | None:
     """Identify each camera's path among `paths` by its name among `names` (`match_names`); returns

@@ -62,7 +62,7 @@ def with_rows_between(
     count = np.diff(keys)[number[after]] - 1
     pair = np.repeat(after, count)
     at = keys[number[pair]] + 1 + np.arange(len(pair)) - np.repeat(np.cumsum(count) - count, count)
-    return _with_carried(rows, order[pair], order[pair + 1], frame[at], time_s[at], motion)
+    return _with_interpolated(rows, order[pair], order[pair + 1], frame[at], time_s[at], motion)
 
 
 def strays_m(joints: Array, velocity: Array, times_s: Array) -> Array:
@@ -83,7 +83,7 @@ def strays_m(joints: Array, velocity: Array, times_s: Array) -> Array:
     return np.sqrt(np.nan_to_num(variance).max(axis=1, initial=0.0))
 
 
-def looked_at(rows: Reconstruction) -> Mask:
+def tracked_rows(rows: Reconstruction) -> Mask:
     """(N,) mask of rows in which people were tracked: those with a detection in any view, and those
     before the first or after the last such row of their person.
     """
@@ -114,10 +114,10 @@ def with_rows_like(
     first, second = (order[np.clip(each, 0, len(order) - 1)] for each in (after - 1, after))
     ours = (solved.person[first] == rows.person[new]) & (solved.person[second] == rows.person[new])
     first, second, new = first[ours], second[ours], new[ours]
-    return _with_carried(solved, first, second, rows.frame[new], rows.time_s[new], motion)
+    return _with_interpolated(solved, first, second, rows.frame[new], rows.time_s[new], motion)
 
 
-def _with_carried(
+def _with_interpolated(
     rows: Reconstruction,
     before: Index,
     after: Index,
@@ -130,12 +130,12 @@ def _with_carried(
     """
     if len(frame) == 0:
         return rows
-    between = _carried(rows.rows(before), rows.rows(after), frame, time_s, motion)
+    between = _interpolated(rows.rows(before), rows.rows(after), frame, time_s, motion)
     every = with_bodies_between(Reconstruction.concatenate([rows, between]))
     return every.rows(np.lexsort((every.person, every.frame)))
 
 
-def _carried(
+def _interpolated(
     before: Reconstruction, after: Reconstruction, frame: Whole, time_s: Array, motion: MotionModel
 ) -> Reconstruction:
     """N rows at `time_s` (N,), interpolated between the rows `before` and `after` in adjacent

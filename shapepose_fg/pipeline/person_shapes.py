@@ -110,11 +110,11 @@ def _evidence(model: BodyModel, sigma_m: float, rows: WindowBodies) -> dict[int,
         targets = EnergyTargets(xyz, weigh(known, sigma_m).information)
         held = Held(np.zeros((count, 10)), np.ones(count), free[:, 13:-3])
         body = energy.evaluate(free, targets, _NOT_ROBUST, held, nothing(count))
-        said = np.linalg.inv(body.covariances()[1]) - np.eye(10)
-        pull = (said @ free[:, :10, None])[..., 0]
+        information = np.linalg.inv(body.covariances()[1]) - np.eye(10)
+        pull = (information @ free[:, :10, None])[..., 0]
         looks = (mine.time_s // LOOK_S).astype(np.int64).tolist()
         for n, number in enumerate(mine.person.tolist()):
-            each = ShapeEvidence(said[n], pull[n], 1, {looks[n]})
+            each = ShapeEvidence(information[n], pull[n], 1, {looks[n]})
             found.setdefault(number, ShapeEvidence()).add(each)
     return found
 

@@ -82,11 +82,11 @@ def reconstruct(
     task = Task(detections, rig, config, frames, times, cuts, shapes, fitter, extra_factors)
     kept = InMemory()
     people = reconstruct_parts(kept, task, execution).reconstruction(consume=True)
-    for name, told in people.run.get("extra_factors", {}).items():
-        if told["made"] == told["inactive"]:
+    for name, counts in people.run.get("extra_factors", {}).items():
+        if counts["made"] == counts["inactive"]:
             what = (
                 "is active, because joints that they need have no position"
-                if told["made"] > 0
+                if counts["made"] > 0
                 else "was made"
             )
             warnings.warn(f"extra_factors: {name}: none of its factors {what}", stacklevel=2)
@@ -185,7 +185,7 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
         if fitter is None:
             fitter = make_fitter(config.body, BodyModel.default().with_keypoints(skeleton.joints))
         check_fitter(fitter)
-    tell, passes = execution.tell(len(frames)), 1 + (unrefined(rig) and config.temporal)
+    tell, passes = execution.progress_over(len(frames)), 1 + (unrefined(rig) and config.temporal)
     setup = Setup(rig, skeleton, config, fitter, task.extra_factors)
     setup = _with_refined(kept, task, setup, book, lambda done: tell(done // passes))
     sample = Sample(setup, detections, times)

@@ -142,8 +142,10 @@ class Setup:
             longest_bones(skeleton), motion.density(np.full(len(skeleton), FAST_M_S), UNSEEN_S), law
         )
         find = (sure, hips) if config.temporal else (sure,)
-        told = {"fitter": self.fitter, "drop": book.drop_in, "search": book.search}
-        return Engine(Tracker(skeleton, scale, find, tracking, config.observations, **told), config)
+        options = {"fitter": self.fitter, "drop": book.drop_in, "search": book.search}
+        return Engine(
+            Tracker(skeleton, scale, find, tracking, config.observations, **options), config
+        )
 
 
 def _doubted(solution: WindowSolution, doubted: Mapping[int, tuple[int, ...]]) -> NDArray[np.str_]:
@@ -176,16 +178,16 @@ def _of_frames(whole: WindowSolution, frames: set[int], *, numbered: bool) -> Wi
 
 def _notes(solution: WindowSolution, frames: int, over_time: bool) -> Notes:
     """Notes about a window with this number of own `frames`."""
-    told = {"problems": list(solution.problems), "factors": solution.factors}
-    notes = Notes(frames, dict(solution.seconds), **told)
+    content = {"problems": list(solution.problems), "factors": solution.factors}
+    notes = Notes(frames, dict(solution.seconds), **content)
     rows = solution.observations
-    said = np.isfinite(rows.evidence)
+    known = np.isfinite(rows.evidence)
     if over_time:
-        for track in np.unique(rows.track[said]).tolist():
-            evidence = rows.evidence[said & (rows.track == track)]
+        for track in np.unique(rows.track[known]).tolist():
+            evidence = rows.evidence[known & (rows.track == track)]
             notes.evidence[track] = float(evidence.sum()), len(evidence)
     else:
-        tenths = (f"{tenth / 10:.1f}" for tenth in np.floor(10 * rows.evidence[said]))
+        tenths = (f"{tenth / 10:.1f}" for tenth in np.floor(10 * rows.evidence[known]))
         notes.probable = dict(Counter(tenths))
     return notes
 

@@ -254,17 +254,17 @@ def _restarts(
     """
     T = len(frames)
     placed = np.isfinite(found.places[chosen.hypothesis]).all(axis=-1).any(axis=-1)
-    there = np.array([chosen.during(t) for t in range(T)]).T & placed
+    present = np.array([chosen.during(t) for t in range(T)]).T & placed
     share = found.weight[chosen.hypothesis].sum(axis=(2, 3))
-    worth = np.where(there, share, -0.5).sum(axis=0)
+    visibility = np.where(present, share, -0.5).sum(axis=0)
     parts = np.array_split(np.arange(T), min(T, max(1, round((times[-1] - times[0]) / _RESTART_S))))
     seeds = []
     for part in parts:
-        key = int(part[worth[part].argmax()])
-        who = chosen.hypothesis[there[:, key]]
-        if len(who) > 0:
-            own = found.candidate[who, key].astype(np.intp)
-            seeds.append(_seed(tracker, frames, key, found.places[who, key], own))
+        key = int(part[visibility[part].argmax()])
+        hypotheses = chosen.hypothesis[present[:, key]]
+        if len(hypotheses) > 0:
+            own = found.candidate[hypotheses, key].astype(np.intp)
+            seeds.append(_seed(tracker, frames, key, found.places[hypotheses, key], own))
     return seeds
 
 

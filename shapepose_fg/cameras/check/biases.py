@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from shapepose_fg.cameras.check.evidence import Look
+from shapepose_fg.cameras.check.evidence import SetupHypothesis
 from shapepose_fg.cameras.parameters import TURN, Q, by_parameters, placing, seen_by
 from shapepose_fg.cameras.sightings import median_over
 from shapepose_fg.cameras.triangulation import Structure, observed, triangulate
@@ -241,19 +241,19 @@ def _with_biases(
     return structure, away
 
 
-def without_biases(look: Look) -> Look:
-    """The look without the lasting bias of each joint in each view that people have in common.
+def without_biases(setup: SetupHypothesis) -> SetupHypothesis:
+    """The set-up without the lasting bias of each joint in each view that people have in common.
 
     Such a bias along the motion of a person looks like an offset in time.
     """
-    groups = look.groups()
+    groups = setup.groups()
     if len(groups) == 0:
-        return look
-    seen = observed(groups, look.sightings)
-    common = median_over(_with_biases(seen, look.views, np.zeros(len(groups), np.intp))[1])
-    every = look.evidence.sightings
+        return setup
+    seen = observed(groups, setup.sightings)
+    common = median_over(_with_biases(seen, setup.views, np.zeros(len(groups), np.intp))[1])
+    every = setup.evidence.sightings
     xy = every.xy - every.size_px[:, None, None] * common.swapaxes(0, 1)[every.view]
-    return replace(look, evidence=replace(look.evidence, sightings=replace(every, xy=xy)))
+    return replace(setup, evidence=replace(setup.evidence, sightings=replace(every, xy=xy)))
 
 
 def _count(number: Index) -> int:

@@ -77,8 +77,8 @@ def skeleton_of_people(
             f"{known}"
         )
     found, why = (alike[0], "") if len(alike) == 1 else _best_fit(people, alike)
-    said = f"{count} keypoints per person without joint names: read as {found.name}{why}"
-    return found, [*notes, said]
+    note = f"{count} keypoints per person without joint names: read as {found.name}{why}"
+    return found, [*notes, note]
 
 
 def _best_fit(people: Sequence[KeptPeople], layouts: Sequence[Skeleton]) -> tuple[Skeleton, str]:
