@@ -40,9 +40,9 @@ _SPREAD, _PHANTOMS_SPREAD = 0.08, 0.35
 """Standard deviation of the logarithm of a bone's length, for people and for false positives."""
 _ASTRAY = 0.1
 """Share of people's bones distributed like those of false positives, because a joint is wrong. All
-these are from 5779 hypotheses of simulated crowds before two to six cameras."""
+these are from 5779 hypotheses of simulated crowds with two to six cameras."""
 _BONE = 0.15
-"""Weight of a bone's log-likelihood ratio; bones are not independent. In crowds before three to six
+"""Weight of a bone's log-likelihood ratio; bones are not independent. In crowds with three to six
 cameras it finds 1 to 4 points more people with fewer false positives, while 0.3 and 0.6 give more
 of these."""
 

@@ -34,7 +34,7 @@ _ROUNDS = 2
 """Maximum number of rounds of tracking again."""
 _ALIKE = 0.95
 """Agreement of detections above which two selections count as one. The best selection is tracked
-again, and the best different one: on ten simulated recordings, most before three cameras, IDF1 is
+again, and the best different one: on ten simulated recordings, most with three cameras, IDF1 is
 95.0 (92.8 without; 95.2 with two others, at twice the time)."""
 _PLAIN = 0.25
 """Minimum evidence per second, over any window of `SEARCH_S`, of a person for whom no alternatives

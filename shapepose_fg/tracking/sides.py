@@ -36,7 +36,7 @@ _FITS = 3.0
 _EXCHANGED = 0.02
 """Probability that a view swaps the sides of a person or a part; on Shelf, 22 of 1,573 times."""
 _SURE = 6.0
-"""Minimum log-odds for correcting a swap. The mean error of three crowds before three cameras is 43
+"""Minimum log-odds for correcting a swap. The mean error of three crowds with three cameras is 43
 mm with 6, 54 mm with 0, and 40 mm without any swaps in the data. A memory of each view's earlier
 swaps makes it worse."""
 _AGREES = 0.99
@@ -283,7 +283,7 @@ def _doubtful(doubt: Array, skeleton: Skeleton) -> bool:
     wrong.
 
     Joints in the middle count with the last part; counting them as certain is worse in a crowd
-    before three cameras. Such a person may mix views, or people, that contradict each other, and is
+    with three cameras. Such a person may mix views, or people, that contradict each other, and is
     not corrected.
     """
     return bool(np.median(doubt[paired_parts(skeleton) - 1]) > DOUBTED)
