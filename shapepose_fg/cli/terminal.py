@@ -88,10 +88,26 @@ def console(*, stderr: bool = False) -> "Console":
 
 
 def show(content: "RenderableType") -> None:
-    """Print on stdout; colours only on a terminal. Text is not parsed as markup, because it
-    contains names and paths.
+    """Print on stdout; colours only on a terminal, elsewhere without blanks at the ends of lines.
+    Text is not parsed as markup, because it contains names and paths.
     """
-    console().print(content, crop=False, highlight=False)
+    on = console()
+    if on.is_terminal:
+        on.print(content, crop=False, highlight=False)
+        return
+    with on.capture() as printed:
+        on.print(content, crop=False, highlight=False)
+    print("\n".join(line.rstrip() for line in printed.get().split("\n")), end="")
+
+
+def show_written(lines: Iterable[str]) -> None:
+    """Print the paths of written files on stdout, one line each: a path is never broken."""
+    from rich.text import Text
+
+    on = console()
+    for n, line in enumerate(lines):
+        head = "written  " if n == 0 else "         "
+        on.print(Text.assemble((head, "bold"), line), soft_wrap=True)
 
 
 def show_json(value: Any) -> None:
@@ -141,6 +157,23 @@ def note(*messages: str) -> None:
     """Print notes on stderr, one line each."""
     for message in messages:
         say("note", message, "bold")
+
+
+_noted = set[str]()
+"""Notes of readers that the running command has printed."""
+
+
+def note_of_reading(*messages: str) -> None:
+    """Print the notes of a reader that this command has not printed yet: some commands read their
+    input twice.
+    """
+    note(*dict.fromkeys(each for each in messages if each not in _noted))
+    _noted.update(messages)
+
+
+def forget_notes() -> None:
+    """Begin a new command, in which every note is printed again."""
+    _noted.clear()
 
 
 def warn(message: str) -> None:

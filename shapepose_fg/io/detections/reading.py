@@ -116,16 +116,18 @@ def read_detections(
             streams.append(read)
     if len(people) > 0:
         skeleton, told = skeleton_of_people(people, wanted, declared)
-        how = "they are the midpoints of two joints, if both were detected"
+        how = "the midpoint of two joints, if both were detected"
         streams, said, first = _streams_of(people, skeleton)
         notes += [*said, *told]
     else:
         skeleton, how = (
             _skeleton_of_streams(streams, wanted),
-            ("they are midpoints of the two joints that their limbs connect"),
+            "the midpoint of the two joints that its limbs connect",
         )
     made = [skeleton.joints[joint] for joint, _, _ in skeleton.middles]
-    notes += [f"{skeleton.name} has no {' and no '.join(made)}: {how}"] if made else []
+    if made:
+        each = "it" if len(made) == 1 else "each"
+        notes.append(f"{skeleton.name} has no {' and no '.join(made)}: {each} is {how}")
     table = assemble(streams, rig, skeleton, kept, own_frames)
     return replace(table, notes=(*notes, *table.notes), first=first)
 
