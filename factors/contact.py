@@ -1,4 +1,4 @@
-"""A standing foot: its position stays constant between successive frames.
+"""Factor of a standing foot: its position stays constant between successive frames.
 
 Residual, in metres in the world:
 

@@ -139,7 +139,7 @@ class Motion:
 
 
 class ConstantVelocity(Motion):
-    """White noise on acceleration, by GTSAM's own factor.
+    """Motion model with white noise on acceleration, by GTSAM's own factor.
 
     r = [x' - x - dt v,  v' - v]  ~  N(0, q [[dt³/3, dt²/2], [dt²/2, dt]])
     """
@@ -156,9 +156,9 @@ class ConstantVelocity(Motion):
 
 
 CONSTANT_VELOCITY = ConstantVelocity()
-"""White noise on acceleration."""
+"""Motion model with white noise on the acceleration (constant velocity between steps)."""
 CONSTANT_ACCELERATION = Motion(3, (2.0, 5.0))
-"""White noise on jerk."""
+"""Motion model with white noise on the jerk (constant acceleration between steps)."""
 MOTIONS: dict[str, Motion] = {
     "constant velocity": CONSTANT_VELOCITY,
     "constant acceleration": CONSTANT_ACCELERATION,

@@ -164,8 +164,8 @@ def errors_in_frames(marginals: Marginals, truth: np.ndarray) -> Columns:
     """
     found, squared = squared_errors(marginals, truth)
     views = marginals.window.last.evidence.inlier[found.row].sum(axis=-1)
-    sigma_m, told, used = association_features(marginals)
-    rejected = 1 - used / np.maximum(told, 1e-9)
+    sigma_m, evidence, used = association_features(marginals)
+    rejected = 1 - used / np.maximum(evidence, 1e-9)
     signs = (np.repeat(each[found.row, None], 25, 1) for each in (sigma_m, rejected))
     seen = views > 0
     return tuple(each[seen] for each in (squared, views, *signs))
@@ -177,8 +177,8 @@ def errors_over_time(marginals: Marginals, truth: np.ndarray) -> Columns:
     """
     found, squared = squared_errors(marginals, truth)
     seen = marginals.window.last.evidence.inlier[found.row].any(axis=-1)
-    _, told, used = association_features(marginals)
-    rejected = 1 - used.sum() / max(told.sum(), 1e-9)
+    _, evidence, used = association_features(marginals)
+    rejected = 1 - used.sum() / max(evidence.sum(), 1e-9)
     return squared[seen], rejected, *map(np.array, correlation_features(marginals))
 
 
@@ -198,7 +198,7 @@ def new_errors(seed: int) -> Iterator[Columns]:
 def fitted(
     squared: np.ndarray, views: np.ndarray, sigma_m: np.ndarray, rejected: np.ndarray
 ) -> AssociationUncertainty:
-    """The numbers of least loss, scaled for 95 %."""
+    """The parameters of least loss, scaled so that 95 % regions hold 95 % of the joints."""
     share = np.where(views > 1, SHARES[1] / (views > 1).sum(), SHARES[0] / (views == 1).sum())
 
     def loss(numbers: np.ndarray) -> float:
@@ -218,8 +218,8 @@ def fitted(
 def fitted_over_time(
     windows: list[Columns], new: list[Columns], association: AssociationUncertainty
 ) -> CorrelatedErrors:
-    """The numbers of least loss over windows of recordings and of people with new errors, half
-    each, scaled for 95 % of the joints in recordings.
+    """The parameters of least loss over windows of recordings and of people with new errors, half
+    each, scaled so that 95 % regions hold 95 % of the joints in recordings.
     """
 
     def loss(numbers: np.ndarray) -> float:

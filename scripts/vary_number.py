@@ -68,7 +68,7 @@ CASES = (
     Case("crowd", 7105, 3), Case("crowd", 7106, 4), Case("crossing", 7107, 3),
     Case("crossing", 7108, 4), Case("salsa", 7109, 4), Case("salsa", 7110, 4, 10),
 )  # fmt: skip
-"""The last one moves thrice as far between frames."""
+"""Simulated recordings; in the last one people move three times as far between frames."""
 
 
 def main() -> None:

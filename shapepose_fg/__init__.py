@@ -1,4 +1,4 @@
-"""From several calibrated cameras to every person in the room in 3D, with a body."""
+"""Reconstruct several people in 3D, with bodies and identities, from several calibrated cameras."""
 
 import os
 from importlib import import_module

@@ -8,7 +8,7 @@ import signal
 def main() -> None:
     """Run the command line. Until it is loaded, Ctrl-C ends the program without a message.
 
-    Garbage collection does not visit modules imported here, and they are not torn down at the end.
+    Garbage collection skips the modules imported here, and they are not finalised at exit.
     """
     gc.disable()
     # NumPy's matrices are small here: its threads wait for each other, a tenth of all processor

@@ -50,7 +50,7 @@ class AngleDefinition:
     ends: tuple[str, str]
     """Proximal and distal bone, by the joint at which each begins, without side."""
     sided: bool = True
-    """Whether there is one on each side."""
+    """Whether the joint exists on each side."""
 
 
 DEFINITIONS = (

@@ -1,1 +1,1 @@
-"""Cameras from people: checked, calibrated, refined, synchronised, and found while they move."""
+"""Checks, calibrates, refines and synchronises cameras with the people that they see."""

@@ -274,7 +274,9 @@ class Undetermined(InputError):
 
 
 class Steps:
-    """Counts steps: each call adds some to those done, and reports these, and the total."""
+    """Counts steps, for a progress bar: each call adds to the number of finished steps, and reports
+    it with the total.
+    """
 
     def __init__(self, progress: Callable[[int, int], None], total: int):
         self._progress, self._total, self._done = progress, total, 0
@@ -291,16 +293,17 @@ def settle(
     given: Rig,
     times: FrameTimes,
     freedom: Freedom | Sequence[Freedom],
-    told: Callable[[int], None],
+    advance: Callable[[int], None],
     reference: int | None = None,
     scale: Callable[[Array], float] | None = None,
 ) -> Adjusted:
-    """Associate people and adjust cameras alternately, starting at `now`, until the cameras stand
-    still.
+    """Associate people and adjust cameras alternately, starting at `now`, until their poses have
+    converged.
 
-    The prior has the `freedom` about the cameras `given`. With `scale`, the metres per unit of the
-    people's joints (P, J, 3), it has only their lenses, and the rig is scaled. `told` gets the
-    number of rounds that are done. Raises Undetermined if too few people are seen.
+    The prior has the `freedom` about the cameras `given`. With `scale`, a function from the
+    people's joints (P, J, 3) to metres per unit, only the lenses have a prior, and the rig is
+    scaled. `advance` gets the number of rounds that are done. Raises Undetermined if too few people
+    are seen.
     """
     adjusted: Adjusted | None = None
     for step in range(rounds):
@@ -323,7 +326,7 @@ def settle(
             adjusted = grown(adjusted, factor)
         before, now = now, adjusted.rig
         still = apart(before, now)[0].max() < _STILL_DEG
-        told(rounds - step if still else 1)
+        advance(rounds - step if still else 1)
         if still:
             break
     assert adjusted is not None

@@ -79,7 +79,7 @@ class Placed(Rows):
     """People at regular moments, in three dimensions, with their tracks."""
 
     time_s: Array
-    """(P,) time of each, seconds."""
+    """(P,) time of each person, seconds."""
     moment: Index
     """(P,) number of the moment, `LOOK_S` apart."""
     points: Array
@@ -87,7 +87,7 @@ class Placed(Rows):
     velocity: Array
     """(P, J, 3) metres per second; 0 where unknown."""
     track: Index
-    """(P,) track of each."""
+    """(P,) track of each person."""
     spread: Array
     """(P, J, 3, M) changes of the positions by one standard deviation of each of M independent
     errors of the fixed cameras, metres."""
@@ -224,7 +224,7 @@ class Start:
         return replace(camera, K=K, bTc=self.bTc, distortion=distortion), moved
 
     def words(self, name: str) -> str:
-        """How well the start of a camera is known."""
+        """A sentence on the uncertainty of the start of camera `name`."""
         return (
             f"camera {name}: its trajectory starts {self.offset_s:+.3f} s after the first camera; "
             f"{self.share:.0%} of the people in its view agree; its poses are known to "

@@ -32,7 +32,7 @@ class People(Rows):
     """P people of single frames, J joints, V cameras."""
 
     frame: Index
-    """(P,) frame of each."""
+    """(P,) frame of each person."""
     xy: Array
     """(P, J, V, 2) detections, undistorted pixels; NaN where there is none."""
     sigma_px: Array

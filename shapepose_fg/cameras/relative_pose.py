@@ -101,14 +101,14 @@ class Together:
         """Which pairs of tracks (K,) are one person each, greedily by residual, and their total
         score.
         """
-        worth = np.maximum(1 - miss / _GATE, 0.0) * self.count
-        order = np.argsort(-worth, kind="stable")
+        score = np.maximum(1 - miss / _GATE, 0.0) * self.count
+        order = np.argsort(-score, kind="stable")
         kept, (a, b) = np.zeros(len(miss), dtype=bool), self.tracks.T
-        for n in order[worth[order] > 0].tolist():
+        for n in order[score[order] > 0].tolist():
             # A track cannot be two people at once.
             rival = ((a == a[n]) & self.alike[1][b[n], b]) | ((b == b[n]) & self.alike[0][a[n], a])
             kept[n] = not (kept & rival).any()
-        return kept, float(worth[kept].sum() / max(self.possible, 1))
+        return kept, float(score[kept].sum() / max(self.possible, 1))
 
     def joints(self, kept: Mask) -> tuple[Array, Array, Array]:
         """Rays (N, J, 3) of both cameras for the pairs of tracks that are `kept`, and

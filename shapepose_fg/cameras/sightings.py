@@ -155,7 +155,7 @@ class Pairs:
     error: Array
     """(M,) median distance of their rays, as a share of the person's size in the picture."""
     frame: Index
-    """(M,) frame of each."""
+    """(M,) frame of each pair."""
     third: Index
     """(M, V) for each other camera, the sighting nearest to the person's projection; -1 for
     none."""
@@ -202,9 +202,11 @@ class Pairs:
             supported = (
                 free[thirds[live]] & (thirds[live] >= 0) & allowed & (self.third_error[live] < GATE)
             )
-            worth = 1 - self.error[live] / GATE
-            worth = worth + np.where(supported, 1 - self.third_error[live] / GATE, 0).sum(axis=1)
-            best = least_of_each(self.frame[live], -worth)
+            support = 1 - self.error[live] / GATE
+            support = support + np.where(supported, 1 - self.third_error[live] / GATE, 0).sum(
+                axis=1
+            )
+            best = least_of_each(self.frame[live], -support)
             member = np.where(supported[best], thirds[live[best]], -1)
             chosen = live[best]
             member[np.arange(len(best))[:, None], self.views[chosen]] = members[chosen]

@@ -161,10 +161,10 @@ def offsets(
 def chosen(
     curves: dict[tuple[int, int], Array], lags: Index, views: int, around: int
 ) -> tuple[Array, Array]:
-    """(V,) shifts relative to the first camera, and their prominence (V,).
+    """(V,) shifts in frames relative to the first camera, and their prominence (V,).
 
-    Cameras are added one by one in order of prominence, each at the offset that fits all those
-    before it: frame f of the first camera is frame f + shift of another.
+    Frame f of the first camera is frame f + shift of another. Cameras are added one by one in order
+    of prominence, each at the offset that fits all those before it.
     """
     step = int(lags[1] - lags[0]) if len(lags) > 1 else 1
     half = len(lags) // 2
@@ -186,12 +186,12 @@ def chosen(
     def best(view: int, placed: dict[int, int]) -> tuple[float, int]:
         low, high = min(placed.values()) - half, max(placed.values()) + half
         tried = np.arange(low, high + 1)
-        worth = np.sum(
+        score = np.sum(
             [fit(one, view, tried - at) for one, at in placed.items()], axis=0
         ) / np.sqrt(len(placed))
-        top = int(np.argmax(worth))
+        top = int(np.argmax(score))
         far = np.abs(tried - tried[top]) * step > around
-        return float(worth[top] - worth[far].max(initial=0.0)), int(tried[top])
+        return float(score[top] - score[far].max(initial=0.0)), int(tried[top])
 
     margins = {pair: best(pair[1], {pair[0]: 0})[0] for pair in curves}
     root = max(margins, key=lambda pair: margins[pair])[0]

@@ -240,11 +240,11 @@ def calibrate(
         remarks=found.notes,
     )
     if as_json:
-        told = found.as_dict() | (
+        content = found.as_dict() | (
             {} if clocks is None else {"clocks": clocks.as_dict(rig)["cameras"]}
         )
-        told |= {"moving": {name: each.as_dict() for name, each in starts.items()}}
-        show_json(told)
+        content |= {"moving": {name: each.as_dict() for name, each in starts.items()}}
+        show_json(content)
     else:
         show(table(("camera", *heads), [(name, *each) for name, each in rows], caption=_CAPTION))
         show("\n".join(lines[1:]))

@@ -73,11 +73,11 @@ def live(
         published(output or (), rig, of_readers, covariances) as publish,
         OnlineReconstructor(rig, skeleton=joints, lag_s=lag, workers=workers) as people,
     ):
-        frames, jumps, said = 0, 0, None
+        frames, jumps, status = 0, 0, None
         is_file = _is_file(detections)
 
         def push(*view: Any) -> None:
-            nonlocal frames, jumps, said
+            nonlocal frames, jumps, status
             people.push_view(*view)
             report = people.report()
             if report.frames > frames:
@@ -89,7 +89,7 @@ def live(
             if report.jumps > jumps:
                 jumps = report.jumps
                 of_cameras(f"the times of all cameras jumped to {view[2]:.2f} s")
-            said = _say(people, said, of_cameras)
+            status = _say(people, status, of_cameras)
 
         if os.isatty(0) if detections is None else detections.startswith("tcp:"):
             note(f"reads from {detections or 'this terminal'} until Ctrl-C")

@@ -204,7 +204,7 @@ class CameraOptions:
         note_of_reading(*found.notes)
         return found
 
-    def said(self) -> dict[str, object]:
+    def calibration_options(self) -> dict[str, object]:
         """The options about the calibration, to be repeated in the next command."""
         names = ("up", "unit", "image_size", "cameras", "without")
         return {f"--{name.replace('_', '-')}": getattr(self, name) for name in names}

@@ -96,13 +96,13 @@ def overlay(
         if drawn.stills is not None:
             chosen, fps = _stills(drawn.stills, length), None
         else:
-            told = [
+            covered = [
                 each
                 for span in covered_frames(run) or [range(length)]
                 for each in span
                 if each < length
             ]
-            chosen, fps = told if frames is None else frame_range(frames, length), _fps(run)
+            chosen, fps = covered if frames is None else frame_range(frames, length), _fps(run)
         if len(chosen) == 0:
             raise InputError(
                 f"{folder}: none of its frames has a picture; give the videos that it was made from"

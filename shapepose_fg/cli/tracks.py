@@ -29,7 +29,7 @@ _ACTIONS = {
     "swap": ("person", "other", "frame"),
     "undo": (),
 }
-"""The numbers that follow each action."""
+"""Arguments of each action."""
 
 
 @grouped

@@ -21,8 +21,8 @@ _spent_s = 0.0
 """Time that `compile_beside` took in this process, s."""
 
 _tried = False
-"""Whether this process has compiled the missing kernels; kernels that are missing later are
-compiled when they are called."""
+"""Whether this process has compiled the missing kernels once; other missing kernels are compiled
+when they are called."""
 
 
 def compile_beside(kernels: Sequence[Any]) -> None:
@@ -102,7 +102,7 @@ def end_with(parent: int) -> None:
 
 
 def _begin(parent: int) -> None:
-    """Prepare a process of `compile_beside`: it compiles what it is told, and prints nothing."""
+    """Initialise a process of `compile_beside`, which compiles kernels and prints nothing."""
     global _tried
     _tried = True
     end_with(parent)

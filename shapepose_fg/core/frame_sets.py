@@ -35,7 +35,7 @@ class FrameSets:
     """The synchronised frame sets of a recording: one picture of each camera per set."""
 
     picture: Index
-    """(T, V) index of each camera's picture; -1 if it has none within half a frame."""
+    """(T, V) index of each camera's picture; -1 if the camera has none within half a frame."""
     time_s: Array | None
     """(T, V) times of the pictures of each set, seconds; for a missing picture, the time of the
     set, or NaN if start times are unknown. None without a clock."""

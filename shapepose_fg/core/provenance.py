@@ -41,7 +41,7 @@ def checksums(inputs: Iterable[str | Path]) -> dict[str, str]:
     """SHA-256 of every input file; for a folder, one checksum of the names and contents of its data
     files.
 
-    So a recording of 10,000 JSON files is one line of run.json, and a renamed or missing file
+    Thus a recording of 10,000 JSON files is one line of run.json, and a renamed or missing file
     changes it.
     """
     return {str(path): _digest(Path(path), _INPUTS) for path in inputs}

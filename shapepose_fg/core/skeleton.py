@@ -66,11 +66,11 @@ class Skeleton:
     ) -> "Skeleton":
         """Make a skeleton from names.
 
-        `keypoints` are the detector's, in its order; "" is ignored, and so are `passed_over`
-        further ones at the end. `middles` are computed as midpoints of two keypoints. `anchor` is a
-        joint, or the names of two joints with the midpoint "MidHip". `mirror` are pairs of joints
-        on both sides of the body. By default, `parents` are found along the limbs, from the anchor
-        outwards. ValueError names what is inconsistent.
+        `keypoints` are the detector's, in its order; Keypoints named "", and `passed_over` further
+        ones at the end, are ignored. `middles` are computed as midpoints of two keypoints. `anchor`
+        is a joint, or the names of two joints with the midpoint "MidHip". `mirror` are pairs of
+        joints on both sides of the body. By default, `parents` are found along the limbs, from the
+        anchor outwards. ValueError names what is inconsistent.
         """
         middles = dict(middles or {})
         if not isinstance(anchor, str):
@@ -279,8 +279,8 @@ def body_skeleton(name: str, keypoints: Sequence[str], passed_over: int = 0) -> 
     """Skeleton of a detector from the body points of its `keypoints`: those of BODY_25, HALPE's top
     of the head (`Head`), or SMPL_24's `head`, `neck`, spine, collars, hands and feet.
 
-    "" is a keypoint that is ignored, and so are `passed_over` further ones at the end. Missing Neck
-    and MidHip are computed as midpoints. ValueError if shoulders or hips are missing.
+    Keypoints named "", and `passed_over` further ones at the end, are ignored. Missing Neck and
+    MidHip are computed as midpoints. ValueError if shoulders or hips are missing.
     """
     given = [point for point in keypoints if point]
     lacking = [each for ends in _MIDDLES.values() for each in ends if each not in given]

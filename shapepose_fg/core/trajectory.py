@@ -176,7 +176,7 @@ class Trajectory:
 
 @dataclass(frozen=True)
 class Carried:
-    """Poses of the carriers of cameras at N times, with covariances."""
+    """Poses of the carriers of cameras at N times, with covariances: one row per time."""
 
     carrier: Index
     """(V,) index of the carrier of each view among B; -1 for a fixed camera."""
@@ -187,7 +187,7 @@ class Carried:
 
     @classmethod
     def of(cls, trajectories: Iterable[Trajectory], carrier: Index, time_s: Array) -> "Carried":
-        """The poses at N times `time_s` (N,)."""
+        """The poses of the carriers at N times `time_s` (N,)."""
         every = tuple(trajectories)
         poses = np.stack([each.at(time_s) for each in every], axis=1)
         return cls(carrier, poses, np.stack([each.covariance_at(time_s) for each in every], axis=1))

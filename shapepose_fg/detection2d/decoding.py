@@ -21,7 +21,7 @@ class PictureCandidates:
     joint: Index
     """(D,) joint of each candidate, in the network's order."""
     xy: Array
-    """(D, 2) position."""
+    """(D, 2) position of each candidate; in cells of the heat map, or in pixels after `moved`."""
     score: Array
     """(D,) height of the peak, 0 to 1."""
     pairs: Index

@@ -138,12 +138,12 @@ def _fetched(file: str, progress: Callable[[int, int], object]) -> bytes:
             http.client.HTTPException,
             *_BROKEN,
         ) as error:
-            told = (
+            reason = (
                 error
                 if isinstance(error, urllib.error.HTTPError)
                 else getattr(error, "reason", error)
             )
-            problems.append(f"{base}/{file} ({told})")
+            problems.append(f"{base}/{file} ({reason})")
     raise InputError(
         f"the network cannot be downloaded from {' or '.join(problems)}; download it by hand and "
         f"give --network the path of the {_INSIDE} in it"

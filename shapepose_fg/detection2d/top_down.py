@@ -50,7 +50,7 @@ class KeypointForm(BaseModel, extra="forbid"):
     mean: _Three = (123.675, 116.28, 103.53)
     """Mean that is subtracted from the colours (0 to 255), in their order."""
     std: tuple[_Above0, _Above0, _Above0] = (58.395, 57.12, 57.375)
-    """Standard deviation by which the colours are divided after that."""
+    """Standard deviation by which the colours are divided after subtracting the mean."""
     cells: Literal["corners", "edges"] = "corners"
     """Whether the outer cells of a heat map have their centres on the input's outer pixels, or fill
     the input."""
@@ -142,7 +142,7 @@ class TopDownNetwork:
     @property
     def settings(self) -> dict[str, Any]:
         """All settings that affect the detections."""
-        said = [
+        descriptions = [
             part
             and {
                 "sha256": part.network.sha256,
@@ -150,7 +150,7 @@ class TopDownNetwork:
             }
             for part in (self, self.boxes)
         ]
-        return {"network": said[0], "detection": {"boxes": said[1]}}
+        return {"network": descriptions[0], "detection": {"boxes": descriptions[1]}}
 
     def head(self, frames: int) -> str:
         """The beginning of MMPose's JSON of a video, with the layout of the joints unless it was

@@ -21,12 +21,13 @@ from shapepose_fg.estimation.body_window import (
 from shapepose_fg.estimation.condensed_graph import frame_systems
 
 DEVIATION_M = 0.012
-"""As `body_window.DEVIATION_M`, for a body whose shape a single frame determines: of 7, 12 and 20
-mm that with which neither simulated nor recorded people are much worse than with the best."""
+"""Standard deviation of a detector's joint from the body's, metres per axis. It is larger than in a
+window, because a single frame determines the shape less. Of 7, 12 and 20 mm, it is the value with
+which neither simulated nor recorded people are much worse than with the best of them."""
 
 
 class BodyFrames(BodyWindow):
-    """The model of T people in a single frame each, with a shape each."""
+    """The model of T rows of people in single frames, each row with its own shape."""
 
     over_time = False
     deviation_m = DEVIATION_M
@@ -44,7 +45,7 @@ class BodyFrames(BodyWindow):
         return part
 
     def solve(self, start: Array) -> BodyState:
-        """The states of least cost, from bodies (T, P) in the world on."""
+        """The states of least cost; the solver starts at bodies `start` (T, P) in the world."""
         self.origin = start[:, None, -3:]
         free = start.copy()
         free[:, -3:] = 0.0
@@ -85,7 +86,7 @@ class BodyFrames(BodyWindow):
         return found
 
     def take(self, state: BodyState, shape: Array, pose: Array) -> BodyState:
-        """The states after another step, where it doesn't make them worse."""
+        """The states after another step; rows that the step makes worse keep their state."""
         there, new = self._after(state, self.last, shape, pose)
         worse = ~_better(new, self.last)
         new.put(worse, self.last.rows(worse))
@@ -103,7 +104,7 @@ class BodyFrames(BodyWindow):
         return Marginals(self, state, poses, np.zeros_like(poses), whole[:, :10, :10], across)
 
     def _total(self, state: BodyState, cost: Array) -> tuple[Array, Array]:
-        """As for a window, for each row."""
+        """The cost of each row with that of its shape, and zero for the gradient of motion."""
         nothing = np.zeros((len(cost), self.energy.num_free - 10))
         return cost + np.square(state.betas).sum(axis=1), nothing
 

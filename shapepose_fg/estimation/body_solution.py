@@ -58,8 +58,8 @@ def solve_bodies(
     motion: MotionModel,
     functions: Sequence[FactorFunction] = (),
 ) -> WindowSolution:
-    """Joints, covariances and bodies of N rows: each track over its rows, or a row by itself. They
-    begin at the `first` estimates.
+    """Joints, covariances and bodies of N rows: each track over all its rows, or every row
+    separately. The solver starts at the initial estimates `first`.
 
     A joint's covariance is, in this order: the one from its views, if its row has no body
     (`_of_views`); the marginal of its person's graph, with deviations wider for unseen joints
@@ -167,8 +167,8 @@ def _widen_unseen(
     views: Views,
     config: EstimatorConfig,
 ) -> None:
-    """Unseen joints deviate from their bodies by more, above all those that cameras should see.
-    `spread` has each person's covariances of joints from bodies alone.
+    """Widen the deviations of unseen joints from their bodies, above all of those that cameras
+    should see. `spread` has each person's covariances of the bodies' joints.
     """
     strong = strong_detections(observations, found.evidence.inlier)
     limbs = limbs_that_hide(config.joints)
@@ -209,6 +209,8 @@ def _put(found: Estimates, person: BodyGraph, marginals: Marginals) -> None:
 
 
 def _filled(free: Array, ok: Mask, times_s: Array) -> Array:
-    """Bodies (T, P), those that are not `ok` (T,) as the nearest in time that are."""
+    """Bodies (T, P), where those that are not `ok` (T,) are replaced by the nearest in time that
+    are.
+    """
     there = np.flatnonzero(ok)
     return free[there[np.abs(times_s[:, None] - times_s[there]).argmin(axis=1)]]

@@ -5,8 +5,8 @@ the body's.
                 + |beta|² - 2 (dt / 1 s) log p(theta_t) + motion(theta_t, theta_t+1, theta_t+2)
 
 The first sum is Eq. 1 with the gates of Eq. 2, the second Eq. 3 with a measured `s` and without a
-threshold. Joints X are eliminated from every step in closed form: three unknowns each that only
-their body is connected to.
+threshold. Joints X are eliminated from every step in closed form: each has three unknowns, and is
+connected to its body only.
 """
 
 from dataclasses import dataclass, replace
@@ -50,14 +50,14 @@ once in it."""
 _AVERAGED = 0.15
 """Ratio of the covariance of a seen foot's velocity to that from the views of its two frames alone,
 because a window averages over frames and joints: 0.11 to 0.25 in the median of each person in
-simulated recordings of three to six cameras, against `Marginals.velocities`. Errors and speeds of
-standing feet are those with the marginals themselves, which take a twentieth of a run."""
+simulated recordings of three to six cameras, against `Marginals.velocities`. With the marginals
+themselves, errors and speeds of standing feet are the same, and a run takes a twentieth longer."""
 _STRAYS_M = 0.07
 """Standard deviation, m, of an unseen joint of the body at which its own deviation is as large:
-errors of poses that nothing shows are larger than their Gaussian when they are large."""
+errors of unseen poses have heavier tails than a Gaussian."""
 STEPS, SETTLED_M = 8, 2e-3
-"""Most steps of the solver; it ends when joints move by less on average, metres. GTSAM's last step
-then moves them by a tenth of that."""
+"""Maximum number of steps of the solver, and mean motion of joints below which it ends, metres. The
+last step, by GTSAM, then moves them by a tenth of that."""
 HELD = 1e-6
 """Information on every unknown, so that what nothing determines stays where it is."""
 DAMPING = 1e-3
@@ -72,12 +72,14 @@ class BodyState(Rows):
     root: Array
     """(T, 3, 3) rotation of the root."""
     others: Array
-    """(T, N - 3) visible angles, rad, and place, metres around the window's origin."""
+    """(T, N - 3) visible angles, rad, and position, metres from the window's origin."""
     deviation: Array
     """(T, J, 3) X - J(theta, beta), metres."""
 
     def moved(self, shape: Array, pose: Array) -> "BodyState":
-        """After a step of betas and poses (T, N), the root's in tangents of the world."""
+        """The state after a step of the betas and of the poses (T, N); rotations of the root are
+        tangent vectors in world axes.
+        """
         return replace(
             self,
             betas=self.betas + shape,
@@ -104,14 +106,14 @@ class Around(Rows):
     pull: Array
     """(T, N) half the gradient of the motion."""
     bodies: Array
-    """(T, J, 3) joints of the body, metres around the origin."""
+    """(T, J, 3) joints of the body, metres from the origin."""
     evidence: ViewEvidence
     """Measurements of the views, linearised at the joints X."""
     gain: Array
     """(T, J, 3, 3) gain (1 + s² L)^-1 s² L, by which X lies between the body's joint (0) and the
     estimate of the views (1)."""
     target: Array
-    """(T, J, 3) joints as estimated from the views only, metres around the origin; undefined where
+    """(T, J, 3) joints as estimated from the views only, metres from the origin; undefined where
     these give no information."""
 
 
@@ -165,8 +167,8 @@ class BodyWindow:
         return len(self.times_s)
 
     def solve(self, start: Array) -> BodyState:
-        """The state of least cost, from bodies (T, P) in the world on, parameters as `BodyEnergy`
-        has them.
+        """The state of least cost; the solver starts at bodies `start` (T, P) in the world,
+        parameters of `BodyEnergy`.
         """
         self.origin = start[:, -3:].mean(axis=0)
         free = start.copy()
@@ -183,7 +185,7 @@ class BodyWindow:
         return self._descended(state)
 
     def _descended(self, state: BodyState) -> BodyState:
-        """The state of least cost, from one with `last` around it."""
+        """The state of least cost; the solver starts at `state`, where `last` is linearised."""
         here, damping, done = self.last, DAMPING, False
         for _ in range(STEPS):
             if done:
@@ -221,9 +223,9 @@ class BodyWindow:
         if not np.isfinite(density).any():
             return
         evidence = self.last.evidence
-        told = np.where(seen[..., None, None], evidence.information[:, feet], 0.0)
-        told = JointTargets(evidence.target[:, feet], told)
-        information, pull = held_in_place(told, density, self.times_s)
+        information = np.where(seen[..., None, None], evidence.information[:, feet], 0.0)
+        targets = JointTargets(evidence.target[:, feet], information)
+        information, pull = held_in_place(targets, density, self.times_s)
         information[~seen], pull[~seen] = 0.0, 0.0
         scale = np.trace(information, axis1=-2, axis2=-1)
         known = information + 1e-9 * scale[..., None, None] * np.eye(3)
@@ -231,7 +233,7 @@ class BodyWindow:
         self.standing.xyz[:, feet] = (inverses(known) @ pull[..., None])[..., 0]
         self.walk[:, feet] = np.where(seen[1:] & seen[:-1], density, np.inf)
         # Detectors' errors last: all frames of a stance together say as much as one.
-        own = np.trace(told.information, axis1=-2, axis2=-1)
+        own = np.trace(targets.information, axis1=-2, axis2=-1)
         share = np.where(scale > 0, own / np.maximum(own + scale, 1e-9), 1.0)
         self.standing.information[:, feet] = share[..., None, None] * information
         self.sigmas_px[:, feet] /= np.sqrt(share)[..., None]
@@ -322,8 +324,8 @@ class BodyWindow:
         return Around(total, linear.system, pull, bodies, evidence, variance * weighed, target)
 
     def _total(self, state: BodyState, cost: Array) -> tuple[float | Array, Array]:
-        """The cost with that of shape and motion, for the `cost` of each frame (T,); and half the
-        gradient of motion.
+        """The cost of detections and joints in each frame, `cost` (T,), summed, plus that of shape
+        and motion; and half the gradient of motion.
         """
         total = float(cost.sum() + np.square(state.betas).sum())
         if self.links is None:
@@ -352,7 +354,7 @@ class BodyWindow:
     def _bodies(self, state: BodyState) -> Array:
         return self.energy.model.keypoints(self.energy.complete(state.free))
 
-    def said_by(self, state: BodyState, joints: Mask) -> Array:
+    def information_from(self, state: BodyState, joints: Mask) -> Array:
         """(T, M, P) normal equations of each frame's body from some `joints` (J,) only, without
         priors, around the last solution.
         """
@@ -512,8 +514,8 @@ class Marginals:
         """(T, J, 3, 3) covariances of the velocities of the joints as in `in_time.velocities`,
         m²/s²; NaN for a single frame.
 
-        Errors between distant frames are a Markov chain of those of consecutive ones, joint by
-        joint, which is less correlated than they are.
+        The errors of each joint are assumed to be a Markov chain over the frames; true errors are
+        more correlated over distant frames.
         """
         slope = self.slopes[..., 10:]
         T, J = slope.shape[:2]

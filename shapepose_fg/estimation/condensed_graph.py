@@ -16,9 +16,9 @@ from shapepose_fg.estimation.body_window import HELD, BodyState, BodyWindow
 
 
 def gtsam_step(window: BodyWindow, state: BodyState) -> tuple[Array, Array]:
-    """Gauss-Newton step by GTSAM around a solved window: of the betas, (10,) or of single frames
-    (T, 10), and of the poses (T, N), the root's in tangents of the world. LinAlgError if the system
-    is singular.
+    """Gauss-Newton step of GTSAM at a solved window: of the betas (10,), in single frames (T, 10),
+    and of the poses (T, N). Rotations of the root are tangent vectors in world axes. LinAlgError if
+    the system is singular.
     """
     poses = body_keys(0, np.arange(len(window))).tolist()
     shapes = [shape_key(n) for n in range(len(np.atleast_2d(state.betas)))]
@@ -64,12 +64,12 @@ def frame_systems(
     window: BodyWindow, state: BodyState, joints: Mask | None = None
 ) -> tuple[Array, Array]:
     """Information of each frame about betas and pose around a state: Hessians (T, P, P) and
-    negative gradients (T, P), the root's in tangents of the world, with the priors of poses. With
-    `joints` (J,), only the information of these joints, without priors.
+    negative gradients (T, P), with the priors of poses. Rotations of the root are tangent vectors
+    in world axes. With `joints` (J,), only the information of these joints, without priors.
     """
     system, turn, P = window.last.system, state.root, window.energy.num_free
     if joints is not None:
-        system = window.said_by(state, joints)
+        system = window.information_from(state, joints)
     lower = np.tril(system[:, :P])
     H, pull = lower + np.tril(lower, -1).mT, -system[:, P]
     H[:, 10:13] = turn @ H[:, 10:13]

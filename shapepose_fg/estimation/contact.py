@@ -19,8 +19,8 @@ from shapepose_fg.estimation.in_time import SPEED_S
 FEET = ("Ankle", "Heel", "BigToe", "SmallToe")
 """Joints that may stand, independently on either side: toes stand while the heel rises."""
 ALIKE_S = 0.25
-"""Frames within this time count as one look of the views at a standing foot, seconds: detectors'
-errors last."""
+"""Time within which frames count as one measurement of a standing foot, s: detectors' errors are
+correlated as long."""
 FREE_M2_S = 0.003
 """Density above which a step is unconstrained: at 30 frames a second it corresponds to 1 cm. With
 0.02 salsa and crowds of four cameras are 0.05 to 0.1 mm worse, with 0.001 standing feet move."""
@@ -127,10 +127,10 @@ def smoothed(log: Array, times_s: Array) -> Array:
     forward, backward = np.empty_like(seen), np.ones_like(seen)
     forward[0] = feet.first * seen[0]
     for t in range(1, len(seen)):
-        told = forward[t - 1] @ turn[t - 1] * seen[t]
-        forward[t] = told / told.sum(axis=1, keepdims=True)
+        unnormalised = forward[t - 1] @ turn[t - 1] * seen[t]
+        forward[t] = unnormalised / unnormalised.sum(axis=1, keepdims=True)
     for t in range(len(seen) - 2, -1, -1):
-        told = (seen[t + 1] * backward[t + 1]) @ turn[t].T
-        backward[t] = told / told.sum(axis=1, keepdims=True)
+        unnormalised = (seen[t + 1] * backward[t + 1]) @ turn[t].T
+        backward[t] = unnormalised / unnormalised.sum(axis=1, keepdims=True)
     both = forward * backward
     return both / both.sum(axis=2, keepdims=True)

@@ -81,7 +81,7 @@ def draft(
     From the views, and from the body where these are weak or contradict it. Measurements are
     linearised at triangulated joints, then at the body's, with a decreasing kernel (`NARROWING_M`).
     Rows with the same detections as in the `last` estimate start from its body, with the narrowest
-    kernel; others from a body fitted to the triangulated joints: without it a crowd before three
+    kernel; others from a body fitted to the triangulated joints: without it a crowd with three
     cameras lost two points of F1. As a joint's views also determine the body, the covariances are
     too small.
     """

@@ -10,22 +10,23 @@ from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.decompositions import basis_across
 
 LOOK_S = 1.5
-"""Time for which a standing foot counts as one look, s: errors of joints last as long."""
+"""Time for which a standing foot counts as one measurement of the floor, s: errors of joints are
+correlated as long."""
 LEAST_LOOKS = 6
-"""Minimum number of looks for a floor: two feet of one person over five seconds, or of three people
-at once."""
+"""Minimum number of measurements for a floor: two feet of one person over five seconds, or of three
+people in the same second."""
 AGREE = 0.6
-"""Minimum share of looks that agree on the floor. The others may be feet on chairs, or crossed
-legs."""
+"""Minimum share of measurements that agree on the floor. The others may be feet on chairs, or
+crossed legs."""
 NEAR_M = 0.06
 """Distance from the floor within which a foot stands on it, m: in simulated recordings of 3 to 6
 cameras 99 % of the bodies' lowest points are within 4 cm."""
 UNDER_M = 0.1
 """Depth below the floor, m, at which a foot contradicts it."""
 UNDER_SHARE = 0.05
-"""Maximum share of looks below the floor, due to badly fitted bodies: with two cameras that face
-each other up to 4 in 100, with three and more none (simulated). With more, there is another floor,
-and none is reported."""
+"""Maximum share of measurements below the floor, due to badly fitted bodies: with two cameras that
+face each other up to 4 in 100, with three and more none (simulated). With more, there is another
+floor, and none is reported."""
 SCALE_M = 0.015
 """Standard deviation of the soles of bodies from the floor, metres; width of the kernel."""
 TILT_RAD = np.deg2rad(0.5)
@@ -69,8 +70,9 @@ def find_floor(points: Array, look: Index, up: Array, tilt_rad: float = TILT_RAD
     """The floor under `points` (N, 3), the lowest points of standing feet; else the reason why
     there is none.
 
-    `look` (N,) numbers correlated observations. A robust fit of a plane, level up to `tilt_rad`,
-    starts at the height where most looks agree.
+    `look` (N,) is the number of the measurement to which each point belongs: errors within one are
+    correlated. A robust fit of a plane, level up to `tilt_rad`, starts at the height at which most
+    measurements agree.
     """
     numbers, whose, count = np.unique(look, return_inverse=True, return_counts=True)
     if len(numbers) < LEAST_LOOKS:

@@ -48,11 +48,11 @@ class MotionModel:
     """(J,) power spectral density of the acceleration of a joint nearly at rest, m²/s³,
     per axis."""
     psd_speed: Array
-    """(J,) increase of this density per (m/s)² of the joint's speed: fast joints also accelerate
-    more."""
+    """(J,) increase of the power spectral density per (m/s)² of the joint's speed: fast joints also
+    accelerate more."""
     psd_lost: Array
-    """(J,) minimum of this density while a joint is lost. Its speed is then unknown, so the minimum
-    is the mean over all speeds."""
+    """(J,) minimum of the power spectral density while a joint is lost. Its speed is then unknown,
+    so the minimum is the mean over all speeds."""
     law: Motion = CONSTANT_VELOCITY
     """Motion model of the states."""
 

@@ -93,9 +93,9 @@ class NoiseLaw:
     @classmethod
     def read(cls, run: Any, path: Path) -> "NoiseLaw":
         """The law in `run`, the content of the run.json at `path`; otherwise as `load`."""
-        told = run.get("noise_law") if isinstance(run, dict) else None
+        saved = run.get("noise_law") if isinstance(run, dict) else None
         try:
-            return cls.shipped() if told is None else cls.from_dict(told)
+            return cls.shipped() if saved is None else cls.from_dict(saved)
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise InputError(
                 f"{path}: noise_law is damaged ({error}); reconstruct the recording again"

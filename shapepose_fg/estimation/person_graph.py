@@ -201,14 +201,14 @@ class BodyGraph(PersonWindow):
         return np.concatenate([turn, others], axis=1)
 
     def turns(self) -> Array:
-        """(T, 3, 3) how the root turns, in tangents of the world, where a body's first numbers
-        change.
+        """(T, 3, 3) derivative of the root's rotation, as a tangent vector in world axes, by the
+        first three numbers of each body.
         """
         found = np.linalg.inv(right_jacobian_inverse(-self._bodies()[:, :3]))
         return np.asarray(found, dtype=np.float64)
 
     def order(self) -> Iterator[tuple[int, int, int]]:
-        """Rank, within its frame, and frame of each variable, for elimination without much
+        """Frame, rank within the frame, and key of each variable, for elimination with little
         fill-in.
         """
         for kind, keys in enumerate((self.velocity_keys, self.keys, self.body_keys[:, None])):
@@ -216,8 +216,8 @@ class BodyGraph(PersonWindow):
                 yield from ((frame, kind, key) for key in row if self.values.exists(key))
 
     def _velocities(self) -> list[gtsam.NonlinearFactor]:
-        """Make v = (x' - x) / dt of the velocities that user factors are on, for x as in
-        `in_time.velocities`.
+        """Factors that define the velocities on which user factors are: v = (x' - x) / dt, with x
+        as in `in_time.velocities`.
         """
         if not self.temporal or len(self.ties.factors) == 0:
             return []
@@ -237,7 +237,9 @@ class BodyGraph(PersonWindow):
         return found
 
     def _standing(self, scale: float, joints: Mask) -> list[gtsam.NonlinearFactor]:
-        """Factors on `joints` (J,) of feet from the other frames of a stance."""
+        """Factors on the joints of standing feet among `joints` (J,), from the other frames of a
+        stance.
+        """
         held = self.window.standing
         frame, joint = np.nonzero(held.information.any(axis=(-1, -2)) & joints)
         roots = symmetric_root(held.information[frame, joint]) / scale

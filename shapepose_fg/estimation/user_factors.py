@@ -90,8 +90,8 @@ class CoupledGraph:
 
 
 class PersonWindow:
-    """One person in T frames, as functions that make factors see it, with the graph in which their
-    factors are.
+    """One person in T frames, as functions that make user factors see it; with the graph of these
+    factors.
     """
 
     def __init__(
@@ -269,8 +269,8 @@ class PersonWindow:
 
     @cached_property
     def _own(self) -> dict[int, int]:
-        """The person's variables that factors may be on, with the number of their joint; -1 for the
-        body's.
+        """Keys of the person's variables on which factors may be, with the index of their joint; -1
+        for variables of the body.
         """
         joint = np.broadcast_to(np.arange(self.state_keys.shape[1])[:, None], self.state_keys.shape)
         body = [key for key in (*self.body_keys.tolist(), self.shape_key) if key >= 0]

@@ -220,29 +220,29 @@ class PersonGraph:
         t, joint, kind = found[0].tolist()
         frame, time_s = int(self.frames[t]), float(self.window.times_s[t])
         if kind == keys.shape[-1] - 1:
-            said = "the joints of the frame do not determine it"
-            return NotDetermined(self.person, "body", frame, time_s, said)
+            missing = "the joints of the frame do not determine it"
+            return NotDetermined(self.person, "body", frame, time_s, missing)
         views = int(self.window.seen[t, joint].sum())
         saw = {0: "no camera saw it", 1: "only one camera saw it"}.get(
             views, f"{views} cameras saw it"
         )
         says = "constrains" if self.window.of_body(t, joint).any() else "does not constrain"
-        said = f"{saw}, and the body {says} it"
-        return NotDetermined(self.person, str(joint_names[joint]), frame, time_s, said)
+        missing = f"{saw}, and the body {says} it"
+        return NotDetermined(self.person, str(joint_names[joint]), frame, time_s, missing)
 
 
 @dataclass(frozen=True)
 class Estimates:
-    """What is known of N rows while they are solved."""
+    """Current estimates of N rows while they are solved."""
 
     joints: Array
-    """(N, J, 3) metres; NaN if unknown."""
+    """(N, J, 3) joints, metres; NaN if unknown."""
     covariance: Array
-    """(N, J, 3, 3) m²; NaN if unknown."""
+    """(N, J, 3, 3) covariances of the joints, m²; NaN if unknown."""
     velocity: Array
-    """(N, J, 3) m/s; NaN if unknown."""
+    """(N, J, 3) velocities, m/s; NaN if unknown."""
     velocity_covariance: Array
-    """(N, J, 3, 3) m²/s²; NaN if unknown."""
+    """(N, J, 3, 3) covariances of the velocities, m²/s²; NaN if unknown."""
     evidence: ViewEvidence
     """The detections at the joints, with those that were used."""
     fit: BodyFit
@@ -263,8 +263,8 @@ class Estimates:
         *,
         held: bool,
     ) -> None:
-        """Add errors that graphs do not have to the covariances: poses of moving cameras, against
-        which bodies hold joints or not (`held`), and exchanged sides.
+        """Add errors that the graphs do not contain to the covariances: those of poses of moving
+        cameras, and of exchanged sides. With `held`, bodies reduce the former.
         """
         if views.carried is not None:
             of_body = np.zeros(self.covariance.shape)

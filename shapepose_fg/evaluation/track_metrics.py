@@ -48,7 +48,7 @@ class TrackFrame(NamedTuple):
 
 @dataclass(frozen=True)
 class TrackMetrics:
-    """Result of `track_metrics`. Shares are NaN if there is nothing to measure."""
+    """Result of `track_metrics`; shares are NaN if there is nothing to measure."""
 
     mota: float
     """1 - (false positives + misses + switches) / true people (CLEAR MOT); may be negative."""

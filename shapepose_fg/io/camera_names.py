@@ -64,13 +64,11 @@ def _one_number_each(names: Sequence[str]) -> list[tuple[str | int, ...]] | None
     return numbers if len(set(numbers)) == len(numbers) else None
 
 
-def told_by_parts(
+def match_by_parts(
     folder: Path, cameras: Sequence[str], paths: Sequence[Path], names: Sequence[str]
 ) -> tuple[list[Path], list[str]] | None:
-    """Return the path of each camera, found in `paths` (called `names`) with `match_names`, and a
-    note about it.
-
-    None if the names do not identify the cameras.
+    """Identify each camera's path among `paths` by its name among `names` (`match_names`); returns
+    the paths and a note. None if the names do not identify the cameras.
     """
     chosen = match_names(cameras, names)
     if chosen is None:

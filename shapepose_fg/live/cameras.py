@@ -25,7 +25,7 @@ this multiple of the median camera's distance."""
 _BACK_M = 0.04
 """Distance below which a camera is used again, m."""
 _CAP_M = 0.5
-"""Maximum of a distance in the average, m."""
+"""Upper limit of a distance in the average, m."""
 _LEAST = 12
 """Minimum number of joints in a picture, and of detections, from which distances are computed: half
 a person."""

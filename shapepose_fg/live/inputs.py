@@ -62,7 +62,7 @@ def feed(where: str | None, rig: Rig, skeleton: Skeleton, note: Note, push: Push
 
 @dataclass(frozen=True)
 class _Given:
-    """The arguments of `feed` that all senders share."""
+    """Arguments of `feed` that are the same for all senders."""
 
     rig: Rig
     skeleton: Skeleton
@@ -97,7 +97,7 @@ class _Sender:
             self._number += 1
 
     def take(self, read: Callable[[str], tuple[Any, ...] | None]) -> None:
-        """Push the result of `read`, called with the next line's name, unless None. Raises
+        """Call `read` with the name of the next line, and push its result unless it is None. Raises
         InputError as `line` does.
         """
         self._number += 1
@@ -213,11 +213,11 @@ def _from_socket(where: str, given: _Given) -> None:
             # another.
             if first.sender.good > 0 and now_s - first.heard_s < 60.0:
                 connection.close()
-                told = f"because {MOST_CLIENTS} clients are connected already"
-                given.note(f"{where}: {name} is rejected, {told}")
+                reason = f"because {MOST_CLIENTS} clients are connected already"
+                given.note(f"{where}: {name} is rejected, {reason}")
                 return
-            told = "and this one was silent for the longest time"
-            cut_off(first, f"at most {MOST_CLIENTS} clients are served, {told}")
+            reason = "and this one was silent for the longest time"
+            cut_off(first, f"at most {MOST_CLIENTS} clients are served, {reason}")
         clients.append(client)
         connection.setblocking(True)
         Thread(target=serve, args=(client,), daemon=True).start()

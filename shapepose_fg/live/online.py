@@ -48,8 +48,8 @@ _BEFORE = 7.0
 With a third of the lag it takes an eighth more time, and errors are 0.04 mm smaller (two stretches
 of split `tune`)."""
 _BEHIND = 3.0
-"""Age of a frame, in lags, at which it is settled without refinement, because solving does not keep
-up."""
+"""Age of a frame, in lags, at which it is settled without refinement, because solving is too
+slow."""
 _OFF_CLOCK = 10
 """Number of consecutive views with a wrong time after which the camera is reported, and frames from
 `push` are accepted."""
@@ -82,7 +82,7 @@ class LiveReport:
     """Number of frames, or detections of one camera, that were left out because they arrived too
     late or twice."""
     unrefined: int
-    """Number of frames that were settled without refinement, because solving did not keep up."""
+    """Number of frames that were settled without refinement, because solving was too slow."""
     not_taken: int
     """Number of settled rows that were not collected in time."""
     jumps: int
@@ -96,7 +96,8 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
     """Tracks people from frame to frame as they come, and refines them within a fixed lag.
 
     A context manager; on exit the worker processes end. `push`, `push_view`, `settled`, `catch_up`,
-    `save` and `close` lock each other out; `people` and `report` never wait and may be called from any thread.
+    `save` and `close` exclude each other; `people` and `report` never wait and may be called from
+    any thread.
     """
 
     def __init__(

@@ -138,9 +138,7 @@ class WindowQueue:
         self._sent.append(_Sent(part, frames, names, own, start))
 
     def came(self, *, wait: bool = False) -> list[Refined]:
-        """Windows that have been solved since the last call, oldest first; with `wait` all of
-        them.
-        """
+        """Windows that were solved since the last call, oldest first; with `wait` all of them."""
         found = []
         while len(self._sent) > 0 and (wait or self._sent[0].part.done()):
             sent = self._sent.popleft()

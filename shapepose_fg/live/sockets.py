@@ -29,8 +29,8 @@ def listen(where: str) -> socket.socket:
 
 
 def accept(listening: socket.socket) -> tuple[socket.socket, str] | None:
-    """The next connection, non-blocking, and its address; None if none waits. Raises OSError if the
-    system has no resources for it.
+    """The next connection, non-blocking, and its address; None if there is none. Raises OSError if
+    the system has no resources for it.
     """
     try:
         client, address = listening.accept()

@@ -82,7 +82,7 @@ class Scheduler:
     processes: int
     """Current number of worker processes."""
     dashboard: str | None
-    """Address of its dashboard; None if there is none."""
+    """Address of the scheduler's dashboard; None if it has none."""
 
 
 @contextmanager
@@ -90,8 +90,8 @@ def local_cluster(count: int, *, dashboard: bool = False) -> Iterator[Scheduler]
     """A cluster of `count` processes on this machine, inaccessible to others, for the duration of
     the block.
 
-    Raises InputError if Dask is not installed. With `dashboard`, and bokeh installed, the scheduler
-    has one.
+    Raises InputError if Dask is not installed. With `dashboard`, the scheduler has a dashboard if
+    bokeh is installed.
     """
     optional("distributed", "cluster")
     # Dask's processes import `__main__`, which fails for some notebooks and scripts: an own process
@@ -102,7 +102,7 @@ def local_cluster(count: int, *, dashboard: bool = False) -> Iterator[Scheduler]
 
 
 _running: list[Any] = []
-"""The cluster of this machine, in its leading process."""
+"""The local cluster, in the process that started it; empty in others."""
 
 
 def _local_cluster(count: int, dashboard: bool) -> Scheduler:

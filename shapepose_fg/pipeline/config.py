@@ -46,11 +46,12 @@ class PeopleConfig(Settings):
     two."""
     most_pairs: Annotated[int, Interval(ge=1000, le=1_000_000)] = 150_000
     """Maximum number of pairs of detections of one joint in a frame; beyond it, each view keeps its
-    most confident detections (18 a view of 30 cameras, 47 of 12, 122 of 5). Increase it for denser
-    crowds, decrease it for detectors with many false positives: time and memory grow with it."""
+    most confident detections (18 a view for 30 cameras, 47 for 12, 122 for 5). Increase it for
+    denser crowds, decrease it for detectors with many false positives: time and memory grow with
+    it."""
     min_probability: Share = 0.3
-    """Minimum probability of a new person. A lower value finds people of whom little is seen, a
-    higher one leaves out more false positives; over time, 0.5 and 0.3 gave F1 95.2 and 95.7 before
+    """Minimum probability of a new person. A lower value finds people who are hardly visible, a
+    higher one leaves out more false positives; over time, 0.5 and 0.3 gave F1 95.2 and 95.7 with
     three and four cameras."""
     min_new_joints: Count = 4
     """Minimum number of core joints (trunk, arms, legs) that two views must see for a new person
@@ -76,7 +77,7 @@ class WindowConfig(Settings):
     little is lost. New people are searched for in keyframes that are 0.3 s or more apart."""
     again_over_time: RepeatsOrNone = 8
     """Rounds of reassociation around the initial estimate of a window, at most; they end when
-    hardly any detection changes. Fewer rounds are faster; with 3, crowds before three cameras lose
+    hardly any detection changes. Fewer rounds are faster; with 3, crowds with three cameras lose
     one to two points of F1."""
     again_alone: RepeatsOrNone = 5
     """Rounds of reassociation of a single frame, at most; 0 for none, as in the paper. Each round
@@ -96,11 +97,11 @@ class SolvingConfig(Settings):
     """
 
     alternations: Repeats = 3
-    """N of Algorithm 1, for the paper's preset, which has 10, and fitters without a body model:
-    maximum number of times that the body is fitted and the joints are solved."""
+    """N of Algorithm 1: maximum number of times that the body is fitted and the joints are solved.
+    Used by the paper's preset, where it is 10, and by fitters without a body model."""
     weight_shape: Factor = 1.0
-    """w_shape of Eq. 5, multiplies the squared distances to the body model: decrease it for people
-    whom it does not fit, in wide clothes or with a load."""
+    """w_shape of Eq. 5, a factor on the squared distances to the body model: decrease it for people
+    whom the model does not fit, in wide clothes or with a load."""
     motion: str = "constant velocity"
     """Motion model of joints, a name in `factors.MOTIONS`: "constant velocity" (white noise on
     acceleration), or "constant acceleration" (on jerk)."""
@@ -125,8 +126,8 @@ class PipelineConfig(Settings):
     """The settings of every step, and the size of batches."""
 
     method: Literal["default", "paper"] = "default"
-    """"paper": the steps as section 3 of the paper has them. `PipelineConfig.paper()` and `config
-    --preset paper` set its numbers, too."""
+    """"paper": the steps of section 3 of the paper. `PipelineConfig.paper()` and `config --preset
+    paper` also set its parameters."""
     people: PeopleConfig = field(default_factory=PeopleConfig)
     """Stage I and tracking: the search for people."""
     observations: ObservationConfig = field(default_factory=ObservationConfig)
@@ -203,33 +204,33 @@ class PipelineConfig(Settings):
 
     @property
     def candidates(self) -> CandidateConfig:
-        """Stage I (b, c): from pairs of views to 3D joint candidates."""
+        """Settings of stage I (b, c): 3D joint candidates from pairs of views."""
         own = self.people
         return replace(self._rules(CandidateConfig), gate_m=own.gate_m, most_pairs=own.most_pairs)
 
     @property
     def proposals(self) -> ProposalConfig:
-        """Stage I (d, e): from candidates to people, and from people to their 2D observations."""
+        """Settings of stage I (d, e): people from candidates, and their 2D observations."""
         return replace(self._rules(ProposalConfig), min_probability=self.people.min_probability)
 
     @property
     def tracking(self) -> TrackingConfig:
-        """Tracking from frame to frame."""
+        """Settings of tracking from frame to frame."""
         return TrackingConfig(self.people.min_new_joints, self.people.patience_s)
 
     @property
     def window_graph(self) -> WindowGraphConfig:
-        """Stage II: the factor graph of a person."""
+        """Settings of the factor graph of a person."""
         return replace(self._rules(WindowGraphConfig), weight_shape=self.solving.weight_shape)
 
     @property
     def refine(self) -> RefineConfig:
-        """Stage II: how bodies and joints are solved together."""
+        """Settings of the joint solution of bodies and joints."""
         return replace(self._rules(RefineConfig), alternations=self.solving.alternations)
 
     @property
     def estimator(self) -> EstimatorConfig:
-        """Stage II."""
+        """All settings of stage II."""
         return EstimatorConfig(
             self.observations, self.window_graph, self.refine, self.motion, self.law
         )

@@ -24,7 +24,8 @@ class Execution:
     """Address of a Dask scheduler to solve on; `local` for `workers` processes of a temporary Dask
     cluster."""
     sharing: int = 1
-    """Number of runs that share the cluster: each keeps its share of work submitted."""
+    """Number of runs that share the cluster; each submits a corresponding share of the items that
+    the cluster has at a time."""
     chunk_frames: int | None = None
     """Length of chunks with people tracked in parallel, frames; identities are joined across the
     borders (`runs/chunks.py`). The result may differ if people are occluded at a border. None: no
@@ -32,11 +33,11 @@ class Execution:
     progress: Progress | None = None
     """Called while frames are solved."""
 
-    def tell(self, frames: int) -> Callable[[int], object]:
+    def progress_over(self, frames: int) -> Callable[[int], object]:
         """A function to be called with the number of frames that are done, out of `frames`."""
         return lambda done: None if self.progress is None else self.progress(done, frames)
 
-    def worth(self, frames: int) -> "Execution":
+    def with_workers(self, frames: int) -> "Execution":
         """Return a copy with a suitable number of workers for this many frames, if none
         is given.
         """
@@ -47,7 +48,7 @@ class Execution:
 
     def pool(self, shared: Shared, frames: int) -> AbstractContextManager[Pool[Shared]]:
         """The processes for solving this many frames, each with `shared`."""
-        count = self.worth(frames).workers or 0
+        count = self.with_workers(frames).workers or 0
         if self.cluster is None:
             return workers(count, shared)
         return cluster(

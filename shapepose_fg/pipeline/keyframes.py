@@ -18,13 +18,13 @@ from shapepose_fg.core.reconstruction import BODY, Known, Reconstruction, Status
 from shapepose_fg.estimation.motion_densities import MotionModel
 
 STRAY_M = 0.03
-"""Deviation of a joint from the cubic between keyframes, m, above which a frame between becomes a
-keyframe."""
+"""Deviation of a joint from the cubic between two keyframes, m, above which a frame between them
+becomes a keyframe."""
 
 
 def spaced(time_s: Array, apart_s: float) -> Mask:
-    """(T,) mask for ascending times: first, last, and as few between as leave no gap longer than
-    `apart_s`.
+    """(T,) mask of frames with ascending times `time_s` (T,): the first, the last, and the fewest
+    others that leave no gap longer than `apart_s`.
     """
     chosen, at, last = np.zeros(len(time_s), dtype=bool), 0, len(time_s) - 1
     reached = np.searchsorted(time_s, time_s + apart_s + 1e-6, side="right") - 1
@@ -36,8 +36,8 @@ def spaced(time_s: Array, apart_s: float) -> Mask:
 
 
 def keyframes(time_s: Array, frames: range, cuts: Sequence[int], apart_s: float) -> Mask:
-    """(T,) mask of keyframes of a recording with times (T,): among the wanted `frames`, as few as
-    leave no gap longer than `apart_s` between cuts; all if that is 0.
+    """(T,) mask of keyframes of a recording with times `time_s` (T,): the fewest of the wanted
+    `frames` that leave no gap longer than `apart_s` between cuts; all of them if `apart_s` is 0.
     """
     chosen = np.ones(len(time_s), dtype=bool)
     for segment in segments(frames, cuts) if apart_s > 0 else ():
@@ -62,15 +62,15 @@ def with_rows_between(
     count = np.diff(keys)[number[after]] - 1
     pair = np.repeat(after, count)
     at = keys[number[pair]] + 1 + np.arange(len(pair)) - np.repeat(np.cumsum(count) - count, count)
-    return _with_carried(rows, order[pair], order[pair + 1], frame[at], time_s[at], motion)
+    return _with_interpolated(rows, order[pair], order[pair + 1], frame[at], time_s[at], motion)
 
 
 def strays_m(joints: Array, velocity: Array, times_s: Array) -> Array:
-    """(T - 1,) largest standard deviation of a person's joints from the cubic, half way between two
-    keyframes, m.
+    """(T - 1,) largest standard deviation of a person's joints around the cubic, half way between
+    two keyframes, m.
 
-    `joints` and `velocity` (T, J, 3), at `times_s` (T,). The deviation is under white noise on the
-    acceleration, with the maximum-likelihood density for the change between the two states.
+    `joints` and `velocity` (T, J, 3), at `times_s` (T,). The standard deviation assumes white noise
+    on the acceleration, with the maximum-likelihood density for the change between the two states.
     """
     lasts_s = np.diff(times_s)[:, None, None]
     moved, turned = np.diff(joints, axis=0) - lasts_s * velocity[:-1], np.diff(velocity, axis=0)
@@ -83,9 +83,9 @@ def strays_m(joints: Array, velocity: Array, times_s: Array) -> Array:
     return np.sqrt(np.nan_to_num(variance).max(axis=1, initial=0.0))
 
 
-def looked_at(rows: Reconstruction) -> Mask:
-    """(N,) rows with a detection in any view, or before the first or after the last such row of
-    their person.
+def tracked_rows(rows: Reconstruction) -> Mask:
+    """(N,) mask of rows in which people were tracked: those with a detection in any view, and those
+    before the first or after the last such row of their person.
     """
     table = rows.observations
     seen = (
@@ -103,8 +103,8 @@ def looked_at(rows: Reconstruction) -> Mask:
 def with_rows_like(
     solved: Reconstruction, rows: Reconstruction, motion: MotionModel
 ) -> Reconstruction:
-    """The `solved` rows, and the interpolated rows between them that `rows` have of the same
-    people.
+    """Add to the `solved` rows those of `rows` that lie between them, for the same people; joints
+    and bodies of the added rows are interpolated.
     """
     width = int(rows.frame.max(initial=0)) + 1
     order = np.lexsort((solved.frame, solved.person))
@@ -114,10 +114,10 @@ def with_rows_like(
     first, second = (order[np.clip(each, 0, len(order) - 1)] for each in (after - 1, after))
     ours = (solved.person[first] == rows.person[new]) & (solved.person[second] == rows.person[new])
     first, second, new = first[ours], second[ours], new[ours]
-    return _with_carried(solved, first, second, rows.frame[new], rows.time_s[new], motion)
+    return _with_interpolated(solved, first, second, rows.frame[new], rows.time_s[new], motion)
 
 
-def _with_carried(
+def _with_interpolated(
     rows: Reconstruction,
     before: Index,
     after: Index,
@@ -125,15 +125,17 @@ def _with_carried(
     time_s: Array,
     motion: MotionModel,
 ) -> Reconstruction:
-    """Add N rows between the rows `before` and `after` (N,); sorted by frame and person."""
+    """Add N rows, interpolated between the rows `before` and `after` (N,); all rows are then sorted
+    by frame and person.
+    """
     if len(frame) == 0:
         return rows
-    between = _carried(rows.rows(before), rows.rows(after), frame, time_s, motion)
+    between = _interpolated(rows.rows(before), rows.rows(after), frame, time_s, motion)
     every = with_bodies_between(Reconstruction.concatenate([rows, between]))
     return every.rows(np.lexsort((every.person, every.frame)))
 
 
-def _carried(
+def _interpolated(
     before: Reconstruction, after: Reconstruction, frame: Whole, time_s: Array, motion: MotionModel
 ) -> Reconstruction:
     """N rows at `time_s` (N,), interpolated between the rows `before` and `after` in adjacent
@@ -198,8 +200,9 @@ def cubic(
 
 
 def with_bodies_between(rows: Reconstruction) -> Reconstruction:
-    """The rows with bodies where they had none, between those of the same person that have one:
-    translations, and rotations as quaternions, are cubics with the slopes of their neighbours.
+    """The rows with interpolated bodies where they had none, between rows of the same person with a
+    body: translations, and rotations as quaternions, are cubics with the slopes of their
+    neighbours.
     """
     columns = {name: getattr(rows, name).copy() for name in BODY}
     status, order = rows.status.copy(), np.lexsort((rows.time_s, rows.person))

@@ -35,7 +35,8 @@ _OFFSETS, _NOISE = "keypoint-offsets", "noise-law"
 NOISE_FRAMES = 60
 """Maximum number of frames for learning the noise law. Shorter recordings use the shipped law."""
 _ENOUGH = 10_000
-"""Number of detections that are enough for either; a crowd has them in about 12 frames."""
+"""Number of detections that suffice for learning the offsets or the noise law; a crowd has them in
+about 12 frames."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ class Sample:
     detections: ThinnedFrames
     """The recording."""
     times: FrameTimes
-    """Times of its frames."""
+    """Times of the recording's frames."""
     _found: list[tuple[Detections, Observations]] = field(default_factory=list, init=False)
 
     def people(self, most: int) -> Iterator[tuple[Detections, Observations]]:
@@ -119,8 +120,8 @@ def _kept(
     make: Callable[[], T],
     of: Callable[[dict[str, Any]], T],
 ) -> T:
-    """What a run has stored under a name, `of` its columns; what `make` returns if there is nothing
-    yet, which is then stored, unless it is None.
+    """Return what a run has stored under `name`, converted from its `columns` by `of`. If nothing
+    is stored yet, the result of `make` is stored, unless it is None, and returned.
     """
     if len(kept.names(name)) > 0:
         with naming(kept.place(name), ANEW):
@@ -177,7 +178,7 @@ def offsets_of(sample: Sample, book: Notebook) -> KeypointOffsets | None:
 
 
 def _enough(frames: Iterable[Observations]) -> list[Observations]:
-    """The first of some frames, with `_ENOUGH` detections together."""
+    """The first of some `frames` that together have `_ENOUGH` detections."""
     found, learnt = list[Observations](), 0
     for each in frames:
         found.append(each)

@@ -50,7 +50,7 @@ class WindowBodies(Rows):
     joints: Array
     """(R, J, 3) joints in the world, metres; NaN if unknown."""
     covariance: Array
-    """(R, J, 3, 3) their covariances, m²."""
+    """(R, J, 3, 3) covariances of the joints, m²."""
     betas: Array
     """(R, 10) shapes; NaN without a body."""
     global_orient: Array
@@ -62,12 +62,12 @@ class WindowBodies(Rows):
 
     @classmethod
     def of(cls, people: Reconstruction) -> "WindowBodies":
-        """The rows of a result."""
+        """Take the columns from a result."""
         return cls(*(getattr(people, name) for name in cls.__dataclass_fields__))
 
     @property
     def body(self) -> BodyParameters:
-        """The bodies."""
+        """The bodies as parameters of the body model."""
         return BodyParameters(self.betas, self.global_orient, self.body_pose, self.transl)
 
 
@@ -76,14 +76,14 @@ class ShapeEvidence:
     """Information of rows about a person's shape, without a prior."""
 
     information: Array = field(default_factory=lambda: np.zeros((10, 10)))
-    """(10, 10) sum of the information of all rows on the betas."""
+    """(10, 10) information on the betas, summed over all rows."""
     pull: Array = field(default_factory=lambda: np.zeros(10))
-    """(10,) sum of information times betas."""
+    """(10,) information times betas, summed over all rows."""
     count: int = 0
     """Number of rows."""
     looks: set[int] = field(default_factory=set)
-    """Intervals of `LOOK_S` with rows. Errors of joints last as long: together, the rows of an
-    interval are one measurement of the shape."""
+    """Numbers of the intervals, `LOOK_S` long, in which there are rows. Errors of joints are
+    correlated as long, so all rows of an interval count as one measurement of the shape."""
 
     def add(self, other: "ShapeEvidence") -> None:
         """Add the evidence of other rows."""
@@ -94,13 +94,15 @@ class ShapeEvidence:
 
     @property
     def measured(self) -> tuple[Array, Array]:
-        """Information (10, 10) of all intervals, and information times betas (10,)."""
+        """Information on the betas (10, 10), and information times betas (10,), if each interval
+        counts as one measurement.
+        """
         share = min(len(self.looks) / max(self.count, 1), 1.0)
         return share * self.information, share * self.pull
 
 
 def _evidence(model: BodyModel, sigma_m: float, rows: WindowBodies) -> dict[int, ShapeEvidence]:
-    """The evidence of rows on the shapes of their people."""
+    """Information of the rows on the shape of each person, by person number."""
     found, energy = dict[int, ShapeEvidence](), BodyEnergy(model, PosePrior.default())
     for some, mine, free in _batches(rows, energy):
         count, known = len(some), JointTargets.solved(mine.joints, mine.covariance)
@@ -108,11 +110,11 @@ def _evidence(model: BodyModel, sigma_m: float, rows: WindowBodies) -> dict[int,
         targets = EnergyTargets(xyz, weigh(known, sigma_m).information)
         held = Held(np.zeros((count, 10)), np.ones(count), free[:, 13:-3])
         body = energy.evaluate(free, targets, _NOT_ROBUST, held, nothing(count))
-        said = np.linalg.inv(body.covariances()[1]) - np.eye(10)
-        pull = (said @ free[:, :10, None])[..., 0]
+        information = np.linalg.inv(body.covariances()[1]) - np.eye(10)
+        pull = (information @ free[:, :10, None])[..., 0]
         looks = (mine.time_s // LOOK_S).astype(np.int64).tolist()
         for n, number in enumerate(mine.person.tolist()):
-            each = ShapeEvidence(said[n], pull[n], 1, {looks[n]})
+            each = ShapeEvidence(information[n], pull[n], 1, {looks[n]})
             found.setdefault(number, ShapeEvidence()).add(each)
     return found
 
@@ -147,10 +149,10 @@ def combined(
 def _with_shape(
     model: BodyModel, sigma_m: float, job: tuple[WindowBodies, Mapping[int, Array], Floor | None]
 ) -> dict[str, Array]:
-    """The bodies of rows with the shapes of their people, by number, by column.
+    """Columns of the rows' bodies, with the shapes that the job gives by person number.
 
     Poses change so that joints of bodies stay; no body sinks into the floor. Rows without a body
-    stay so.
+    do not change.
     """
     rows, known, floor = job
     betas = np.array([known[number] for number in rows.person.tolist()]).reshape(-1, 10)
@@ -186,8 +188,9 @@ def _batches(rows: WindowBodies, energy: BodyEnergy) -> Iterator[tuple[Index, Wi
 
 
 Mapped = Callable[[Callable[[BodyModel, float, Any], Any], Iterable[Any]], Iterator[Any]]
-"""`map` over items, in any processes, of a function of a body model, the standard deviation of a
-detector's joint from the body's (metres), and an item."""
+"""Applies a function to all items, in any processes, and yields the results in order, as `map`
+does. The function gets the body model, the standard deviation of a detector's joint from the body's
+(metres), and an item."""
 
 
 def bodies_with_shapes(

@@ -62,7 +62,7 @@ def reconstruct(
     Frames are separate if `config.temporal` is false.
 
     `frames` selects frames of the recording (default: all). `times` are the times of the frames.
-    Without it, 30 frames per second are assumed, and `run` says so. `cuts` are the first frames
+    Without them, 30 frames per second are assumed, and `run` says so. `cuts` are the first frames
     after cuts. No states or identities are carried over a cut. `shapes` are people known from other
     recordings. `fitter` replaces the body fitter. `extra_factors`, one function or several, adds
     your own factors to every person's window; they may connect people (docs/extending.md), and
@@ -82,11 +82,11 @@ def reconstruct(
     task = Task(detections, rig, config, frames, times, cuts, shapes, fitter, extra_factors)
     kept = InMemory()
     people = reconstruct_parts(kept, task, execution).reconstruction(consume=True)
-    for name, told in people.run.get("extra_factors", {}).items():
-        if told["made"] == told["inactive"]:
+    for name, counts in people.run.get("extra_factors", {}).items():
+        if counts["made"] == counts["inactive"]:
             what = (
                 "is active, because joints that they need have no position"
-                if told["made"] > 0
+                if counts["made"] > 0
                 else "was made"
             )
             warnings.warn(f"extra_factors: {name}: none of its factors {what}", stacklevel=2)
@@ -106,11 +106,11 @@ def refine_trajectories(
     """Refine the trajectories of moving cameras with the people that the cameras see; returns the
     rig, with covariances.
 
-    `reconstruct` does this first where cameras move; given the rig that this returns, it uses the
-    poses as they are. People constrain a pose where two cameras see them that do not move together;
-    elsewhere the odometry is used. Where no camera stands still the world is that in which the
-    first carrier starts. `camera_factors` add your own factors on the carriers' poses. Poses of
-    separate frames (`config.temporal` false) are used as they are.
+    `reconstruct` does this first where cameras move; it does not refine the returned rig again.
+    People constrain a pose where two cameras see them that do not move together; elsewhere the
+    odometry is used. If all cameras move, the world is the frame of the first carrier at the start.
+    `camera_factors` add your own factors on the carriers' poses. Poses of separate frames
+    (`config.temporal` false) are used as they are.
     """
     config = PipelineConfig() if config is None else config
     task = Task(detections, rig, config, frames, times, cuts, camera_factors=camera_factors)
@@ -185,7 +185,7 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
         if fitter is None:
             fitter = make_fitter(config.body, BodyModel.default().with_keypoints(skeleton.joints))
         check_fitter(fitter)
-    tell, passes = execution.tell(len(frames)), 1 + (unrefined(rig) and config.temporal)
+    tell, passes = execution.progress_over(len(frames)), 1 + (unrefined(rig) and config.temporal)
     setup = Setup(rig, skeleton, config, fitter, task.extra_factors)
     setup = _with_refined(kept, task, setup, book, lambda done: tell(done // passes))
     sample = Sample(setup, detections, times)
@@ -251,7 +251,7 @@ def _with_refined(
     book: Notebook,
     tell: Callable[[int], object] = lambda done: None,
 ) -> Setup:
-    """The set-up with refined trajectories for moving cameras; a run stores them. `tell` gets the
+    """The set-up with refined trajectories for moving cameras; the run stores them. `tell` gets the
     number of frames that are done.
     """
     rig, config = setup.rig, setup.config
@@ -292,7 +292,7 @@ def _with_person_shapes(
 
 
 def _on_bodies(setup: Setup, job: tuple[Callable[[Any, float, Any], Any], Any]) -> Any:
-    """A function of the body model on a part's bodies, in any process."""
+    """Apply the job's function to its part, with the body model, in any process."""
     return job[0](setup.fitter.model, setup.config.body.model_sigma_m, job[1])
 
 

@@ -51,7 +51,7 @@ class Setup:
     config: PipelineConfig
     """The settings."""
     fitter: BodyFitter
-    """Fits bodies."""
+    """Fitter of the bodies."""
     extra_factors: ExtraFactors | None = None
     """The user's own factors."""
     noise: NoiseLaw = field(default_factory=NoiseLaw.shipped)
@@ -95,8 +95,8 @@ class Setup:
     def _with_rows_between(
         self, span: Span, whole: WindowSolution, solved: Reconstruction, notes: Notes
     ) -> Part:
-        """The own rows of a window of which only keyframes are `solved`, with those of the frames
-        between; frames in which people do not follow the motion model are solved, too.
+        """The rows of a window's own frames: those of keyframes are `solved`, the others are
+        interpolated. Frames in which people do not follow the motion model are solved, too.
         """
         every = [frame for frame, _ in span.decided]
         frame, key = (np.array([getattr(each, of) for each in every]) for of in ("frame", "key"))
@@ -142,13 +142,15 @@ class Setup:
             longest_bones(skeleton), motion.density(np.full(len(skeleton), FAST_M_S), UNSEEN_S), law
         )
         find = (sure, hips) if config.temporal else (sure,)
-        told = {"fitter": self.fitter, "drop": book.drop_in, "search": book.search}
-        return Engine(Tracker(skeleton, scale, find, tracking, config.observations, **told), config)
+        options = {"fitter": self.fitter, "drop": book.drop_in, "search": book.search}
+        return Engine(
+            Tracker(skeleton, scale, find, tracking, config.observations, **options), config
+        )
 
 
 def _doubted(solution: WindowSolution, doubted: Mapping[int, tuple[int, ...]]) -> NDArray[np.str_]:
-    """Statuses (N,) with cameras doubted in some frames: changed for rows without `LEAST_JOINTS` in
-    two other views.
+    """(N,) statuses, if cameras are `doubted` in some frames: `CONTRADICTED` for rows that do not
+    have `LEAST_JOINTS` joints seen by two other views.
     """
     used = solution.inlier.copy()
     for row, frame in enumerate(solution.observations.frame.tolist()):
@@ -160,7 +162,9 @@ def _doubted(solution: WindowSolution, doubted: Mapping[int, tuple[int, ...]]) -
 
 
 def _of_frames(whole: WindowSolution, frames: set[int], *, numbered: bool) -> WindowSolution:
-    """The rows of some frames, by frame and person, who may be `numbered` within each frame."""
+    """The rows of some frames, sorted by frame and person; with `numbered`, people are numbered
+    from 0 within each frame.
+    """
     found = whole.observations
     by_person = np.lexsort((found.track, found.frame))
     solution = whole.rows(by_person[np.isin(found.frame[by_person], list(frames))])
@@ -173,17 +177,17 @@ def _of_frames(whole: WindowSolution, frames: set[int], *, numbered: bool) -> Wi
 
 
 def _notes(solution: WindowSolution, frames: int, over_time: bool) -> Notes:
-    """Notes about a window of so many own `frames`."""
-    told = {"problems": list(solution.problems), "factors": solution.factors}
-    notes = Notes(frames, dict(solution.seconds), **told)
+    """Notes about a window with this number of own `frames`."""
+    content = {"problems": list(solution.problems), "factors": solution.factors}
+    notes = Notes(frames, dict(solution.seconds), **content)
     rows = solution.observations
-    said = np.isfinite(rows.evidence)
+    known = np.isfinite(rows.evidence)
     if over_time:
-        for track in np.unique(rows.track[said]).tolist():
-            evidence = rows.evidence[said & (rows.track == track)]
+        for track in np.unique(rows.track[known]).tolist():
+            evidence = rows.evidence[known & (rows.track == track)]
             notes.evidence[track] = float(evidence.sum()), len(evidence)
     else:
-        tenths = (f"{tenth / 10:.1f}" for tenth in np.floor(10 * rows.evidence[said]))
+        tenths = (f"{tenth / 10:.1f}" for tenth in np.floor(10 * rows.evidence[known]))
         notes.probable = dict(Counter(tenths))
     return notes
 

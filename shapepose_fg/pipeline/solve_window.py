@@ -30,8 +30,8 @@ _SETTLED = 0.002
 """Share of changed detections below which reassociation ends: in crowds after three or four rounds
 with six cameras, after eight or more with three."""
 _CHANGED_S, _SMOOTHED_S = 0.2, 0.5
-"""Time around a changed detection, s, in which others may change in the next round, and in which
-joints are estimated anew for that."""
+"""Time around a changed detection, s: within the first one, others may change in the next round;
+within the second one, joints are estimated again."""
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from shapepose_fg.proposal.thinning import ThinnedFrames
 
 @dataclass(frozen=True)
 class SolvedWindows:
-    """Windows of a recording: source and solution."""
+    """Tracks people through a recording, and solves its windows."""
 
     setup: Setup
     """Data shared by all processes."""
@@ -63,13 +63,15 @@ class SolvedWindows:
             found = self.detections[frame] if key else self.pictures[frame]
             # With more detections than people could explain, associations are chance.
             doubted = tuple(range(len(self.setup.rig))) if thinned else trust.in_doubt(frame)
-            said = tuple(sorted({*repeated, *trust.dark(frame)})), doubted
+            views = tuple(sorted({*repeated, *trust.dark(frame)})), doubted
             if self.setup.rig.moves:
-                rig = replace(self.setup.rig.at(self._time_s[frame]), dark=said[0], doubted=said[1])
+                rig = replace(
+                    self.setup.rig.at(self._time_s[frame]), dark=views[0], doubted=views[1]
+                )
                 return Input(frame, self._time_s[frame], found, rig, key)
-            if said not in self._rigs:
-                self._rigs[said] = replace(self.setup.rig, dark=said[0], doubted=said[1])
-            return Input(frame, self._time_s[frame], found, self._rigs[said], key)
+            if views not in self._rigs:
+                self._rigs[views] = replace(self.setup.rig, dark=views[0], doubted=views[1])
+            return Input(frame, self._time_s[frame], found, self._rigs[views], key)
 
     def after(
         self, begin: Checkpoint | None, pool: Pool[Setup], chunk_frames: int | None

@@ -101,7 +101,7 @@ def about(given: Rig, refined: Rig) -> list[dict[str, Any]]:
     """The entry of run.json about trajectories: cameras, length, corrections, standard
     deviations.
     """
-    told = []
+    entries = []
     for number, (old, new) in enumerate(zip(given.trajectories, refined.trajectories, strict=True)):
         cameras = [
             name for name, on in zip(given.names, given.carrier, strict=True) if on == number
@@ -110,7 +110,7 @@ def about(given: Rig, refined: Rig) -> list[dict[str, Any]]:
         moved = np.linalg.norm(new.wTb[:, :3, 3] - was[:, :3, 3], axis=1)
         turned = rotation_angle(new.wTb[:, :3, :3] @ was[:, :3, :3].mT)
         variance = np.einsum("tii->ti", covariance)
-        told.append(
+        entries.append(
             {
                 "carrier": new.name,
                 "cameras": cameras,
@@ -126,7 +126,7 @@ def about(given: Rig, refined: Rig) -> list[dict[str, Any]]:
                 ),
             }
         )
-    return told
+    return entries
 
 
 @dataclass

@@ -78,7 +78,7 @@ class StreamState:
 
 @dataclass(frozen=True)
 class Engine:
-    """From frames to windows with tracked people."""
+    """Tracks people through frames, and divides these into windows."""
 
     tracker: Tracker
     """Tracks people and finds new ones."""

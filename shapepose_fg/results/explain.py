@@ -69,7 +69,7 @@ def explain(
         raise InputError(
             "the cameras are not those of observations.npz; give the cameras of the reconstruction"
         )
-    told = entries_of(people.run)
+    entries = entries_of(people.run)
     row = _row_of(people, person, frame, time_s)
     names, frame = people.joint_names.tolist(), int(people.frame[row])
     if joint not in names:
@@ -85,9 +85,9 @@ def explain(
     place, known = people.joints[row, number], np.isfinite(people.joints[row, number]).all()
     sigma, when = float(sigma_m(people.covariance[row, number])), float(people.time_s[row])
     refused = _refused(around, at, number, detections)
-    findings = _findings(people, told, row, number, views, factors, shares, refused)
+    findings = _findings(people, entries, row, number, views, factors, shares, refused)
     given = {name_of(function) for function in functions_of(extra_factors)}
-    missing = tuple(name for name in told.extra_factors if name not in given)
+    missing = tuple(name for name in entries.extra_factors if name not in given)
     return Explanation(
         person, joint, frame, round(when, 6) if np.isfinite(when) else None,
         tuple(place.tolist()) if known else None, sigma if known and np.isfinite(sigma) else None,
@@ -232,7 +232,7 @@ def _view_reasons(
             looks_like=like,
         )
         reasons.append(reason)
-    told = dict[tuple[str, tuple[str, ...]], float]()
+    factor_shares = dict[tuple[str, tuple[str, ...]], float]()
     for each, share in zip(evidence, shares[len(gates) :], strict=False):
         tied = ((who, people.joint_names[number]) for who, number, _ in each.others)
         mine = int(people.person[row])
@@ -241,8 +241,8 @@ def _view_reasons(
                 str(name) if who == mine else f"person {who}'s {name}" for who, name in tied
             )
         )
-        told[each.name, others] = told.get((each.name, others), 0.0) + share
-    factors = tuple(FactorReason(*which, share) for which, share in told.items())
+        factor_shares[each.name, others] = factor_shares.get((each.name, others), 0.0) + share
+    factors = tuple(FactorReason(*which, share) for which, share in factor_shares.items())
     return tuple(reasons), factors, (shares[-2], shares[-1])
 
 
@@ -328,8 +328,8 @@ def _findings(
     problem = _problem(people, run, row, joint)
     if problem:
         found.append(Finding(Cause.NOT_SOLVED, (), f"It was not solved: {problem}."))
-    told = _checked(people, run, row)
-    found += [each for each in told if each.cause == Cause.WRONG_CAMERA]
+    checked = _checked(people, run, row)
+    found += [each for each in checked if each.cause == Cause.WRONG_CAMERA]
     left = [view for view in views if view.gate not in (GATES[Gate.USED], GATES[Gate.NOT_SEEN])]
     suspects = [
         view
@@ -345,7 +345,7 @@ def _findings(
             found.append(Finding(Cause.FOREIGN, (view.camera,), words))
     named = {name for each in found for name in each.cameras}
     suspects = [view for view in suspects if view.camera not in named]
-    found += [each for each in told if each.cause == Cause.CONTRADICTION]
+    found += [each for each in checked if each.cause == Cause.CONTRADICTION]
     against = [view for view in suspects if view.gate == GATES[Gate.CONTRADICTS_BODY]]
     doubted = [view for view in suspects if view in used and (view.off_sigma or 0.0) > OFF_SIGMA]
     agree = [view for view in used if view not in doubted]
@@ -384,35 +384,35 @@ def _findings(
     return tuple(found)
 
 
-def _problem(people: Reconstruction, told: RunEntries, row: int, joint: int) -> str:
-    """The problem with a joint as run.json states it; empty where there was none."""
+def _problem(people: Reconstruction, entries: RunEntries, row: int, joint: int) -> str:
+    """The problem with a joint as run.json states it; empty if there was none."""
     here = int(people.person[row]), int(people.frame[row]), str(people.joint_names[joint])
-    problems = told.people.problems
+    problems = entries.people.problems
     return next(
         (each.reason for each in problems if (each.person, each.frame, each.joint) == here), ""
     )
 
 
-def _checked(people: Reconstruction, told: RunEntries, row: int) -> list[Finding]:
-    """What the set-up check found wrong with single cameras, according to run.json: excluded from a
-    row's frame, doubted in it, or used nevertheless.
+def _checked(people: Reconstruction, entries: RunEntries, row: int) -> list[Finding]:
+    """Cameras in which the set-up check found an error, according to run.json: excluded from a
+    row's frame, doubted in it, or used nevertheless; in words.
     """
     found, frame = list[Finding](), people.frame[row]
     for spells, cause, fate in (
-        (told.setup.left_out, Cause.WRONG_CAMERA, "left out"),
-        (told.setup.doubted, Cause.CONTRADICTION, "doubted"),
+        (entries.setup.left_out, Cause.WRONG_CAMERA, "left out"),
+        (entries.setup.doubted, Cause.CONTRADICTION, "doubted"),
     ):
         those = tuple(each.camera for each in spells if each.frames[0] <= frame < each.frames[1])
-        says = "; ".join(each.says for each in told.setup.findings if {*each.cameras} & {*those})
+        says = "; ".join(each.says for each in entries.setup.findings if {*each.cameras} & {*those})
         if those:
             words = (
                 f"In the set-up check, {_cameras(those)} "
                 f"{'were' if len(those) > 1 else 'was'} {fate}: {says}."
             )
             found.append(Finding(cause, those, words))
-    judged = {each.camera for each in (*told.setup.left_out, *told.setup.doubted)}
+    judged = {each.camera for each in (*entries.setup.left_out, *entries.setup.doubted)}
     assert people.observations is not None
-    for each in told.setup.findings:
+    for each in entries.setup.findings:
         some = 0 < len(each.cameras) < len(people.observations.view_names)
         if some and not judged & {*each.cameras}:
             words = f"The set-up check says: {each.says}."

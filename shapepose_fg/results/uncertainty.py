@@ -50,7 +50,7 @@ _NODES, _WIDE = 24, 6.0
 """Number of nodes of the quadrature per axis, and its range in standard deviations on
 either side."""
 _SCALES = 4
-"""Number of Gaussians whose mixture Student's t is."""
+"""Number of Gaussians in the mixture that represents Student's t."""
 _STEPS = 64
 """Number of limits at which a distance's distribution is tabulated for quantiles."""
 
@@ -445,10 +445,10 @@ def _paces(people: Reconstruction, rows: Index, joints: Index) -> Array:
             lasts[mine] = moments(people.time_s[mine])[2]
     own = np.trace(people.covariance[rows, joints], axis1=-2, axis2=-1)
     speed = np.trace(people.velocity_covariance[rows, joints], axis1=-2, axis2=-1)
-    said = 1 - speed * lasts[rows] ** 2 / (2 * own)
+    correlated = 1 - speed * lasts[rows] ** 2 / (2 * own)
     usual_s = np.geomspace(1e-4, 10.0, 200)
-    at_s = np.interp(-said, -_over_time(usual_s), usual_s)
-    return np.where(np.isfinite(said), np.maximum(at_s / lasts[rows], 1.0), 1.0)
+    at_s = np.interp(-correlated, -_over_time(usual_s), usual_s)
+    return np.where(np.isfinite(correlated), np.maximum(at_s / lasts[rows], 1.0), 1.0)
 
 
 def _together(one: str, other: str) -> float:

@@ -67,17 +67,17 @@ class FalseCandidates(Rows):
 
     view: Index
     person: Index
-    """(F,) index of the person that it moves with; -1 for none."""
+    """(F,) index of the person that a false candidate moves with; -1 for none."""
     anchor: Index
-    """(F,) joint relative to which it is fixed."""
+    """(F,) joint relative to which a false candidate is fixed."""
     joint: Index
-    """(F,) joint that it is reported as."""
+    """(F,) joint that a false candidate is reported as."""
     offset: Array
     """(F, 2) offset from the anchor, metres, or position as a share of the image."""
     rank: Array
-    """(F,) quantile of its confidence."""
+    """(F,) quantile of the confidence of a false candidate."""
     stays: Array
-    """(F,) probability of persisting to the next frame."""
+    """(F,) probability that a false candidate persists to the next frame."""
 
 
 class FalseCandidateProcess:
@@ -124,7 +124,9 @@ class FalseCandidateProcess:
         return self._present_now
 
     def _born(self, rng: np.random.Generator, rate: Array) -> FalseCandidates:
-        """Draw new ones with Poisson `rate` (3, 2): by duration, near people and elsewhere."""
+        """Draw new false candidates with Poisson `rate` (3, 2): by duration, near people and
+        elsewhere.
+        """
         kind = np.repeat(np.arange(6), rng.poisson(rate).ravel())
         stays, far = self._stays[kind // 2], kind % 2 == 1
         count = len(kind)
@@ -239,8 +241,8 @@ def _pairs(view: Index, joint: Index, views: int) -> tuple[Index, Index, Index]:
 
 
 def _detour(found: Candidates, near: Index, far: Index, true_xy: Array) -> Array:
-    """(E,) distance of candidates `far` from the true joint of the owners of `near`, in limb
-    lengths; inf for none.
+    """(E,) distance of each candidate `far` from the true joint, of the same kind, of the person
+    who owns the candidate `near`, in limb lengths; infinite if that has no owner.
     """
     if found.owner.shape[1] == 0:
         return np.full(len(near), np.inf)

@@ -80,7 +80,7 @@ class DetectorStatistics:
     double: float
     """Share of the swapped joints that are reported under both names."""
     double_m: float
-    """Standard deviation of each coordinate of the distance between the two, m."""
+    """Standard deviation of each coordinate of the distance between the two detections, m."""
     double_confidence: Array
     """(K,) quantiles of the confidence of the wrongly named detection."""
     capture_gap_m: Array

@@ -34,11 +34,11 @@ _ROUNDS = 2
 """Maximum number of rounds of tracking again."""
 _ALIKE = 0.95
 """Agreement of detections above which two selections count as one. The best selection is tracked
-again, and the best different one: on ten simulated recordings, most before three cameras, IDF1 is
+again, and the best different one: on ten simulated recordings, most with three cameras, IDF1 is
 95.0 (92.8 without; 95.2 with two others, at twice the time)."""
 _PLAIN = 0.25
-"""Minimum evidence per second, over any window of `SEARCH_S`, of a person to whom no
-alternatives are sought; in simulated crowds, they are found only for people with less."""
+"""Minimum evidence per second, over any window of `SEARCH_S`, of a person for whom no alternatives
+are sought; in simulated crowds, they are found only for people with less."""
 _SAME_M = 0.02
 """Maximum distance between joints of two global hypotheses with the same detections for these to
 be merged, m."""
@@ -49,7 +49,7 @@ class Hypotheses:
     """H track hypotheses through T frames."""
 
     carried: NDArray[np.intp]
-    """(H,) index of the carried person that each track continues; -1 for none."""
+    """(H,) index of the person of the previous frame that each track continues; -1 for none."""
     world: NDArray[np.intp]
     """(H,) global hypothesis to which each track belongs."""
     there: NDArray[np.bool_]
@@ -63,7 +63,7 @@ class Hypotheses:
     price: NDArray[np.float32]
     """(H, T) price of presence (`weighed`)."""
     joints: JointStates
-    """(H, J) states of the joints in the frame from which people are carried on."""
+    """(H, J) states of the joints in the frame from which tracking continues."""
     counts: NDArray[np.intp]
     """(T,) number of detections in each frame."""
     lasts_s: Array
@@ -116,8 +116,8 @@ def explained(
 ) -> tuple[Hypotheses, SelectedTracks]:
     """Track hypotheses of T frames, and the best selection of them.
 
-    `carried` are the people of the frame before; `keep` is the index of the frame from which they
-    are carried on.
+    `carried` are the people of the frame before; `keep` is the index of the frame from which
+    tracking continues later.
     """
     times, unseen = (
         times_of(frames),
@@ -175,8 +175,8 @@ class Rest:
         candidate: NDArray[np.int32] | None = None,
         places: Array | None = None,
     ) -> "Rest":
-        """What people with detections `candidate` (K, T, J, V), -1 for none, at `places` leave; by
-        default, nobody is tracked already.
+        """Remove the detections `candidate` (K, T, J, V), -1 for none, of people at `places` from
+        the frames; by default, nobody is tracked already.
         """
         if candidate is None or places is None or len(candidate) == 0:
             index = [np.append(np.arange(len(frame.detections)), -1) for frame in frames]
@@ -254,17 +254,17 @@ def _restarts(
     """
     T = len(frames)
     placed = np.isfinite(found.places[chosen.hypothesis]).all(axis=-1).any(axis=-1)
-    there = np.array([chosen.during(t) for t in range(T)]).T & placed
+    present = np.array([chosen.during(t) for t in range(T)]).T & placed
     share = found.weight[chosen.hypothesis].sum(axis=(2, 3))
-    worth = np.where(there, share, -0.5).sum(axis=0)
+    visibility = np.where(present, share, -0.5).sum(axis=0)
     parts = np.array_split(np.arange(T), min(T, max(1, round((times[-1] - times[0]) / _RESTART_S))))
     seeds = []
     for part in parts:
-        key = int(part[worth[part].argmax()])
-        who = chosen.hypothesis[there[:, key]]
-        if len(who) > 0:
-            own = found.candidate[who, key].astype(np.intp)
-            seeds.append(_seed(tracker, frames, key, found.places[who, key], own))
+        key = int(part[visibility[part].argmax()])
+        hypotheses = chosen.hypothesis[present[:, key]]
+        if len(hypotheses) > 0:
+            own = found.candidate[hypotheses, key].astype(np.intp)
+            seeds.append(_seed(tracker, frames, key, found.places[hypotheses, key], own))
     return seeds
 
 

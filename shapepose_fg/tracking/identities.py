@@ -175,8 +175,8 @@ def observed(
         np.full(len(track), given.frame),
         np.repeat(given.time_s[None], len(track), axis=0),
     )
-    told = {"track": track, "frame": frame, "time_s": time_s, "evidence": evidence}
-    return Observations.of(candidate, given.detections, places, **told)
+    columns = {"track": track, "frame": frame, "time_s": time_s, "evidence": evidence}
+    return Observations.of(candidate, given.detections, places, **columns)
 
 
 def _identities(

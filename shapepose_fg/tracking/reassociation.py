@@ -43,15 +43,15 @@ def reassociate(
         index = np.flatnonzero(rows.frame == frame.frame)
         if least is not None:
             index = index[np.isfinite(sigma_m[index]).any(axis=1)]
-        candidate, probability = _given_out(frame, joints[index], sigma_m[index], skeleton)
+        candidate, probability = _reassigned(frame, joints[index], sigma_m[index], skeleton)
         evidence = rows.evidence[index]
         while least is not None and len(index) > 0:
             evidence = probabilities_of(frame, candidate, joints[index], skeleton)
-            gone = who_goes(evidence, joints[index], skeleton, least)
+            gone = people_to_remove(evidence, joints[index], skeleton, least)
             if not gone.any():
                 break
             index, evidence = index[~gone], evidence[~gone]
-            candidate, probability = _given_out(frame, joints[index], sigma_m[index], skeleton)
+            candidate, probability = _reassigned(frame, joints[index], sigma_m[index], skeleton)
         who = {name: getattr(rows, name)[index] for name in ("track", "frame", "time_s")}
         sure = {"probability": probability, "evidence": evidence}
         parts.append(Observations.of(candidate, frame.detections, joints[index], **who, **sure))
@@ -59,16 +59,16 @@ def reassociate(
 
 
 def changed(before: Observations, now: Observations) -> Mask:
-    """(N, J, V) detection slots, used before or now in the same rows, that hold another detection
-    now.
+    """(N, J, V) mask of detections that differ between the same rows `before` and `now`, where
+    either has one.
     """
     return np.asarray((before.candidate != now.candidate) & (before.seen | now.seen))
 
 
-def _given_out(
+def _reassigned(
     frame: Input, joints: Array, sigma_m: Array, skeleton: Skeleton
 ) -> tuple[Index, Array]:
-    """(P, J, V) detections assigned to one frame's people, and their probabilities."""
+    """(P, J, V) detections assigned to the people of one frame, and their probabilities."""
     predicted = Predicted(joints, sigma_m, lost=~np.isfinite(sigma_m))
     return assign_with_probability(predicted, FrameArrays.of(frame.detections, frame.rig, skeleton))
 
@@ -81,7 +81,7 @@ def probabilities_of(frame: Input, candidate: Index, joints: Array, skeleton: Sk
     )
 
 
-def who_goes(
+def people_to_remove(
     sure: Array, joints: Array, skeleton: Skeleton, least: float, double_m: float = SAME_M
 ) -> Mask:
     """(P,) whether to remove: the least probable person below `least`, and the less probable of

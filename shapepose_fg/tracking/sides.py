@@ -36,7 +36,7 @@ _FITS = 3.0
 _EXCHANGED = 0.02
 """Probability that a view swaps the sides of a person or a part; on Shelf, 22 of 1,573 times."""
 _SURE = 6.0
-"""Minimum log-odds for correcting a swap. The mean error of three crowds before three cameras is 43
+"""Minimum log-odds for correcting a swap. The mean error of three crowds with three cameras is 43
 mm with 6, 54 mm with 0, and 40 mm without any swaps in the data. A memory of each view's earlier
 swaps makes it worse."""
 _AGREES = 0.99
@@ -56,10 +56,10 @@ class _Compared:
     groups: Sequence[Index]
     """(G) indices of the detections of each 2D person."""
     who: Index
-    """(G,) number of the matched person; -1 for none."""
+    """(G,) number of the person that each 2D person matches; -1 for none."""
     log: Array
-    """(G, S) log-probability of each of the `exchanges`: which parts this view has swapped against
-    the prediction."""
+    """(G, S) log-probability that this view has swapped the sides of each combination of parts
+    (`exchanges`) against the prediction."""
 
     @classmethod
     def of(cls, given: Input, ids: Index, joints: JointStates, skeleton: Skeleton) -> "_Compared":
@@ -283,7 +283,7 @@ def _doubtful(doubt: Array, skeleton: Skeleton) -> bool:
     wrong.
 
     Joints in the middle count with the last part; counting them as certain is worse in a crowd
-    before three cameras. Such a person may mix views, or people, that contradict each other, and is
+    with three cameras. Such a person may mix views, or people, that contradict each other, and is
     not corrected.
     """
     return bool(np.median(doubt[paired_parts(skeleton) - 1]) > DOUBTED)

@@ -23,7 +23,7 @@ joint."""
 _PRICE_HIDDEN = 0.05
 """Cost where the joint is occluded by another person, or its position unknown. With these costs a
 person is accepted if a quarter of the unoccluded joints have detections of their own. In simulated
-crowds of eight before three cameras (seeds 6101, 6104), 76 % of unoccluded joints have a detection,
+crowds of eight with three cameras (seeds 6101, 6104), 76 % of unoccluded joints have a detection,
 and 20 % of those behind a limb."""
 _LIMB_M = 0.12
 """Distance from a limb or spine of another person, m, within which a joint's ray is occluded."""
@@ -45,7 +45,7 @@ _ON_TRIAL = 0.25
 the others they may gain evidence."""
 _SCALE, _PRIOR = 13.7, -0.6
 """Scale and offset of the log-odds of a person's existence by evidence: logistic fit to 482 people,
-11 of them false positives or duplicates, in simulated crowds, crossings and pairs before two to
+11 of them false positives or duplicates, in simulated crowds, crossings and pairs with two to
 four cameras. A track's duration adds nothing. On 364 others, predicted probabilities 0.74 / 0.87 /
 0.96 / 0.996 were correct for 8 of 11, 19 of 20, 70 of 70 and 263 of 263."""
 _EVEN = -_PRIOR / _SCALE

@@ -38,7 +38,7 @@ SEARCH_S = 0.3
 """Interval between searches for new people in each global hypothesis, and between comparisons of a
 track with a body, s; half that between searches among all detections. In a global hypothesis that
 lacks a person, the others take that person's detections, so every global hypothesis is searched: in
-crowds before three cameras this finds two to six more people of a hundred."""
+crowds with three cameras this finds two to six more people of a hundred."""
 _APART_M = 0.25
 """Minimum mean distance of a new person's joints from any track's, m; nearer is the same person."""
 _BIRTH_SIGMA_M = 0.04

@@ -150,7 +150,8 @@ class BodyEnergy:
         return np.concatenate((fit.betas, fit.global_orient, angles, fit.transl - origin), axis=1)
 
     def retract(self, free: Array, step: Array) -> Array:
-        """Apply a step (B, P): the orientation by R exp(step), all else by addition.
+        """Apply a step (B, P): the orientation is multiplied by exp(step) on the right, and the
+        step is added to all other parameters.
 
         Angles are added as vectors, because the pose prior is exactly quadratic in them.
         """

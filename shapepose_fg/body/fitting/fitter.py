@@ -165,7 +165,7 @@ class BodyFit(Rows):
     """(B,) weighted root mean square distance of the joints to their targets, metres; NaN where not
     OK."""
     status: NDArray[np.str_]
-    """(B,) a `FitStatus` each."""
+    """(B,) `FitStatus` of each row."""
 
     @property
     def ok(self) -> Mask:

@@ -22,7 +22,7 @@ class PersonFrame:
     rest_xyz: Array
     """(K, 3) `BODY_POINTS` of the mean body in its mean pose, relative to the pelvis, metres."""
     rest_variance: Array
-    """(K,) variance of each over poses and shapes, mean over the axes, m²."""
+    """(K,) variance of each point over poses and shapes, mean over the axes, m²."""
     local: Array
     """(24, 3, 3) the mean pose's local rotations; the root's is the identity."""
     transl: Array

@@ -57,8 +57,8 @@ class Sizes:
         return 1 + betas @ self.taller / self.stature_m
 
     def measured(self, body: BodyModel, betas: Array, information: Array, pull: Array) -> Array:
-        """(10,) betas of a person who was measured with `information` (10, 10) about `pull` =
-        information times betas (10,), without a prior; `betas` (10,) are a first estimate.
+        """(10,) betas of a person who was measured with `information` (10, 10) without a prior,
+        where `pull` (10,) is information times betas; `betas` (10,) are a first estimate.
 
         At an adult's size, the prior of adults holds: if the person is `size` times the adult with
         betas a, size a + (size - 1) u is measured, with u the betas that make a body larger.

@@ -93,7 +93,7 @@ class BodyModel:
     ):
         """Build it from validated arrays; most callers want `default` or `load`.
 
-        `same` is a model of the same arrays, if there is one: what costs most here is shared.
+        `same` is another model of the same arrays, with which the expensive results are shared.
         """
         self.arrays = arrays
         """Arrays of the file, in float64."""

@@ -58,7 +58,7 @@ class KeypointOffsets:
     sigma_m: Array
     """(25,) standard deviation of each offset, root mean square over the axes, metres."""
     count: Index
-    """(25,) number of observed joints from which each was estimated; 0 for none."""
+    """(25,) number of observed joints from which each offset was estimated; 0 for none."""
     bones: Index
     """(25,) index in `SMPL_24` of the bone with which each joint moves."""
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from shapepose_fg.cameras.check.evidence import Look
+from shapepose_fg.cameras.check.evidence import SetupHypothesis
 from shapepose_fg.cameras.parameters import TURN, Q, by_parameters, placing, seen_by
 from shapepose_fg.cameras.sightings import median_over
 from shapepose_fg.cameras.triangulation import Structure, observed, triangulate
@@ -56,7 +56,7 @@ class BiasedResiduals:
     xy: Array
     """(N, J, V, 2) undistorted pixels; 0 where there is none."""
     weight: Array
-    """(N, J, V) robust weight of each, 1 / pixels^2; 0 where there is none."""
+    """(N, J, V) robust weight of each detection, 1 / pixels^2; 0 where there is none."""
     size_px: Array
     """(N, V) the person's size in each picture, pixels."""
     points: Array
@@ -223,8 +223,8 @@ class BiasedResiduals:
 def _with_biases(
     seen: tuple[Array, Array, Array], views: Views, person: Index
 ) -> tuple[Structure, Array]:
-    """Triangulated joints of the arrays of `observed`, beside lasting biases, and the residuals
-    (N, J, V, 2), as shares of the size, with these; NaN where not used.
+    """Joints triangulated from the arrays of `observed`, corrected for persistent biases; and the
+    residuals (N, J, V, 2) of the uncorrected detections, as shares of the size, NaN if not used.
 
     A bias is the median residual over the frames of a person, joint and view.
     """
@@ -241,19 +241,19 @@ def _with_biases(
     return structure, away
 
 
-def without_biases(look: Look) -> Look:
-    """The look without the lasting bias of each joint in each view that people have in common.
+def without_biases(setup: SetupHypothesis) -> SetupHypothesis:
+    """The set-up without the lasting bias of each joint in each view that people have in common.
 
     Such a bias along the motion of a person looks like an offset in time.
     """
-    groups = look.groups()
+    groups = setup.groups()
     if len(groups) == 0:
-        return look
-    seen = observed(groups, look.sightings)
-    common = median_over(_with_biases(seen, look.views, np.zeros(len(groups), np.intp))[1])
-    every = look.evidence.sightings
+        return setup
+    seen = observed(groups, setup.sightings)
+    common = median_over(_with_biases(seen, setup.views, np.zeros(len(groups), np.intp))[1])
+    every = setup.evidence.sightings
     xy = every.xy - every.size_px[:, None, None] * common.swapaxes(0, 1)[every.view]
-    return replace(look, evidence=replace(look.evidence, sightings=replace(every, xy=xy)))
+    return replace(setup, evidence=replace(setup.evidence, sightings=replace(every, xy=xy)))
 
 
 def _count(number: Index) -> int:

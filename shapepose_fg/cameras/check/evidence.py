@@ -43,7 +43,7 @@ class Evidence:
     sightings: Sightings
     """Sightings in the checked frames and their neighbours."""
     around: Index
-    """(G,) the frames used whose neighbours are there, too."""
+    """(G,) the frames used whose neighbouring frames have sightings, too."""
     most_lag: int
     """Maximum time offset that can be detected, frames."""
     other_side: Index
@@ -53,8 +53,10 @@ class Evidence:
 
     def thinned(self, frames: int) -> "Evidence":
         """Return the evidence with about `frames` of the frames used."""
-        few, near = (each[:: max(1, len(each) // frames)] for each in (self.anchors, self.around))
-        return replace(self, anchors=few, around=near)
+        anchors, around = (
+            each[:: max(1, len(each) // frames)] for each in (self.anchors, self.around)
+        )
+        return replace(self, anchors=anchors, around=around)
 
 
 def gather(detections: DetectionSequence, frames: range, views: int) -> Evidence:
@@ -105,7 +107,7 @@ def _other_side(skeleton: Skeleton) -> Index:
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class SetupHypothesis:
     """A recording under one hypothesis on its cameras, which changes as mistakes are found."""
 
     evidence: Evidence
@@ -117,23 +119,23 @@ class Look:
     _others: dict[tuple[int, ...], Others] = field(init=False, default_factory=dict)
 
     @classmethod
-    def given(cls, evidence: Evidence, rig: Rig) -> "Look":
-        """The look with the cameras as given by the user."""
+    def given(cls, evidence: Evidence, rig: Rig) -> "SetupHypothesis":
+        """The set-up with the cameras as given by the user."""
         return cls(evidence, Views.of(rig), np.zeros(len(rig), dtype=np.intp))
 
     def camera(self, view: int) -> Pinhole:
         """One of the assumed cameras."""
         return Pinhole(self.views.K[view], self.views.cTw[view])
 
-    def with_cameras(self, cameras: Mapping[int, Pinhole]) -> "Look":
-        """Return the look with some cameras replaced."""
+    def with_cameras(self, cameras: Mapping[int, Pinhole]) -> "SetupHypothesis":
+        """Return the set-up with some cameras replaced."""
         K, cTw = self.views.K.copy(), self.views.cTw.copy()
         for view, camera in cameras.items():
             K[view], cTw[view] = camera.K, camera.cTw
         return replace(self, views=replace(self.views, K=K, cTw=cTw))
 
-    def seeing(self, view: int, change: Callable[[Sightings], Sightings]) -> "Look":
-        """Return the look with changed detections of one camera."""
+    def seeing(self, view: int, change: Callable[[Sightings], Sightings]) -> "SetupHypothesis":
+        """Return the set-up with changed detections of one camera."""
         every = self.evidence.sightings
         mine = np.flatnonzero(every.view == view)
         xy, confidence, new = every.xy.copy(), every.confidence.copy(), change(every.rows(mine))
@@ -143,8 +145,8 @@ class Look:
             evidence=replace(self.evidence, sightings=replace(every, xy=xy, confidence=confidence)),
         )
 
-    def later(self, view: int, frames: int) -> "Look":
-        """Return the look with one camera assumed late by `frames` more."""
+    def later(self, view: int, frames: int) -> "SetupHypothesis":
+        """Return the set-up with one camera assumed late by `frames` more."""
         lag = self.lag.copy()
         lag[view] += frames
         return replace(self, lag=lag)
@@ -207,7 +209,7 @@ class Look:
             [match(self.others(v), self.seen_by(v), self.camera(v)).score for v in views]
         )
 
-    def beside_biases(self, view: int) -> float:
+    def score_without_biases(self, view: int) -> float:
         """Score of a camera for the others' people, as `Match.score`, corrected for persistent
         errors of the detector.
         """
@@ -246,5 +248,5 @@ class Look:
         groups, structure = self.structure(steps=3)
         error = np.moveaxis(structure.miss_px / structure.size_px[:, None], 1, 2)
         median = median_of(error)
-        worth = np.maximum(1 - median / GATE, 0.0)
-        return float(worth[groups.member >= 0].sum() / max(len(self.sightings), 1))
+        quality = np.maximum(1 - median / GATE, 0.0)
+        return float(quality[groups.member >= 0].sum() / max(len(self.sightings), 1))

@@ -87,8 +87,8 @@ class Request(ProjectOptions, TimeOptions):
     )
 
     def rig(self) -> "Rig":
-        """The cameras, with the option `readout` for rolling shutters, if the calibration does not
-        define it.
+        """The cameras; the option `readout` applies to rolling shutters that the calibration does
+        not define.
         """
         from shapepose_fg.core.camera import LONGEST_READOUT_S
 

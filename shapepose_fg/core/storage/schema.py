@@ -1,5 +1,5 @@
-"""Tables of arrays with columns that are declared in the types of the fields and checked whenever a
-table is created.
+"""Tables of arrays. The type of each field declares its column; every new table is checked against
+these declarations.
 
 For example `place: Annotated[Array, Column("N 3", unit="m", most=1e6)]`.
 """

@@ -97,7 +97,7 @@ def _named(path: Path, value: Any) -> dict[str, Any]:
 
 
 def _parse_yaml(path: Path, text: str) -> Any:
-    """The first non-empty document, read by a loader that constructs only plain values and OpenCV's
+    """The first non-empty document, read by a loader that makes only plain values and OpenCV's
     matrices.
     """
     text = _YAML_VERSION.sub("\n", text)  # OpenCV's first line %YAML:1.0 is invalid YAML

@@ -61,7 +61,7 @@ _ALL_FRAMES, _SEP_JSON = "alphapose-results.json", "sep-json"
 """AlphaPose's file with all frames, and its folder with a file per frame (--format open and
 cmu)."""
 _LISTS = ("annotations", "instance_info")
-"""Keys of the list if the file is an object: COCO's data sets, and MMPose."""
+"""Keys of the list of people in a file that is an object: COCO's data sets, and MMPose."""
 
 
 def _keypoints(person: Any, place: str, program: str) -> Array:
@@ -103,8 +103,8 @@ def _keypoints(person: Any, place: str, program: str) -> Array:
 def _member(record: Any, key: str, place: str, program: str) -> Any:
     """The value of a key; InputError if it is missing."""
     if not isinstance(record, dict) or key not in record:
-        told = "" if isinstance(record, dict) else f" in {describe(record)}"
-        raise InputError(f"{place}{key} is missing{told}; {_RERUN[program]}")
+        description = "" if isinstance(record, dict) else f" in {describe(record)}"
+        raise InputError(f"{place}{key} is missing{description}; {_RERUN[program]}")
     return record[key]
 
 

@@ -77,8 +77,8 @@ def skeleton_of_people(
             f"{known}"
         )
     found, why = (alike[0], "") if len(alike) == 1 else _best_fit(people, alike)
-    said = f"{count} keypoints per person without joint names: read as {found.name}{why}"
-    return found, [*notes, said]
+    note = f"{count} keypoints per person without joint names: read as {found.name}{why}"
+    return found, [*notes, note]
 
 
 def _best_fit(people: Sequence[KeptPeople], layouts: Sequence[Skeleton]) -> tuple[Skeleton, str]:
@@ -133,9 +133,11 @@ def _fits(people: Array, layouts: Sequence[Skeleton]) -> Array:
 
 
 def _sure(fits: Array) -> int | None:
-    """Index of the best-fitting layout for `fits` (L, N), if it is significantly better than the
-    most common one (the first); 0 if the first is significantly better than all others; otherwise
-    None.
+    """Index of the layout that people fit significantly best; None if this is not clear.
+
+    `fits` (L, N) are the fits of N people to L layouts, of which the first is the most common one.
+    The best other layout is returned if it is significantly better than the first, and 0 if the
+    first is significantly better than all others.
     """
     from shapepose_fg.body.joint_order import LIKE_A_BODY
 
@@ -174,10 +176,8 @@ def _named_in_files(
     people: Sequence[KeptPeople], count: int
 ) -> tuple[tuple[Skeleton, str, list[str]] | None, list[str]]:
     """The skeleton that the files name, its source, and ignored names (None if no file has names);
-    and notes on unknown names.
-
-    InputError if files of two cameras name different joints, or if the names do not match the
-    keypoints.
+    and notes on unknown names. InputError if files of two cameras name different joints, or if the
+    names do not match the keypoints.
     """
     found: tuple[Skeleton, str, list[str], CameraPeople] | None = None
     notes = dict[str, None]()

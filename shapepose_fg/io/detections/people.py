@@ -113,7 +113,7 @@ class DeclaredJoints:
     joints: str | tuple[str, ...]
     """Names of the joints or of the layout, as in `CameraPeople.joints`."""
     source: str
-    """Where it was declared, for messages: "Config.toml: pose.pose_model"."""
+    """Place of the declaration, for messages: "Config.toml: pose.pose_model"."""
 
 
 class KeptPeople:

@@ -13,7 +13,7 @@ from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import BODY_25, Skeleton
 from shapepose_fg.core.storage.kept_arrays import InMemory, KeptArrays
-from shapepose_fg.io.camera_names import listing, told_by_parts
+from shapepose_fg.io.camera_names import listing, match_by_parts
 from shapepose_fg.io.detection_table import DetectionTable
 from shapepose_fg.io.detections.arrays import (
     cameras_of_freemocap,
@@ -115,10 +115,10 @@ def read_detections(
         else:
             streams.append(read)
     if len(people) > 0:
-        skeleton, told = skeleton_of_people(people, wanted, declared)
+        skeleton, skeleton_notes = skeleton_of_people(people, wanted, declared)
         how = "the midpoint of two joints, if both were detected"
-        streams, said, first = _streams_of(people, skeleton)
-        notes += [*said, *told]
+        streams, stream_notes, first = _streams_of(people, skeleton)
+        notes += [*stream_notes, *skeleton_notes]
     else:
         skeleton, how = (
             _skeleton_of_streams(streams, wanted),
@@ -165,8 +165,8 @@ def find_places(path: Path, rig: Rig) -> tuple[DetectionFormat, list[Path], list
             )
     # Such as `walk_Miqus_1_23087_json` for camera `23087`, or `cam01_json` for camera `int_cam1`.
     for form, offered, names in _offered(entries):
-        if (told := told_by_parts(folder, rig.names, offered, names)) is not None:
-            return form, *told
+        if (matched := match_by_parts(folder, rig.names, offered, names)) is not None:
+            return form, *matched
     whole = [
         (form, each) for each in entries if (form := _of_all_cameras(each, rig.names)) is not None
     ]

@@ -19,8 +19,8 @@ from shapepose_fg.core.run_summary import covered_frames, has_identities
 _BODY_BYTES = 2_000
 """Approximate memory for one person's body per frame during export, bytes."""
 _OF_JOINTS = ("joints", "covariance", "velocity", "velocity_covariance")
-"""Columns that `seen_only` sets to NaN if no view detected the joint; those of `BODY`, if no view
-detected the person."""
+"""Columns of joints that `seen_only` sets to NaN if no view detected the joint; the columns of
+`BODY` are NaN if no view detected the person."""
 
 
 @dataclass(frozen=True)

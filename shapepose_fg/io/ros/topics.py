@@ -46,7 +46,8 @@ class PeopleTopics:
             rig.cameras[rig.names.index(picture)] if rig is not None and picture else None
         )
         self._described = set[str]()
-        """Identifiers of the people whose URDF has been published; who returns gets another."""
+        """Identifiers of the people whose URDF has been published; a person who returns gets
+        another identifier."""
 
     def fixed(self, time_s: float) -> Iterator[Published]:
         """Yield /tf_static and the cameras, which are published once."""

@@ -31,8 +31,8 @@ from shapepose_fg.pipeline.person_shapes import WindowBodies
 from shapepose_fg.pipeline.runs.parts import OBSERVED, Parts
 
 _STANDS_M_S = 0.1
-"""Maximum speed of a standing foot, m/s, and of its standard deviation per axis, for a visible heel
-or toe."""
+"""Maximum speed of a visible heel or toe that stands, m/s; also the maximum standard deviation of
+its velocity per axis."""
 
 
 @dataclass(frozen=True)

@@ -70,9 +70,9 @@ def cut_in_chunks(
 def _until(stop: int, segment: range, first: int, time_s: Array, config: PipelineConfig) -> int:
     """Frame up to which people must be tracked for the window that ends at `stop`.
 
-    It adds half a window and the overlap, the block in which that is decided, the tracker's
-    look-ahead, and two spare frames, in whole batches. `Engine` compares means over the cameras'
-    times, with other rounding: one frame more or less, twice.
+    It adds half a window, the overlap, the tracker's block and look-ahead, and two spare frames, in
+    whole batches. `Engine` compares means over the cameras' times, with other rounding: one frame
+    more or less, twice.
     """
     beyond = stop + config.batch_frames // 2 + 1
     while beyond < segment.stop and time_s[beyond] - time_s[stop] <= config.windows.shared_s:
@@ -139,8 +139,8 @@ def same_people(before: Border, after: Border) -> dict[int, int]:
 
 
 def _alike(a: Border, b: Border) -> float:
-    """Similarity of two tracks: 0 for two people; up to 1 without detections, and up to 2 by common
-    ones.
+    """Similarity of two tracks: 0 for different people, up to 1 for tracks without detections that
+    are near each other, and 1 to 2 for tracks with the same detections.
     """
     _, first, second = np.intersect1d(a.frame, b.frame, return_indices=True)
     if len(first) == 0:

@@ -37,12 +37,12 @@ _WORDS = {"program": "version of this program", "cameras": "set of cameras", "sk
 def open_run(
     output: Path, begun: dict[str, Any], *, resume: bool = False, restart: bool = False
 ) -> InFolder:
-    """The folder of a run into `output` with inputs `begun`, plain values; or of the resumed one,
-    with `resume`.
+    """Open the folder of a run that writes its results into `output`.
 
-    With `restart`, the files of an interrupted run are removed. Raises InputError if there are some
-    and neither is given, and if its inputs were others: the first difference is named. The caller
-    must be the only run in `output`.
+    `begun` are the inputs of the run, plain values. With `resume` it is the folder of the
+    interrupted run; with `restart`, the files of an interrupted run are removed. Raises InputError
+    if there are such files and neither is given, and if the interrupted run had other inputs: the
+    first difference is named. The caller must be the only run in `output`.
     """
     folder = inside(output, PARTS)
     manifest = inside(folder, _MANIFEST)

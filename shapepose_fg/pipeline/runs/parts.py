@@ -48,7 +48,7 @@ class Checkpoint:
 
 @dataclass(frozen=True)
 class Part:
-    """One window, solved."""
+    """A solved window of a run."""
 
     rows: Reconstruction
     """Rows of the window; a person is a track, or in separate frames a number within the frame."""
@@ -82,9 +82,7 @@ class Parts:
         return sum(self._counts)
 
     def append(self, part: Part) -> None:
-        """Store the next window. After that the run can be resumed behind it, if it has a
-        checkpoint.
-        """
+        """Store the next window. If it has a checkpoint, the run can then be resumed after it."""
         n, rows, table = len(self), part.rows, part.rows.observations
         if table is None:
             raise ValueError("the rows of a part need their observations")

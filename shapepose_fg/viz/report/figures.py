@@ -52,7 +52,7 @@ class Curve:
     lines: tuple[str, ...]
     """Path of the right side, and of the left one."""
     bands: tuple[str, ...]
-    """Two standard deviations around each."""
+    """Bands of two standard deviations around each path."""
     frames: tuple[int, int]
     """The first and the last frame that are drawn."""
 
@@ -112,11 +112,11 @@ def camera_figures(people: Reconstruction) -> list[CameraStatistics]:
     if table is None:
         return []
     px, segment = np.linalg.norm(table.residual_px, axis=-1), _segments(table)
-    told = {each.camera: each for each in entries_of(people.run).cameras}
+    entries = {each.camera: each for each in entries_of(people.run).cameras}
     made = []
     for view, name in enumerate(table.view_names.tolist()):  # only a few cameras
         gate, error = table.gate[..., view], px[..., view]
-        more = told.get(name, CameraEntry())
+        more = entries.get(name, CameraEntry())
         made.append(
             CameraStatistics(
                 name,
@@ -146,8 +146,8 @@ def overall(people: Reconstruction) -> dict[str, Any]:
     spans = [np.arange(span.start, span.stop) for span in covered_frames(people.run) or []]
     gate = np.zeros(0) if table is None else table.gate[table.gate != Gate.NOT_SEEN]
     cameras = entries_of(people.run).cameras
-    told = [each.offered for each in cameras if each.offered is not None]
-    offered = sum(told) if 0 < len(told) == len(cameras) else None
+    counts = [each.offered for each in cameras if each.offered is not None]
+    offered = sum(counts) if 0 < len(counts) == len(cameras) else None
     count = sum(each.used for each in cameras)
     return {
         "placed": bool(np.isfinite(people.joints).all(axis=-1).any()),

@@ -34,9 +34,9 @@ class PageScene:
     data: dict[str, Any]
     """The data for the page's script: plain values for JSON."""
     every: int
-    """Step between the frames in it."""
+    """Step between the frames of the scene."""
     kept: int
-    """Number of frames in it."""
+    """Number of frames in the scene."""
     frames: int
     """Number of frames of the recording."""
 
