@@ -247,6 +247,11 @@ def _is_terminal(on: "Console") -> bool:
     return on.file.isatty() and not on.is_dumb_terminal
 
 
+def _time_words(time_s: float) -> str:
+    """A duration in words, to about two digits."""
+    return f"{time_s:.0f} s" if time_s < 100 else f"{time_s / 60:.0f} min"
+
+
 _EVERY_S = 15.0
 """Interval between lines of progress if stderr is not a terminal, s."""
 
@@ -263,7 +268,7 @@ def progress(what: str, unit: str = "frames") -> Iterator[Callable[[int, int], N
         if total and done > 0 and (now := time.monotonic()) - last >= _EVERY_S:
             last = now
             left = (now - begin) * (total - done) / done
-            say(what, f"{done} of {total} {unit}, {left / 60:.0f} min left", "bold")
+            say(what, f"{done} of {total} {unit}, {_time_words(left)} left", "bold")
 
     with bars(unit) as shown:
         task = shown.add_task(what, total=None)

@@ -40,7 +40,7 @@ from shapepose_fg.io.detections.people import (
 )
 from shapepose_fg.io.detections.view_streams import ViewStream, assemble
 from shapepose_fg.io.detections.yolo import label_files, read_yolo
-from shapepose_fg.io.footage.placement import FOOTAGE
+from shapepose_fg.io.footage.placement import FOOTAGE, UNFINISHED, UNFINISHED_SETTINGS
 from shapepose_fg.io.skeleton_file import find_skeleton
 
 
@@ -150,6 +150,11 @@ def find_places(path: Path, rig: Rig) -> tuple[DetectionFormat, list[Path], list
         raise InputError(f"{path}: there is no such folder; check the path")
     folder, entries = _entries(path)
     holds = listing([each.name for each in entries])
+    if (folder / UNFINISHED / UNFINISHED_SETTINGS).is_file():
+        raise InputError(
+            f"{folder}: `detect` was interrupted and has not finished these detections; start the "
+            "same command again to continue"
+        )
     for form in FORMATS:
         found = [_named(folder, name, form.names) for name in rig.names]
         there = [place for place in found if place is not None]
