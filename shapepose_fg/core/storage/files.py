@@ -292,7 +292,8 @@ def write_together(
             del temporary[path]
     finally:
         for left in temporary.values():
-            left.unlink(missing_ok=True)
+            with suppress(OSError):  # such as on a read-only disk: the first error says why
+                left.unlink(missing_ok=True)
     # The renaming itself is synced to disk, if the system supports it; some network file systems do
     # not.
     for folder in {path.parent for path in files} if os.name == "posix" else ():
