@@ -361,8 +361,8 @@ class BodyWindow:
         weighed = self.last.gain / self.variance[..., None, None] * joints[:, None, None]
         targets, T = EnergyTargets(self.last.target, weighed), len(self)
         whole = self.energy.linearise(state.free, targets, 1e9, self._held, nothing(T)).system
-        alone = EnergyTargets(self.last.target, np.zeros_like(weighed))
-        prior = self.energy.linearise(state.free, alone, 1e9, self._held, nothing(T)).system
+        no_targets = EnergyTargets(self.last.target, np.zeros_like(weighed))
+        prior = self.energy.linearise(state.free, no_targets, 1e9, self._held, nothing(T)).system
         return np.asarray(whole - prior)
 
     def deviation(self, bodies: Array) -> Array:

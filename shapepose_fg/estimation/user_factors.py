@@ -291,12 +291,12 @@ def add_factors(people: Sequence[PersonWindow], functions: Sequence[FactorFuncti
     """Add the factors of user functions to the people of a window; if all have a single frame, to
     those of each frame.
     """
-    alone = all(len(person) == 1 for person in people)
+    single_frames = all(len(person) == 1 for person in people)
     together: dict[int, list[PersonWindow]] = {}
     for person in people:
-        together.setdefault(int(person.frames[0]) if alone else 0, []).append(person)
+        together.setdefault(int(person.frames[0]) if single_frames else 0, []).append(person)
     for person in people:
-        person.people = together[int(person.frames[0]) if alone else 0]
+        person.people = together[int(person.frames[0]) if single_frames else 0]
     for function in functions:
         for person in people:
             for item in function(person, person.keys):

@@ -153,7 +153,9 @@ class Filter:
             return now, candidate
         places, tracker = self.placed(now), self.tracker
         arrays = FrameArrays.of(given.detections, given.rig, tracker.skeleton)
-        weight, price = weighed(candidate, places, arrays, tracker.skeleton, now.tracks.world)
+        weight, price = weighed(
+            candidate, places, arrays, tracker.skeleton, now.tracks.global_hypothesis
+        )
         running_s = now.running_s + lasts_s * own_evidence(candidate, weight, price)
         views = (candidate >= 0).sum(axis=2)
         seen = np.where((views >= 2)[..., None], places, np.nan)
@@ -202,11 +204,11 @@ class Filter:
         trace = self._trace(places)
         blank = np.zeros((count, trace.bones.shape[1]))
         # A person whom one frame makes certain has sufficient evidence at once.
-        arrays, world = (
+        arrays, hypothesis = (
             FrameArrays.of(given.detections, given.rig, tracker.skeleton),
             np.zeros(count, dtype=np.intp),
         )
-        evidence = own_evidence(own, *weighed(own, places, arrays, tracker.skeleton, world))
+        evidence = own_evidence(own, *weighed(own, places, arrays, tracker.skeleton, hypothesis))
         running_s = np.where(evidence >= _SURE, LEAST_S, 0.0)
         columns: dict[str, Any] = {
             "views": (own >= 0).sum(axis=2),

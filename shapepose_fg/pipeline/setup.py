@@ -71,13 +71,13 @@ class Setup:
         given = [frame for frame, _ in span.decided if frame.key]
         rows = Observations.concatenate([part for _, part in span.decided])
         windows, rig = self.config.windows, self.rig if span.rig is None else span.rig
-        rounds = windows.again_alone if span.alone else windows.again_over_time
+        rounds = windows.again_alone if span.isolated else windows.again_over_time
         whole = solve_window(
             rows,
             Views.of(rig, rows.time_s),
             self.fitter,
             self.estimator,
-            assigning=Assigning(given, self.skeleton, rounds, over_time=not span.alone),
+            assigning=Assigning(given, self.skeleton, rounds, over_time=not span.isolated),
             extra_factors=self.extra_factors,
         )
         doubted = {frame.frame: frame.rig.doubted for frame in given if len(frame.rig.doubted) > 0}

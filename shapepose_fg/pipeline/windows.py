@@ -20,7 +20,7 @@ from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.config import WindowConfig as WindowConfig
 from shapepose_fg.pipeline.keyframes import STRAY_M, strays_m
 from shapepose_fg.proposal.thinning import thinned
-from shapepose_fg.tracking.identities import Decided, FollowState, alone, finish, follow
+from shapepose_fg.tracking.identities import Decided, FollowState, finish, follow, isolated_frame
 from shapepose_fg.tracking.tracker import Tracker
 
 
@@ -52,7 +52,7 @@ class Span:
     """Index of the first of `decided` with rows to return."""
     stop: int
     """Index after the last of `decided` with rows to return."""
-    alone: bool = False
+    isolated: bool = False
     """Whether every frame is solved separately."""
     rig: Rig | None = None
     """The cameras, if they move and their poses arrive with the frames; None if they are known
@@ -112,13 +112,13 @@ class Engine:
             decided, before = decided[keep:], stop - keep
         return spans, StreamState(following, tuple(decided), before)
 
-    def alone(self, frames: Iterable[Input]) -> Span:
+    def isolated_frames(self, frames: Iterable[Input]) -> Span:
         """Independent frames in one window, because bodies are fitted fastest in batches."""
         decided, people = list[Decided](), 0
         for frame in frames:
-            decided.append(alone(self.tracker, frame, people))
+            decided.append(isolated_frame(self.tracker, frame, people))
             people += len(decided[-1][1])
-        return Span(tuple(decided), 0, len(decided), alone=True)
+        return Span(tuple(decided), 0, len(decided), isolated=True)
 
     def _next(self, decided: Sequence[Decided], before: int, last: bool) -> tuple[int, int] | None:
         """End of the next window's own frames, and of the window; None with too few frames."""

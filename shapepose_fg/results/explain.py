@@ -352,9 +352,9 @@ def _findings(
     if (
         len(against) + len(doubted) == 1 and len(agree) > 0
     ):  # a single one against all others is wrong
-        alone = [*against, *doubted]
+        single = [*against, *doubted]
     else:
-        alone = []
+        single = []
         for several, fate in ((against, "left out"), (doubted, "used, with less weight")):
             cameras = tuple(view.camera for view in several)
             words = (
@@ -363,8 +363,8 @@ def _findings(
             )
             if several:
                 found.append(Finding(Cause.CONTRADICTION, cameras, words))
-    alone += [view for view in suspects if view.gate == GATES[Gate.TOO_FAR]]
-    for view in sorted(alone, key=lambda view: -(view.off_sigma or 0.0)):
+    single += [view for view in suspects if view.gate == GATES[Gate.TOO_FAR]]
+    for view in sorted(single, key=lambda view: -(view.off_sigma or 0.0)):
         words = (
             f"Camera {view.camera}'s detection is {_off(view)} and matches no known person. "
             f"{_taken(view)}"

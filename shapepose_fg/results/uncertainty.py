@@ -352,9 +352,9 @@ def distance(
         across = both.block(0, 1)
         covariance = both.block(0, 0) + both.block(1, 1) - across - across.T
         return Distance(both.mean[1] - both.mean[0], covariance, error_tails())
-    alone, points = marginal(people, one), np.asarray(other, dtype=np.float64)
-    apart = points - alone.mean[0]
-    covariance = np.broadcast_to(alone.covariance, (*apart.shape, 3))
+    joint_marginal, points = marginal(people, one), np.asarray(other, dtype=np.float64)
+    apart = points - joint_marginal.mean[0]
+    covariance = np.broadcast_to(joint_marginal.covariance, (*apart.shape, 3))
     return Distance(apart, covariance, error_tails())
 
 

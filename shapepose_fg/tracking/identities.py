@@ -138,7 +138,7 @@ def _with_detections(
     return replace(chosen, start=start, stop=stop)
 
 
-def alone(tracker: Tracker, given: Input, next_id: int) -> Decided:
+def isolated_frame(tracker: Tracker, given: Input, next_id: int) -> Decided:
     """Process an isolated frame: people found by stage I, numbered from `next_id` on."""
     nobody, none = (
         tracker.nobody(),

@@ -196,8 +196,8 @@ def _matched(before: Index, after: Index, cost: Array) -> dict[int, int]:
 
     count, nobody = len(rows), len(columns) + np.arange(len(rows))  # or no successor
     # One more pair outweighs all savings of others. A cost of 0 would mean no edge.
-    alone = 2.0 + count * float(cost.max(initial=0.0))
-    costs = np.concatenate([1.0 + cost, np.full(count, alone)])
+    unjoined = 2.0 + count * float(cost.max(initial=0.0))
+    costs = np.concatenate([1.0 + cost, np.full(count, unjoined)])
     places = np.concatenate([row, np.arange(count)]), np.concatenate([column, nobody])
     matrix = csr_array((costs, places), shape=(count, len(columns) + count))
     first, second = min_weight_full_bipartite_matching(matrix)

@@ -35,7 +35,7 @@ detected neighbours on the skeleton it is `LEAST_AFFINITY`."""
 APPEARS_S = 0.125
 """Cost of a track birth or death within the observed time, s of evidence; as much as 0.3 s of
 missed detections in plain view. People rarely appear or disappear in the middle of the scene."""
-_WORLDS = 8
+_MOST_HYPOTHESES = 8
 """Maximum number of global hypotheses given priority in turn, the most promising ones."""
 LEAST_S = 0.1
 """Minimum evidence of a person, in seconds during which all views see the whole person; less in
@@ -75,29 +75,45 @@ class SelectedTracks(Rows):
 
 
 def weighed(
-    candidate: Index, places: Array, arrays: FrameArrays, skeleton: Skeleton, world: Index
+    candidate: Index,
+    places: Array,
+    arrays: FrameArrays,
+    skeleton: Skeleton,
+    hypothesis: Index,
 ) -> tuple[Array, Array]:
     """Weight of each detection of A people (A, J, V), and price of their presence (A,), as shares
     of expected detections.
 
     `candidate` (A, J, V) are detections of one frame, -1 for none, `places` (A, J, 3) the joints,
-    metres, NaN where unknown; people of the same `world` (A,) occlude each other. A detection is
-    weighted by its affinity to the same person's others, and pays the cost of its place. A
-    detection is expected for each joint within a view's image; a joint of unknown position is
-    assumed at the mean of the others.
+    metres, NaN where unknown; people of the same global `hypothesis` (A,) occlude each other. A
+    detection is weighted by its affinity to the same person's others, and pays the cost of its
+    place. A detection is expected for each joint within a view's image; a joint of unknown position
+    is assumed at the mean of the others.
     """
     (A, J), known = candidate.shape[:2], np.asarray(np.isfinite(places).all(axis=-1))
     weight, price, limbs = np.zeros(candidate.shape), np.zeros(A), limbs_of(skeleton)
     lists, tied = np.empty((3, candidate.size), dtype=np.intp), np.empty(candidate.size)
     room = np.empty((A, J, 3)), np.empty((3, A, J)), np.empty((A, 3)), np.zeros(A)
-    _weigh(candidate, places, known, world, arrays, limbs, lists, tied, *room, weight, price)
+    _weigh(
+        candidate,
+        places,
+        known,
+        hypothesis,
+        arrays,
+        limbs,
+        lists,
+        tied,
+        *room,
+        weight,
+        price,
+    )
     return weight, price
 
 
 @kernel("i3 f3 b2 i1", FrameArrays, "i2 i2 f1 f3 f3 f2 f1 f3 f1")
 def _weigh(
-    candidate, places, known, world, arrays, limbs, lists, tied, at, seen, box, expected, weight,
-    price
+    candidate, places, known, hypothesis, arrays, limbs, lists, tied, at, seen, box, expected,
+    weight, price
 ):  # fmt: skip
     """Fill in the results of `weighed`, zero before; `expected` (A,) counts the expected
     detections.
@@ -131,7 +147,9 @@ def _weigh(
                 if not (depth > 0 and 0 <= x < width and 0 <= y < height):
                     continue
                 place = a, x, y, depth - _IN_FRONT_M
-                hidden = not known[a, j] or _behind(place, known, world, limbs, seen, box, focal)
+                hidden = not known[a, j] or _behind(
+                    place, known, hypothesis, limbs, seen, box, focal
+                )
                 cost = _PRICE_HIDDEN if hidden else _PRICE
                 weight[a, j, v] *= 1 + cost
                 price[a] += cost
@@ -174,13 +192,17 @@ def _picture(places, known, camera, focal, a, seen, box):
 
 
 @part
-def _behind(place, known, world, limbs, seen, box, focal):
+def _behind(place, known, hypothesis, limbs, seen, box, focal):
     """Whether the `place` (person, x, y, depth) is occluded by a limb, both ends known, of another
     person of the same global hypothesis.
     """
     a, x, y, depth = place
-    for b in range(len(world)):
-        if a == b or world[a] != world[b] or not (box[b, 0] < x < box[b, 1] and box[b, 2] < depth):
+    for b in range(len(hypothesis)):
+        if (
+            a == b
+            or hypothesis[a] != hypothesis[b]
+            or not (box[b, 0] < x < box[b, 1] and box[b, 2] < depth)
+        ):
             continue
         for n in range(len(limbs)):
             one, two = limbs[n, 0], limbs[n, 1]
@@ -266,29 +288,31 @@ class EvidenceTable:
             least_s,
         )
 
-    def choose(self, world: Index) -> SelectedTracks:
+    def choose(self, hypothesis: Index) -> SelectedTracks:
         """The best selection of `ways`."""
-        return self.ways(world)[0]
+        return self.ways(hypothesis)[0]
 
-    def ways(self, world: Index, *, on_trial: bool = False) -> list[SelectedTracks]:
+    def ways(self, hypothesis: Index, *, on_trial: bool = False) -> list[SelectedTracks]:
         """Selections of hypotheses and their time spans, such that each detection is evidence of
         one person only; best first.
 
-        Hypotheses with the same `world` (H,) were tracked together; `on_trial` also accepts tracks
-        with slightly too little evidence. Selection is greedy: the best segment of the best
+        Tracks with the same global `hypothesis` (H,) were tracked together; `on_trial` also accepts
+        tracks with slightly too little evidence. Selection is greedy: the best segment of the best
         hypothesis comes first, and its detections are evidence of no other. Alternative selections
         give priority to the people of one global hypothesis: a hypothesis that switches from one
         person to another, always to the better visible one, beats either of the two, and leaves too
         little for the others.
         """
-        first, asked = np.zeros(len(world), dtype=bool), _ON_TRIAL if on_trial else 1.0
-        if len(world) == 0:
+        first, asked = np.zeros(len(hypothesis), dtype=bool), _ON_TRIAL if on_trial else 1.0
+        if len(hypothesis) == 0:
             return [self.in_turn(first)]
         segment, costs = np.zeros(3, dtype=np.intp), (asked * APPEARS_S, self.begins, self.ends)
-        best_s = np.array([_best_segment(gains, *costs, 0, segment) for gains in self.alone])
-        bound = np.bincount(world, np.maximum(best_s, 0.0))
-        tried = np.argsort(-bound, kind="stable")[:_WORLDS]
-        found = [self.in_turn(each, asked) for each in (first, *(world == each for each in tried))]
+        best_s = np.array([_best_segment(gains, *costs, 0, segment) for gains in self.unshared_s])
+        bound = np.bincount(hypothesis, np.maximum(best_s, 0.0))
+        tried = np.argsort(-bound, kind="stable")[:_MOST_HYPOTHESES]
+        found = [
+            self.in_turn(each, asked) for each in (first, *(hypothesis == each for each in tried))
+        ]
         return sorted(found, key=lambda each: -float(each.evidence_s.sum()))
 
     def agreement(self, one: SelectedTracks, other: SelectedTracks) -> float:
@@ -312,7 +336,7 @@ class EvidenceTable:
         return self.in_turn(np.zeros(len(self.there), dtype=bool), besides=chosen)
 
     @cached_property
-    def alone(self) -> Array:
+    def unshared_s(self) -> Array:
         """(H, T) evidence of each hypothesis, seconds, as if there were no other."""
         share = self.weight.sum(axis=2, dtype=np.float64)
         return np.where(self.there, (share - self.price) * self.lasts_s, -np.inf)
@@ -341,7 +365,7 @@ class EvidenceTable:
         if besides is not None:
             before = np.column_stack([besides.hypothesis, besides.start, besides.stop])
         appears_s = asked * APPEARS_S if besides is None else 0.0
-        given = self.alone.copy(), self.place, *self.holders, self.lasts_s, first, before
+        given = self.unshared_s.copy(), self.place, *self.holders, self.lasts_s, first, before
         costs, (H, T) = (appears_s, self.begins, self.ends, asked * self.least_s), self.there.shape
         free, changed = np.ones(self.detections, dtype=bool), np.ones(H, dtype=bool)
         room = np.empty((H, 3), dtype=np.intp), np.empty(H)

@@ -3,7 +3,7 @@
 The detections around a track's predicted joints are its observations, whether or not stage I would
 find the person in this frame. Several global hypotheses are tracked at once
 (`global_hypotheses.py`). Each is a set of tracks that share no detection, and is independent of the
-others; its number is `world` in the code.
+others.
 """
 
 from collections.abc import Callable, Sequence
@@ -78,7 +78,7 @@ class Tracks(Rows):
     """Time of the last frame, s."""
     ids: Index
     """(A,) number of each track."""
-    world: Index
+    global_hypothesis: Index
     """(A,) global hypothesis of each track."""
     joints: JointStates
     """(A, J) states of the joints in the last frame."""
@@ -133,7 +133,9 @@ class Tracker:
         joints, lost = predicted(
             tracks.joints, step_s, self.scale.motion, self.scale.density, bones
         )
-        candidate = assign(Predicted(joints.position, joints.sigma_m, lost, tracks.world), arrays)
+        candidate = assign(
+            Predicted(joints.position, joints.sigma_m, lost, tracks.global_hypothesis), arrays
+        )
         certain = detections.confidence
         weight = np.where(certain > 0, self.observation.weight(certain), 0.0)
         joints, candidate, evident = measured(
@@ -163,7 +165,7 @@ class Tracker:
         """(A,) tracks with evidence within the last `patience_s`."""
         return np.abs(tracks.time_s - tracks.evident_s) <= self.config.patience_s
 
-    def at(self, places: Array, ids: Index, world: Index, time_s: float) -> Tracks:
+    def at(self, places: Array, ids: Index, global_hypothesis: Index, time_s: float) -> Tracks:
         """Tracks of people at `places` (P, J, 3), metres, at `time_s`; joints that are NaN are
         lost.
         """
@@ -174,7 +176,7 @@ class Tracker:
         joints = JointStates.at(
             np.where(known[..., None], places, centre), sigma, self.scale.motion.start
         )
-        return Tracks(time_s, ids, world, joints, np.full(len(places), time_s))
+        return Tracks(time_s, ids, global_hypothesis, joints, np.full(len(places), time_s))
 
     def newcomers(
         self, tracks: Tracks, candidate: Index, detections: Detections, rig: Rig

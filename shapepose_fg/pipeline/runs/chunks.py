@@ -165,11 +165,11 @@ class Identities:
         self.next_id = next_id
         self.border = border
 
-    def names(self, begins: Border, *, alone: bool) -> dict[int, int]:
+    def names(self, begins: Border, *, isolated: bool) -> dict[int, int]:
         """Identities of tracks that continue one of the chunk before; empty if frames
-        are `alone`.
+        are `isolated`.
         """
-        return {} if alone or self.border is None else same_people(self.border, begins)
+        return {} if isolated or self.border is None else same_people(self.border, begins)
 
     def name(self, track: int, names: dict[int, int]) -> int:
         """Identity of a track; a track without one gets the next free one."""
