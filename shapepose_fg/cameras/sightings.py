@@ -359,7 +359,7 @@ def follow(frame: Index, away: Callable[[Index, Index], Array], reach: float, ga
 
     `away` are the distances (A, B) of rows (A,) of earlier frames from rows (B,).
     """
-    who, last, count = np.full(len(frame), -1, dtype=np.intp), np.zeros(0, dtype=np.intp), 0
+    identity, last, count = np.full(len(frame), -1, dtype=np.intp), np.zeros(0, dtype=np.intp), 0
     for now in np.unique(frame).tolist():
         here, last = np.flatnonzero(frame == now), last[frame[last] >= now - gap]
         if len(last) > 0:
@@ -367,12 +367,12 @@ def follow(frame: Index, away: Callable[[Index, Index], Array], reach: float, ga
             nearest = far.argmin(axis=1)
             mutual = far.argmin(axis=0)[nearest] == np.arange(len(last))
             mutual &= far.min(axis=1) < reach
-            who[here[nearest[mutual]]] = who[last[mutual]]
-        new = here[who[here] < 0]
-        who[new] = count + np.arange(len(new))
+            identity[here[nearest[mutual]]] = identity[last[mutual]]
+        new = here[identity[here] < 0]
+        identity[new] = count + np.arange(len(new))
         count += len(new)
-        last = np.concatenate([here, last[~np.isin(who[last], who[here])]])
-    return who
+        last = np.concatenate([here, last[~np.isin(identity[last], identity[here])]])
+    return identity
 
 
 def followed(frame: Index, points: Array) -> Index:

@@ -184,9 +184,9 @@ def _followed(seen: Sightings) -> list[Index]:
         apart_px = np.linalg.norm(seen.xy[one][:, None] - seen.xy[other], axis=-1)
         return median_of(apart_px / seen.size_px[other][:, None], MIN_JOINTS)
 
-    who = follow(seen.frame, away, _SAME, 2)
-    order = np.lexsort((seen.frame, who))
-    return np.split(order, np.flatnonzero(np.diff(who[order])) + 1)
+    identity = follow(seen.frame, away, _SAME, 2)
+    order = np.lexsort((seen.frame, identity))
+    return np.split(order, np.flatnonzero(np.diff(identity[order])) + 1)
 
 
 def _smoothed(rays: Array, frame: Index, width: float) -> tuple[Array, Array]:

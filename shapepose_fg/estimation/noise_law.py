@@ -223,11 +223,11 @@ class Residuals:
         count, expected = total(np.ones(len(score))), np.square(prior.times)
         squared_times, gross = expected, np.array(prior.gross)
         for _ in range(_ROUNDS):
-            theirs = np.where(seen, squared_times[of_others], 0.0).sum(axis=1) / np.maximum(
+            of_views = np.where(seen, squared_times[of_others], 0.0).sum(axis=1) / np.maximum(
                 seen.sum(axis=1), 1
             )
             others, own = (
-                self.others * theirs[:, None],
+                self.others * of_views[:, None],
                 (squared_times[score] * self.scatter**2)[:, None],
             )
             likely = [

@@ -189,9 +189,11 @@ class TrajectoryGraph:
         self._at = np.searchsorted(mounted.frames, rows.frame)
         self._joint_keys = np.zeros(rows.confidence.shape[:2], dtype=np.int64)
         for track in np.unique(rows.track).tolist():
-            mine = rows.track == track
-            frames = rows.frame[mine, None]
-            self._joint_keys[mine] = joint_keys(track, np.arange(rows.confidence.shape[1]), frames)
+            of_track = rows.track == track
+            frames = rows.frame[of_track, None]
+            self._joint_keys[of_track] = joint_keys(
+                track, np.arange(rows.confidence.shape[1]), frames
+            )
         self._lenses = [make_calibration(camera.K) for camera in mounted.rig.cameras]
         self._still = [make_camera(camera.K, camera.wTc) for camera in mounted.rig.cameras]
 

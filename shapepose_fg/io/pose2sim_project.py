@@ -67,8 +67,8 @@ class Pose2SimProject:
         """File name of a person, without extension, in Pose2Sim's style; `person` None for the only
         one.
         """
-        who = "" if person is None else f"_P{person}"
-        return f"{self.name}{who}_{first}-{last}"
+        suffix = "" if person is None else f"_P{person}"
+        return f"{self.name}{suffix}_{first}-{last}"
 
     def span(self, count: int) -> range:
         """Wanted frames of a recording of `count` frames, counted from 0; InputError if there are

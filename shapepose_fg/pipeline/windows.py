@@ -150,9 +150,12 @@ def halved(
         np.array([each.time_s.mean() for each in given]),
     )
     key, new = np.array([each.key for each in given]), np.zeros(len(given), dtype=bool)
-    for mine in window_rows(rows):
-        at = np.searchsorted(number, rows.frame[mine])
-        far = strays_m(solved.joints[mine], solved.velocity[mine], time_s[at]) > STRAY_M
+    for rows_of_person in window_rows(rows):
+        at = np.searchsorted(number, rows.frame[rows_of_person])
+        far = (
+            strays_m(solved.joints[rows_of_person], solved.velocity[rows_of_person], time_s[at])
+            > STRAY_M
+        )
         far &= (np.diff(np.cumsum(key)[at]) == 1) & (np.diff(at) > 1)
         new[(at[1:] + at[:-1])[far] // 2] = True
     new[: span.start] = new[span.stop :] = False

@@ -97,7 +97,7 @@ def by_support(
         of[chosen] = person
     of[-1] = -1  # restore the spare entry
     candidate, detection = candidates.support.T
-    whose = of[candidate]
-    has, detection = whose >= 0, detection[whose >= 0]
-    own[whose[has], detections.joint[detection], detections.view[detection]] = detection
+    views_of = of[candidate]
+    has, detection = views_of >= 0, detection[views_of >= 0]
+    own[views_of[has], detections.joint[detection], detections.view[detection]] = detection
     return own

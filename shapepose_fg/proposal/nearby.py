@@ -132,16 +132,19 @@ class Nearby:
         Their distance is infinite.
         """
         person, joint, view = np.nonzero(own >= 0)
-        mine, views = own[person, joint, view], len(arrays.cameras)
-        start, count = arrays.begin[mine], arrays.begin[mine + 1] - arrays.begin[mine]
-        whose = np.repeat(person, count)
+        own_detection, views = own[person, joint, view], len(arrays.cameras)
+        start, count = (
+            arrays.begin[own_detection],
+            arrays.begin[own_detection + 1] - arrays.begin[own_detection],
+        )
+        pair_person = np.repeat(person, count)
         tied = arrays.other[
-            np.arange(len(whose)) + np.repeat(start - np.cumsum(count) + count, count)
+            np.arange(len(pair_person)) + np.repeat(start - np.cumsum(count) + count, count)
         ]
-        lacks = unplaced[whose, arrays.of_joint[tied]]
-        key = np.unique(whose[lacks] * len(arrays.of_view) + tied[lacks])
-        whose, tied = np.divmod(key, max(len(arrays.of_view), 1))
-        person, detection = np.append(self.person, whose), np.append(self.detection, tied)
+        lacks = unplaced[pair_person, arrays.of_joint[tied]]
+        key = np.unique(pair_person[lacks] * len(arrays.of_view) + tied[lacks])
+        pair_person, tied = np.divmod(key, max(len(arrays.of_view), 1))
+        person, detection = np.append(self.person, pair_person), np.append(self.detection, tied)
         slot = arrays.of_joint[detection] * views + arrays.of_view[detection]
         order = np.lexsort((person, slot))
         first = np.searchsorted(slot[order], np.arange(len(self.first)))

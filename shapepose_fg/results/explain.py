@@ -100,20 +100,20 @@ def _row_of(people: Reconstruction, person: int, frame: int | None, time_s: floa
     """Index of the row of a person in a frame, or nearest to a time; raises InputError if there is
     none.
     """
-    mine = np.flatnonzero(people.person == person)
-    if len(mine) == 0:
+    rows = np.flatnonzero(people.person == person)
+    if len(rows) == 0:
         there = " ".join(map(str, np.unique(people.person).tolist()[:20]))
         raise InputError(f"person {person}: not in the result; there are {there or 'none'}")
     if (frame is None) == (time_s is None):
         raise InputError("give either a frame or a time")
     if time_s is not None:
-        away = np.abs(people.time_s[mine] - time_s)
+        away = np.abs(people.time_s[rows] - time_s)
         if not np.isfinite(away).any():
             raise InputError("the result has no times; give a frame")
-        return int(mine[np.nanargmin(away)])
-    row = mine[people.frame[mine] == frame]
+        return int(rows[np.nanargmin(away)])
+    row = rows[people.frame[rows] == frame]
     if len(row) == 0:
-        first, last = people.frame[mine].min(), people.frame[mine].max()
+        first, last = people.frame[rows].min(), people.frame[rows].max()
         raise InputError(
             f"person {person} is not in frame {frame}, only in some frames from {first} to {last}"
         )
@@ -234,11 +234,14 @@ def _view_reasons(
         reasons.append(reason)
     factor_shares = dict[tuple[str, tuple[str, ...]], float]()
     for each, share in zip(evidence, shares[len(gates) :], strict=False):
-        tied = ((who, people.joint_names[number]) for who, number, _ in each.others)
-        mine = int(people.person[row])
+        tied = (
+            (joint_person, people.joint_names[number]) for joint_person, number, _ in each.others
+        )
+        own_person = int(people.person[row])
         others = tuple(
             dict.fromkeys(
-                str(name) if who == mine else f"person {who}'s {name}" for who, name in tied
+                str(name) if joint_person == own_person else f"person {joint_person}'s {name}"
+                for joint_person, name in tied
             )
         )
         factor_shares[each.name, others] = factor_shares.get((each.name, others), 0.0) + share
@@ -294,20 +297,22 @@ def _refused(
     for k in np.flatnonzero((seen.joint == joint) & (owner != me) & missed).tolist():
         view, ends = int(seen.view[k]), slice(begin[k], begin[k + 1])
         name, off = str(table.view_names[view]), float(np.linalg.norm(seen.xy[k] - xy[view]))
-        theirs, others = (affinity[ends][owner[other[ends]] == n].sum() for n in (me, owner[k]))
-        whose = f"person {people.person[here[owner[k]]]}'s"
+        own_affinity, others = (
+            affinity[ends][owner[other[ends]] == n].sum() for n in (me, owner[k])
+        )
+        owner_words = f"person {people.person[here[owner[k]]]}'s"
         if owner[k] < 0:
             sigmas, others = all_of_it.sigmas_px[:, joint, view], 0.0
             usual = sigmas.sum() / max((sigmas > 0).sum(), 1)
-            whose = _looks_like(all_of_it, row, joint, view, seen.xy[k], usual, off)
-        cause = Cause.FOREIGN if whose else Cause.GATED
-        if theirs > others:
+            owner_words = _looks_like(all_of_it, row, joint, view, seen.xy[k], usual, off)
+        cause = Cause.FOREIGN if owner_words else Cause.GATED
+        if own_affinity > others:
             words = (
-                f"connects a detection with this person's that is {whose or 'unassigned'}, "
+                f"connects a detection with this person's that is {owner_words or 'unassigned'}, "
                 f"{off:.0f} px off. It was not used."
             )
             joined.append(Finding(cause, (name,), f"Camera {name} {words}"))
-        elif not whose and off * depth[view] < FARTHEST_M * views.focal[0, view]:
+        elif not owner_words and off * depth[view] < FARTHEST_M * views.focal[0, view]:
             words = f"Camera {name} has an unassigned detection {off:.0f} px off."
             beside.append((off, Finding(cause, (name,), words)))
     return joined + [each for _, each in sorted(beside, key=lambda one: one[0])]

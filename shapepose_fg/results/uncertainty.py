@@ -439,10 +439,10 @@ def _paces(people: Reconstruction, rows: Index, joints: Index) -> Array:
     """
     lasts = np.full(len(people.person), np.nan)
     for person in np.unique(people.person[rows]).tolist():
-        mine = np.flatnonzero(people.person == person)
-        mine = mine[np.argsort(people.time_s[mine], kind="stable")]
-        if len(mine) > 1 and (np.diff(people.time_s[mine]) > 0).all():
-            lasts[mine] = moments(people.time_s[mine])[2]
+        of_person = np.flatnonzero(people.person == person)
+        of_person = of_person[np.argsort(people.time_s[of_person], kind="stable")]
+        if len(of_person) > 1 and (np.diff(people.time_s[of_person]) > 0).all():
+            lasts[of_person] = moments(people.time_s[of_person])[2]
     own = np.trace(people.covariance[rows, joints], axis1=-2, axis2=-1)
     speed = np.trace(people.velocity_covariance[rows, joints], axis1=-2, axis2=-1)
     correlated = 1 - speed * lasts[rows] ** 2 / (2 * own)

@@ -321,11 +321,11 @@ def _follow(
             tracks, candidate = tracks.rows(alive), candidate[alive]
             log.add(t, tracks, candidate)
         tracks = replace(tracks, time_s=time_s)
-        for own, theirs in begins.get(t, []):
-            log.add(t, own, theirs)
+        for own, detections in begins.get(t, []):
+            log.add(t, own, detections)
             tracks, candidate = (
                 Tracks.concatenate([tracks, own]),
-                np.concatenate([candidate, theirs]),
+                np.concatenate([candidate, detections]),
             )
         if abs(time_s - looked_s) < _DUPLICATES_S:
             continue
@@ -355,7 +355,7 @@ def _follow(
             if (since <= t if forwards else since >= t)
         ]:
             here = tracks.global_hypothesis == hypothesis
-            places, theirs = _newcomers(tracker, tracks.rows(here), candidate[here], frame)
+            places, detections = _newcomers(tracker, tracks.rows(here), candidate[here], frame)
             if len(places) > 0:
                 new = tracker.at(
                     places,
@@ -363,11 +363,11 @@ def _follow(
                     np.full(len(places), hypothesis, dtype=np.intp),
                     time_s,
                 )
-                log.add(t, new, theirs)
-                born.append((hypothesis, Seed(t, new, theirs, births=False), new.ids))
+                log.add(t, new, detections)
+                born.append((hypothesis, Seed(t, new, detections, births=False), new.ids))
                 tracks, candidate = (
                     Tracks.concatenate([tracks, new]),
-                    np.concatenate([candidate, theirs]),
+                    np.concatenate([candidate, detections]),
                 )
     return born
 

@@ -159,10 +159,10 @@ def _rows(
 ) -> Observations:
     """The people of a frame as observations; uncertain joints are NaN."""
     here = np.flatnonzero(chosen.during(t) & (identity >= 0))
-    who = chosen.hypothesis[here]
-    own = found.candidate[who, t].astype(np.intp)
-    evidence = own_evidence(own, found.weight[who, t], found.price[who, t])
-    return observed(given, own, found.places[who, t], identity[here], evidence)
+    hypothesis = chosen.hypothesis[here]
+    own = found.candidate[hypothesis, t].astype(np.intp)
+    evidence = own_evidence(own, found.weight[hypothesis, t], found.price[hypothesis, t])
+    return observed(given, own, found.places[hypothesis, t], identity[here], evidence)
 
 
 def observed(

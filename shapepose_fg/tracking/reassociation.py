@@ -52,9 +52,9 @@ def reassociate(
                 break
             index, evidence = index[~gone], evidence[~gone]
             candidate, probability = _reassigned(frame, joints[index], sigma_m[index], skeleton)
-        who = {name: getattr(rows, name)[index] for name in ("track", "frame", "time_s")}
+        columns = {name: getattr(rows, name)[index] for name in ("track", "frame", "time_s")}
         sure = {"probability": probability, "evidence": evidence}
-        parts.append(Observations.of(candidate, frame.detections, joints[index], **who, **sure))
+        parts.append(Observations.of(candidate, frame.detections, joints[index], **columns, **sure))
     return Observations.concatenate(parts)
 
 

@@ -123,18 +123,18 @@ def _weigh(
     others.
     """
     people, joints, views = weight.shape
-    cameras, count, whose, which, neighbours = arrays.cameras, 0, lists[0], lists[1], lists[2]
+    cameras, count, owners, used, neighbours = arrays.cameras, 0, lists[0], lists[1], lists[2]
     for a in range(people):
         for j in range(joints):
             for v in range(views):
                 if candidate[a, j, v] >= 0:
-                    whose[count], which[count] = a, candidate[a, j, v]
+                    owners[count], used[count] = a, candidate[a, j, v]
                     count += 1
-    tie(whose[:count], which[:count], candidate, arrays, tied, neighbours)
+    tie(owners[:count], used[:count], candidate, arrays, tied, neighbours)
     of_joint, of_view = arrays.of_joint, arrays.of_view
     for n in range(count):
-        affinity, d = tied[n] if neighbours[n] > 0 else LEAST_AFFINITY, which[n]
-        weight[whose[n], of_joint[d], of_view[d]] = min(max(affinity / _SURE_AFFINITY, 0.0), 1.0)
+        affinity, d = tied[n] if neighbours[n] > 0 else LEAST_AFFINITY, used[n]
+        weight[owners[n], of_joint[d], of_view[d]] = min(max(affinity / _SURE_AFFINITY, 0.0), 1.0)
     for a in range(people):
         _fill(places[a], known[a], at[a])
     for v in range(views):
@@ -348,9 +348,12 @@ class EvidenceTable:
         """
         counts = np.bincount(self.place.ravel(), minlength=self.detections + 1)[:-1]
         begin = np.cumsum(np.concatenate([[0, 0], counts]))
-        who, what = np.empty(begin[-1], dtype=np.int32), np.empty(begin[-1], dtype=np.float32)
-        _holders(self.place, self.weight, begin, who, what)
-        return begin[:-1], who, what
+        hypotheses, weights = (
+            np.empty(begin[-1], dtype=np.int32),
+            np.empty(begin[-1], dtype=np.float32),
+        )
+        _holders(self.place, self.weight, begin, hypotheses, weights)
+        return begin[:-1], hypotheses, weights
 
     def in_turn(
         self, first: Mask, asked: float = 1.0, besides: SelectedTracks | None = None
@@ -376,7 +379,7 @@ class EvidenceTable:
 
 
 @kernel("w3 s3 i1 w1 s1")
-def _holders(place, weight, begin, who, what):
+def _holders(place, weight, begin, hypotheses, weights):
     """Fill in `EvidenceTable.holders` from indices and weights (H, T, K); `begin` (D + 2,) starts
     with two zeros.
     """
@@ -387,21 +390,21 @@ def _holders(place, weight, begin, who, what):
                 d = place[h, t, k]
                 if d + 2 < len(begin):
                     at = begin[d + 1]
-                    who[at], what[at] = h, weight[h, t, k]
+                    hypotheses[at], weights[at] = h, weight[h, t, k]
                     begin[d + 1] += 1
 
 
 @kernel("f2 w3 i1 w1 s1 f1 b1 i2 f0 i0 i0 f0 b1 b1 i2 f1 i2 f1")
 def _in_turn(
-    gains, place, begin, who, what, lasts, first, besides, appears, begins, ends, least, free,
-    changed, segment, value, chosen, evidence,
+    gains, place, begin, hypotheses, weights, lasts, first, besides, appears, begins, ends, least,
+    free, changed, segment, value, chosen, evidence,
 ):  # fmt: skip
     """Fill in hypothesis, start and stop, `chosen` (N, 3), and `evidence` (N,) of the tracks that
     `EvidenceTable.in_turn` selects; returns their number.
     """
     people, count = len(gains), 0
     for n in range(len(besides)):
-        _take(besides[n], gains, place, begin, who, what, lasts, free, changed)
+        _take(besides[n], gains, place, begin, hypotheses, weights, lasts, free, changed)
     while people > 0:
         before_all, best = False, -1
         for h in range(people):
@@ -417,13 +420,13 @@ def _in_turn(
         evidence[count] = value[best]
         for n in range(3):
             chosen[count, n] = segment[best, n]
-        _take(chosen[count], gains, place, begin, who, what, lasts, free, changed)
+        _take(chosen[count], gains, place, begin, hypotheses, weights, lasts, free, changed)
         count += 1
     return count
 
 
 @part
-def _take(chosen, gains, place, begin, who, what, lasts, free, changed):
+def _take(chosen, gains, place, begin, hypotheses, weights, lasts, free, changed):
     """Select a segment: its detections are no longer evidence of any other hypothesis."""
     person = chosen[0]
     changed[person] = True
@@ -434,8 +437,8 @@ def _take(chosen, gains, place, begin, who, what, lasts, free, changed):
             if d < len(free) and free[d]:
                 free[d] = False
                 for n in range(begin[d], begin[d + 1]):
-                    gains[who[n], t] -= what[n] * lasts[t]
-                    changed[who[n]] = True
+                    gains[hypotheses[n], t] -= weights[n] * lasts[t]
+                    changed[hypotheses[n]] = True
 
 
 @kernel("f1 f0 i0 i0 i0 i1")

@@ -185,7 +185,7 @@ class Tracker:
         positions (P, J, 3), metres, NaN where unknown, and detections (P, J, V).
         """
         core, J = list(self.skeleton.core), len(self.skeleton)
-        there, found, theirs = (
+        there, found, detections_of = (
             tracks.joints.position,
             [np.zeros((0, J, 3))],
             [np.zeros((0, J, len(rig)), np.intp)],
@@ -203,10 +203,10 @@ class Tracker:
             apart = (mean_distance(people.initial, there) > _APART_M).all(axis=1)
             new = apart & (twice.sum(axis=1) >= self.config.min_new_joints)
             found.append(people.initial[new])
-            theirs.append(own[new])
+            detections_of.append(own[new])
             there = np.concatenate([there, people.initial[new]])
             free[own[new][own[new] >= 0]] = False
-        return np.concatenate(found), np.concatenate(theirs)
+        return np.concatenate(found), np.concatenate(detections_of)
 
     def enough(self, detections: Detections, free: Mask) -> bool:
         """Whether the unassigned detections suffice for a person: enough core joints, each in two

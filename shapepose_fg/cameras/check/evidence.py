@@ -137,9 +137,9 @@ class SetupHypothesis:
     def seeing(self, view: int, change: Callable[[Sightings], Sightings]) -> "SetupHypothesis":
         """Return the set-up with changed detections of one camera."""
         every = self.evidence.sightings
-        mine = np.flatnonzero(every.view == view)
-        xy, confidence, new = every.xy.copy(), every.confidence.copy(), change(every.rows(mine))
-        xy[mine], confidence[mine] = new.xy, new.confidence
+        rows = np.flatnonzero(every.view == view)
+        xy, confidence, new = every.xy.copy(), every.confidence.copy(), change(every.rows(rows))
+        xy[rows], confidence[rows] = new.xy, new.confidence
         return replace(
             self,
             evidence=replace(self.evidence, sightings=replace(every, xy=xy, confidence=confidence)),
@@ -220,9 +220,9 @@ class SetupHypothesis:
         person, sighting = person[near], sighting[near]
         away = seen.xy[sighting] - camera.project(others.points[person])[0]
         away /= seen.size_px[sighting][:, None, None]
-        who = followed(others.frame, others.points)[person]
-        for each in np.unique(who).tolist():
-            away[who == each] -= median_over(away[who == each])
+        identity = followed(others.frame, others.points)[person]
+        for each in np.unique(identity).tolist():
+            away[identity == each] -= median_over(away[identity == each])
         miss = np.linalg.norm(away, axis=-1)
         left = np.maximum(1 - median_of(miss) / GATE, 0.0)
         return float(left.sum() / max(possible_matches(others.frame, seen.frame), 1))

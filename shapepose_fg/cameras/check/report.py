@@ -193,11 +193,11 @@ def _camera_figures(diagnosis: Diagnosis, rig: Rig) -> tuple[CameraFigures, ...]
     late = diagnosis.corrected.lag + remaining  # corrected and remaining offset
     found = []
     for view, name in enumerate(rig.names):
-        others, mine, camera = setup.others(view), setup.seen_by(view), setup.camera(view)
-        matched = match(others, mine, camera)
+        others, own, camera = setup.others(view), setup.seen_by(view), setup.camera(view)
+        matched = match(others, own, camera)
         points = others.points[matched.person]
         at, depth = camera.project(points)
-        out_px = miss_px(at, depth, mine.xy[matched.sighting])
+        out_px = miss_px(at, depth, own.xy[matched.sighting])
         figures = CameraFigures(
             camera=name,
             people=int(seen[view]),

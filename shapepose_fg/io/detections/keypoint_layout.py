@@ -51,7 +51,7 @@ def skeleton_of_people(
             return wanted, [f"{named[1]}, but they are read as {wanted.name}, as requested"]
         return wanted, []
     if named is not None:
-        skeleton, who, passed = named
+        skeleton, source, passed = named
         over = (
             [
                 (
@@ -62,7 +62,7 @@ def skeleton_of_people(
             if passed
             else []
         )
-        return skeleton, [f"joints are those of {skeleton.name}: {who}", *over]
+        return skeleton, [f"joints are those of {skeleton.name}: {source}", *over]
     if declared is not None:
         found, what = _declared(declared, count)
         if found is not None:

@@ -125,14 +125,14 @@ def _each(
     write: Callable[[int, Markers, Take, Written], None],
 ) -> Written:
     """Call `write` for each person with a marker; people without markers are noted."""
-    for person, who in enumerate(take.persons.tolist()):
+    for person, identity in enumerate(take.persons.tolist()):
         markers = markers_of(
             take, person, job.markers, job.arrays if job.markers == MarkerSet.BODY else None
         )
         if len(markers.frames) > 0:
-            write(who, markers, take, written)
+            write(identity, markers, take, written)
         else:
-            written.notes.append(f"{kind}: person {who} has no marker in any frame")
+            written.notes.append(f"{kind}: person {identity} has no marker in any frame")
     return written
 
 

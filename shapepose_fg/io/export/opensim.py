@@ -71,11 +71,11 @@ def write_opensim(job: Job) -> Written:
          if SKELETONS[layout].joints == tuple(names)),
         None,
     )  # fmt: skip
-    for place, who in enumerate(take.persons.tolist()):
+    for place, identity in enumerate(take.persons.tolist()):
         markers = markers_of(take, place, MarkerSet.OPENSIM)
         if len(markers.frames) == 0:
             continue
-        name = f"person_{who}"
+        name = f"person_{identity}"
         span = "{:.6f} {:.6f}".format(*take.times_s[markers.frames[[0, -1]]])
         scale = _scale_tool(name, markers, span, marker_file or "markers.xml")
         for part, tool in {"scale": scale, "ik": _ik_tool(name, markers, span)}.items():

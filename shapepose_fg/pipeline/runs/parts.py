@@ -122,11 +122,11 @@ class Parts:
                 rows.check_ranges()
                 table.check_ranges()
                 notes = Notes.from_dict(self.kept.about(_name(n)))
-                mine = range(done, min(done + notes.frames, frames.stop))
+                expected = range(done, min(done + notes.frames, frames.stop))
                 known = all(each.joint < len(joint_names) for each in notes.problems)
-                if not (known and _are_of(rows, mine, frame_s)):
+                if not (known and _are_of(rows, expected, frame_s)):
                     raise ValueError("its rows are not of this run")
-                done = mine.stop
+                done = expected.stop
 
     def drop(self, n: int) -> None:
         """Remove the rows of a part."""

@@ -69,12 +69,12 @@ def pictures_of(
     for name, placement in alike.items():
         size = rig.cameras[rig.names.index(name)].image_size
         if placement.calibrated_size != size:
-            theirs, ours = (
+            calibrated, stored = (
                 f"{width} x {height}" for width, height in (placement.calibrated_size, size)
             )
             raise InputError(
-                f"{FOOTAGE}: camera {name} was calibrated for pictures of {theirs}, but "
-                f"cameras.json of the result is for {ours}; give --detections with the folder of "
+                f"{FOOTAGE}: camera {name} was calibrated for pictures of {calibrated}, but "
+                f"cameras.json of the result is for {stored}; give --detections with the folder of "
                 "this result, or --image-placement"
             )
     sizes = {name: each.size for name, each in opened.items() if name not in alike}
