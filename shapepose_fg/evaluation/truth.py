@@ -188,8 +188,8 @@ def _arrays(file: Path) -> PlainPeople:
     frames = data.get("frames", np.arange(len(joints)))
     if frames.shape != (len(joints),) or frames.dtype.kind not in "iu":
         raise InputError(f"{file}: frames must be ({len(joints)},) whole numbers; correct them")
-    there = np.argwhere(np.isfinite(joints).all(axis=-1).any(axis=-1)).tolist()
-    rows = [(int(frames[t]), person, joints[t, person].astype(np.float64)) for t, person in there]
+    present = np.argwhere(np.isfinite(joints).all(axis=-1).any(axis=-1)).tolist()
+    rows = [(int(frames[t]), person, joints[t, person].astype(np.float64)) for t, person in present]
     return _table(file, rows, tuple(names), covered=spans_of(frames.tolist()))
 
 

@@ -161,8 +161,8 @@ def _with_shape(
     for index, _, free in _batches(rows, energy):
         # All joints alike, or poses would tremble with the views that see them.
         xyz = energy.model.keypoints(energy.complete(free))
-        alike = np.broadcast_to(np.eye(3) / sigma_m**2, (*xyz.shape, 3))
-        targets = EnergyTargets(xyz, alike)
+        information = np.broadcast_to(np.eye(3) / sigma_m**2, (*xyz.shape, 3))
+        targets = EnergyTargets(xyz, information)
         held = Held(betas[index], np.full(len(index), SETTLED), free[:, 13:-3])
         free[:, :10] = betas[index]
         for _ in range(_STEPS):

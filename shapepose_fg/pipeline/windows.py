@@ -97,12 +97,12 @@ class Engine:
 
         With `last`, the recording ends, or is cut, after them.
         """
-        following, decided = state.follow, list(state.decided)
+        tracking, decided = state.follow, list(state.decided)
         for frame in frames:
-            following, more = follow(self.tracker, following, frame, self.config.following)
+            tracking, more = follow(self.tracker, tracking, frame, self.config.following)
             decided += more
         if last:
-            following, more = finish(self.tracker, following)
+            tracking, more = finish(self.tracker, tracking)
             decided += more
         before, spans = state.before, list[Span]()
         while (cut := self._next(decided, before, last)) is not None:
@@ -110,7 +110,7 @@ class Engine:
             spans.append(Span(tuple(decided[:end]), before, stop))
             keep = self._overlap(decided, stop, -1)
             decided, before = decided[keep:], stop - keep
-        return spans, StreamState(following, tuple(decided), before)
+        return spans, StreamState(tracking, tuple(decided), before)
 
     def isolated_frames(self, frames: Iterable[Input]) -> Span:
         """Independent frames in one window, because bodies are fitted fastest in batches."""
@@ -144,12 +144,12 @@ def halved(
 
     `solved` are the rows of the span's keyframes, `between` includes the interpolated ones.
     """
-    given, rows = [each for each, _ in span.decided], solved.observations
+    frames, rows = [each for each, _ in span.decided], solved.observations
     number, time_s = (
-        np.array([each.frame for each in given]),
-        np.array([each.time_s.mean() for each in given]),
+        np.array([each.frame for each in frames]),
+        np.array([each.time_s.mean() for each in frames]),
     )
-    key, new = np.array([each.key for each in given]), np.zeros(len(given), dtype=bool)
+    key, new = np.array([each.key for each in frames]), np.zeros(len(frames), dtype=bool)
     for rows_of_person in window_rows(rows):
         at = np.searchsorted(number, rows.frame[rows_of_person])
         far = (
@@ -160,18 +160,20 @@ def halved(
         new[(at[1:] + at[:-1])[far] // 2] = True
     new[: span.start] = new[span.stop :] = False
     decided = list[Decided]()
-    for n, each in enumerate(given):
+    for n, each in enumerate(frames):
         if new[n]:
-            carried = between.rows(between.frame == each.frame)
-            unseen = np.full((*carried.joints.shape[:2], len(each.rig)), -1)
-            when = {
-                "frame": carried.frame,
-                "time_s": np.repeat(each.time_s[None], len(carried), axis=0),
+            interpolated = between.rows(between.frame == each.frame)
+            unseen = np.full((*interpolated.joints.shape[:2], len(each.rig)), -1)
+            times = {
+                "frame": interpolated.frame,
+                "time_s": np.repeat(each.time_s[None], len(interpolated), axis=0),
             }
             found = thinned(each.detections, each.rig, config.candidates)[0]
             decided.append((
                 replace(each, detections=found, key=True),
-                Observations.of(unseen, found, carried.joints, track=carried.person, **when),
+                Observations.of(
+                    unseen, found, interpolated.joints, track=interpolated.person, **times
+                ),
             ))  # fmt: skip
         else:
             decided.append((each, rows.rows(rows.frame == each.frame)))

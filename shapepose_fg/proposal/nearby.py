@@ -272,16 +272,16 @@ def tie(person, detection, own, arrays, mean, neighbours):
     limb, limb_ends = arrays.limb, arrays.limb_ends
     for e in range(len(person)):
         a, d = person[e], detection[e]
-        j, v, total, there = of_joint[d], of_view[d], 0.0, 0
+        j, v, total, count = of_joint[d], of_view[d], 0.0, 0
         for n in range(limb[j], limb[j + 1]):
             if own[a, limb_ends[n], v] >= 0:
-                there += 1
-        if there > 0:
+                count += 1
+        if count > 0:
             for n in range(begin[d], begin[d + 1]):
                 if own[a, of_joint[other[n]], v] == other[n]:
                     total += value[n]
-            total /= there
-        mean[e], neighbours[e] = total, there
+            total /= count
+        mean[e], neighbours[e] = total, count
 
 
 @kernel("i1 i1 i1 f1 b1 f0 i3 i1", FrameArrays, "f1 f1 b1 f1 i1 i1 i3")

@@ -79,8 +79,11 @@ def explain(
     number = names.index(joint)
     solver = Solver.of(people, rig)
     graph = solved_around(people, solver, person, frame, extra_factors)
-    here = people.frame == frame
-    around, at = _Detections.of(people.rows(here), rig, solver.config), int(here[:row].sum())
+    in_frame = people.frame == frame
+    around, at = (
+        _Detections.of(people.rows(in_frame), rig, solver.config),
+        int(in_frame[:row].sum()),
+    )
     views, factors, shares = _view_reasons(around, graph, at, number, solver.config)
     place, known = people.joints[row, number], np.isfinite(people.joints[row, number]).all()
     sigma, when = float(sigma_m(people.covariance[row, number])), float(people.time_s[row])
@@ -102,8 +105,8 @@ def _row_of(people: Reconstruction, person: int, frame: int | None, time_s: floa
     """
     rows = np.flatnonzero(people.person == person)
     if len(rows) == 0:
-        there = " ".join(map(str, np.unique(people.person).tolist()[:20]))
-        raise InputError(f"person {person}: not in the result; there are {there or 'none'}")
+        known = " ".join(map(str, np.unique(people.person).tolist()[:20]))
+        raise InputError(f"person {person}: not in the result; there are {known or 'none'}")
     if (frame is None) == (time_s is None):
         raise InputError("give either a frame or a time")
     if time_s is not None:
@@ -206,7 +209,7 @@ def _view_reasons(
     reasons = []
     for v, name in enumerate(table.view_names.tolist()):
         off_px = off_sigma = None
-        like = ""
+        words = ""
         if seen[v] and np.isfinite(residual[v]).all() and sigma[v] > 0:
             least = np.eye(3)  # weak prior of 1 m
             without = inverses(raise_eigenvalues(whole - information[v], 0.0) + least)
@@ -215,7 +218,7 @@ def _view_reasons(
             off_px = float(np.linalg.norm(away))
             off_sigma = float(np.sqrt(away @ np.linalg.solve(spread, away)))
             if off_sigma > OFF_SIGMA:
-                like = _looks_like(
+                words = _looks_like(
                     all_of_it, row, joint, v, table.xy[row, joint, v], float(sigma[v]), off_px
                 )
         reason = ViewReason(
@@ -229,7 +232,7 @@ def _view_reasons(
             off_px=off_px,
             off_sigma=off_sigma,
             share=shares[v],
-            looks_like=like,
+            looks_like=words,
         )
         reasons.append(reason)
     factor_shares = dict[tuple[str, tuple[str, ...]], float]()
@@ -257,21 +260,21 @@ def _looks_like(
     `sigma` and distance `off` from its joint, pixels.
     """
     people, names = all_of_it.people, all_of_it.people.joint_names.tolist()
-    here = np.flatnonzero(people.frame == people.frame[row])
+    rows = np.flatnonzero(people.frame == people.frame[row])
     alike = np.array(
         [j for j, name in enumerate(names) if name in (names[joint], mirrored(names[joint]))]
     )
-    points, covariance = people.joints[here][:, alike], people.covariance[here][:, alike]
-    xy, _, slope = (each[:, :, view] for each in all_of_it.views.rows(here).project(points))
+    points, covariance = people.joints[rows][:, alike], people.covariance[rows][:, alike]
+    xy, _, slope = (each[:, :, view] for each in all_of_it.views.rows(rows).project(points))
     away, spread = (xy - at)[..., None], sigma**2 * np.eye(2) + slope @ covariance @ slope.mT
     known = np.isfinite(away).all(axis=(-1, -2)) & np.isfinite(spread).all(axis=(-1, -2))
-    known &= ~((here == row)[:, None] & (alike == joint))
+    known &= ~((rows == row)[:, None] & (alike == joint))
     squared = np.full(known.shape, np.inf)
     squared[known] = (away[known].mT @ np.linalg.solve(spread[known], away[known]))[..., 0, 0]
     squared[np.linalg.norm(away[..., 0], axis=-1) >= _APART * off] = np.inf
     n, j = np.unravel_index(squared.argmin(), squared.shape)
     return (
-        f"person {people.person[here[n]]}'s {names[alike[j]]}"
+        f"person {people.person[rows[n]]}'s {names[alike[j]]}"
         if squared[n, j] < OFF_SIGMA**2
         else ""
     )
@@ -287,8 +290,8 @@ def _refused(
     frame = int(people.frame[row])
     if detections is None or not 0 <= frame < len(detections):
         return []
-    seen, here = detections[frame], np.flatnonzero(people.frame == frame)
-    owner, me = _owner(seen, table, here), int((here < row).sum())
+    seen, rows = detections[frame], np.flatnonzero(people.frame == frame)
+    owner, me = _owner(seen, table, rows), int((rows < row).sum())
     views = all_of_it.views.rows(np.array([row]))
     xy, depth = (each[0, 0] for each in views.pixels(people.joints[row, joint][None, None]))
     begin, other, affinity = seen.ties
@@ -300,7 +303,7 @@ def _refused(
         own_affinity, others = (
             affinity[ends][owner[other[ends]] == n].sum() for n in (me, owner[k])
         )
-        owner_words = f"person {people.person[here[owner[k]]]}'s"
+        owner_words = f"person {people.person[rows[owner[k]]]}'s"
         if owner[k] < 0:
             sigmas, others = all_of_it.sigmas_px[:, joint, view], 0.0
             usual = sigmas.sum() / max((sigmas > 0).sum(), 1)
@@ -391,10 +394,10 @@ def _findings(
 
 def _problem(people: Reconstruction, entries: RunEntries, row: int, joint: int) -> str:
     """The problem with a joint as run.json states it; empty if there was none."""
-    here = int(people.person[row]), int(people.frame[row]), str(people.joint_names[joint])
+    key = int(people.person[row]), int(people.frame[row]), str(people.joint_names[joint])
     problems = entries.people.problems
     return next(
-        (each.reason for each in problems if (each.person, each.frame, each.joint) == here), ""
+        (each.reason for each in problems if (each.person, each.frame, each.joint) == key), ""
     )
 
 

@@ -330,21 +330,21 @@ def _follow(
         if abs(time_s - looked_s) < _DUPLICATES_S:
             continue
         looked_s = time_s
-        gone, same = _duplicates(tracks, candidate)
-        if len(gone) > 0:
+        duplicates, same = _duplicates(tracks, candidate)
+        if len(duplicates) > 0:
             log.duplicates.append(
                 (
                     slice(t + 1, None) if forwards else slice(0, t),
-                    tracks.ids[gone],
+                    tracks.ids[duplicates],
                     tracks.ids[same],
                 )
             )
             births = {
                 hypothesis: since
                 for hypothesis, since in births.items()
-                if hypothesis not in tracks.global_hypothesis[gone]
+                if hypothesis not in tracks.global_hypothesis[duplicates]
             }
-            rest = np.setdiff1d(np.arange(len(tracks)), gone)
+            rest = np.setdiff1d(np.arange(len(tracks)), duplicates)
             tracks, candidate = tracks.rows(rest), candidate[rest]
         if abs(time_s - sought_s) < SEARCH_S:
             continue
@@ -354,8 +354,10 @@ def _follow(
             for hypothesis, since in births.items()
             if (since <= t if forwards else since >= t)
         ]:
-            here = tracks.global_hypothesis == hypothesis
-            places, detections = _newcomers(tracker, tracks.rows(here), candidate[here], frame)
+            of_hypothesis = tracks.global_hypothesis == hypothesis
+            places, detections = _newcomers(
+                tracker, tracks.rows(of_hypothesis), candidate[of_hypothesis], frame
+            )
             if len(places) > 0:
                 new = tracker.at(
                     places,
@@ -381,7 +383,7 @@ def _duplicates(
     Duplicate global hypotheses have the same detections (A, J, V) and the same positions of placed
     joints.
     """
-    gone, same = np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp)
+    duplicates, same = np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp)
     known, kept = tracks.joints.sigma_m < LOST_M, dict[tuple[bytes, ...], NDArray[np.intp]]()
     for hypothesis in np.unique(tracks.global_hypothesis).tolist():
         rows = np.flatnonzero(tracks.global_hypothesis == hypothesis)
@@ -392,8 +394,8 @@ def _duplicates(
             tracks.joints.position[rows] - tracks.joints.position[other], axis=-1
         )
         if other is not rows and (apart[known[rows] & known[other]] < _SAME_M).all():
-            gone, same = np.append(gone, rows), np.append(same, other)
-    return gone, same
+            duplicates, same = np.append(duplicates, rows), np.append(same, other)
+    return duplicates, same
 
 
 class _Log:
@@ -445,21 +447,21 @@ class _Log:
     def hypotheses(self) -> Hypotheses:
         """All recorded tracks, as hypotheses."""
         H, T, (J, V) = len(self.carried), len(self.frames), self.shape
-        there = np.zeros((H, T), dtype=bool)
+        present = np.zeros((H, T), dtype=bool)
         candidate, price = (
             np.full((H, T, J, V), -1, dtype=np.int32),
             np.zeros((H, T), dtype=np.float32),
         )
         places, weight = np.full((H, T, J, 3), np.nan), np.zeros((H, T, J, V), dtype=np.float32)
         for t, ids, own, at, counts, costs in self.parts:
-            there[ids, t], candidate[ids, t], places[ids, t] = True, own, at
+            present[ids, t], candidate[ids, t], places[ids, t] = True, own, at
             weight[ids, t], price[ids, t] = counts, costs
         size = 3 * self.tracker.scale.motion.order
         mean, covariance = np.zeros((H, J, size)), np.zeros((H, J, size, size))
         for ids, joints in self.kept:
             mean[ids], covariance[ids] = joints.mean, joints.covariance
         for span, ids, others in reversed(self.duplicates):
-            for each in (there, candidate, price, places, weight):
+            for each in (present, candidate, price, places, weight):
                 each[ids, span] = each[others, span]
             if self.keep in range(T)[span]:
                 mean[ids], covariance[ids] = mean[others], covariance[others]
@@ -472,7 +474,7 @@ class _Log:
         return Hypotheses(
             carried,
             global_hypothesis,
-            there,
+            present,
             candidate,
             places,
             weight,

@@ -155,9 +155,13 @@ def _pairs(
     before, after, apart_m, reach_m = before[may], after[may], apart_m[may], reach_m[may]
     unlike = _unlike(ends.bones[before], ends.bones[after])
     unlike = np.where(np.isnan(unlike) & (gap_s[may] <= _BRIEF_S), 1.0, unlike)  # the expectation
-    alike = unlike <= _BUILD  # false where unknown
-    unlike = ends.bones.shape[1] * unlike[alike]
-    return before[alike], after[alike], _costs(apart_m[alike], reach_m[alike], unlike)
+    same_build = unlike <= _BUILD  # false where unknown
+    unlike = ends.bones.shape[1] * unlike[same_build]
+    return (
+        before[same_build],
+        after[same_build],
+        _costs(apart_m[same_build], reach_m[same_build], unlike),
+    )
 
 
 def _unlike(bones: Array, others: Array) -> Array:

@@ -185,7 +185,7 @@ class Tracker:
         positions (P, J, 3), metres, NaN where unknown, and detections (P, J, V).
         """
         core, J = list(self.skeleton.core), len(self.skeleton)
-        there, found, detections_of = (
+        places, found, detections_of = (
             tracks.joints.position,
             [np.zeros((0, J, 3))],
             [np.zeros((0, J, len(rig)), np.intp)],
@@ -200,11 +200,11 @@ class Tracker:
             people = find(detections.only(free), rig)
             own = np.where(people.candidate >= 0, np.append(rest, -1)[people.candidate], -1)
             twice = (own >= 0).sum(axis=2)[:, core] >= 2
-            apart = (mean_distance(people.initial, there) > _APART_M).all(axis=1)
+            apart = (mean_distance(people.initial, places) > _APART_M).all(axis=1)
             new = apart & (twice.sum(axis=1) >= self.config.min_new_joints)
             found.append(people.initial[new])
             detections_of.append(own[new])
-            there = np.concatenate([there, people.initial[new]])
+            places = np.concatenate([places, people.initial[new]])
             free[own[new][own[new] >= 0]] = False
         return np.concatenate(found), np.concatenate(detections_of)
 

@@ -142,8 +142,8 @@ class BiasedResiduals:
             A = (by_point @ views.cTw[:, :, :3] * root).reshape(N, J, 2 * V, 3)
             inverse = placing(A)
             points = points + (inverse @ r.reshape(N, J, 2 * V, 1))[..., 0]
-        there = self.weight[..., None] > 0
-        middle = np.where(there, self.xy, 0.0).sum(axis=1) / np.maximum(there.sum(axis=1), 1)
+        seen = self.weight[..., None] > 0
+        middle = np.where(seen, self.xy, 0.0).sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
         rows, bias = np.zeros((N, J, V, 2, V * (Q + 3) + 1)), V * Q
         of_cameras = by_parameters(projected, at, by_point, views)
         for v in range(V):

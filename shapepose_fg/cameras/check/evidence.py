@@ -79,10 +79,12 @@ def gather(detections: DetectionSequence, frames: range, views: int) -> Evidence
         if (
             sum(len(detections[t]) > 0 for t in spread.tolist()) < MOST_FRAMES // 4
         ):  # people are present only at times
-            there = np.array(
+            occupied = np.array(
                 [t for t in frames if len(detections[t]) > 0] or [frames.start], dtype=np.intp
             )
-            spread = there[np.unique(np.linspace(0, len(there) - 1, MOST_FRAMES).astype(np.intp))]
+            spread = occupied[
+                np.unique(np.linspace(0, len(occupied) - 1, MOST_FRAMES).astype(np.intp))
+            ]
         # Number of frames of a longer recording with neighbours used.
         every = max(1, MOST_FRAMES // 16)
         near = [np.arange(t - most, t + most + 1) for t in spread[::every]]
@@ -93,8 +95,8 @@ def gather(detections: DetectionSequence, frames: range, views: int) -> Evidence
     sightings = Sightings.of(pictures, wanted.tolist())
     for frame in wanted.tolist():
         stopped[list(pictures.repeated(frame))] += 1 / len(wanted)
-    here = sightings.rows(np.isin(sightings.frame, spread))
-    _, each = np.unique(here.frame, return_counts=True)
+    in_frames = sightings.rows(np.isin(sightings.frame, spread))
+    _, each = np.unique(in_frames.frame, return_counts=True)
     pairs = int((each * (each - 1) // 2).sum())
     if pairs > _MOST_PAIRS:
         spread = spread[:: -(-pairs // _MOST_PAIRS)]

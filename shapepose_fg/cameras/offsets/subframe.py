@@ -143,8 +143,8 @@ class InSpace:
             now = times[:, None] + shift[v]
             row, which = np.nonzero((now >= each.frame[each.first]) & (now < each.lasts))
             xy = _pixels(each.at(which, times[row] + shift[v])[0], views.K[v] @ views.cTw[v, :, :3])
-            there = np.isfinite(xy[..., 0]).astype(float)
-            parts.append(Sightings(row, np.full(len(row), v), xy, there))
+            known = np.isfinite(xy[..., 0]).astype(float)
+            parts.append(Sightings(row, np.full(len(row), v), xy, known))
             owners.append(which)
         seen, owner = Sightings.concatenate(parts), np.concatenate(owners)
         enough = seen.confidence.sum(axis=1) >= MIN_JOINTS
@@ -199,9 +199,9 @@ class InSpace:
         members = enumerate(zip(self.tracks, np.maximum(self.member, 0).T, strict=True))
         found = [each.at(track, self.time + shift[view]) for view, (each, track) in members]
         rays, speed = (np.stack([each[n] for each in found], axis=2) for n in (0, 1))
-        there = self.member >= 0
-        rays = np.where(there[:, None, :, None], rays, np.nan)
-        size = np.where(there, np.stack([each[2] for each in found], axis=1), np.nan)
+        has_track = self.member >= 0
+        rays = np.where(has_track[:, None, :, None], rays, np.nan)
+        size = np.where(has_track, np.stack([each[2] for each in found], axis=1), np.nan)
         return rays, speed, _pixels(rays, self.views.K @ self.views.cTw[:, :, :3]), size
 
     def _moving(self, points: Array, speed: Array) -> Array:
@@ -239,14 +239,14 @@ class InSpace:
         away = placed.points - centres_of(self.views)[view]
         miss = np.where(seen, placed.miss_px / (size * self.views.focal_px)[:, None], 0.0)
         good = ((seen.sum(axis=-1) >= 2) & (miss.max(axis=-1) < GATE / 2))[..., None]
-        there = np.where(good, away / np.linalg.norm(away, axis=-1, keepdims=True), np.nan)
+        directions = np.where(good, away / np.linalg.norm(away, axis=-1, keepdims=True), np.nan)
         moving = self._moving(placed.points, np.where(seen[..., None], speed, np.nan))
         predicted = _across(placed.points, moving, centres_of(self.views)[view])
         order = np.lexsort((self.time, self.member[:, view]))
         rows = order[self.member[order, view] >= 0]
         track, time, own_rays = self.member[rows, view], self.time[rows], rays[rows]
         own_rays = own_rays / np.linalg.norm(own_rays, axis=-1, keepdims=True)
-        each = np.stack([own_rays - there[rows], predicted[rows], speed[rows, :, view]])
+        each = np.stack([own_rays - directions[rows], predicted[rows], speed[rows, :, view]])
         each /= size[rows, view][:, None, None]
         length = np.linalg.norm(each, axis=-1)
         known = (length[0] < GATE / 2) & (length[1:] < FASTEST / self.fps).all(axis=0)

@@ -248,18 +248,18 @@ def chosen_rows(
     if persons is not None:
         strangers = sorted(set(persons) - set(opened.person.tolist()))
         if strangers:
-            there = " ".join(map(str, np.unique(opened.person).tolist()))
-            raise InputError(f"--person {strangers[0]}: {path} has no such person; it has {there}")
+            known = " ".join(map(str, np.unique(opened.person).tolist()))
+            raise InputError(f"--person {strangers[0]}: {path} has no such person; it has {known}")
         selected = np.isin(opened.person, persons)
     if frames is None:
         return np.flatnonzero(selected)
-    found, there = (
+    found, known = (
         selected & (opened.frame >= frames.start) & (opened.frame < frames.stop),
         opened.frame[selected],
     )
-    if len(there) > 0 and not found.any():
+    if len(known) > 0 and not found.any():
         problem = f"{path} has no people in these frames"
         raise InputError(
-            f"--frames: {problem}; people are in frames {there.min()} to {there.max()}"
+            f"--frames: {problem}; people are in frames {known.min()} to {known.max()}"
         )
     return np.flatnonzero(found)

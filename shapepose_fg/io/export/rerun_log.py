@@ -95,8 +95,8 @@ class LiveLog:
         if len(rows) > 0:
             self._stream.set_time("time", duration=float(time_s[0]))
         for identity in self._there - set(persons.tolist()):
-            for gone in (person_path(identity), _sigma_path(identity)):
-                self._stream.log(gone, self._rr.Clear(recursive=True))
+            for path in (person_path(identity), _sigma_path(identity)):
+                self._stream.log(path, self._rr.Clear(recursive=True))
         self._there = set(persons.tolist())
         self._drawn = {
             identity: parts for identity, parts in self._drawn.items() if identity in self._there
@@ -191,8 +191,8 @@ def _log_person(rr: ModuleType, stream: Any, take: Take, person: int) -> None:
         _set_time(stream, take, index)
         there_before = row >= 0
         if row < 0:
-            for gone in (path, plot):
-                stream.log(gone, rr.Clear(recursive=True))
+            for path_ in (path, plot):
+                stream.log(path_, rr.Clear(recursive=True))
             continue
         joints, known = people.joints[row], sigma[row][np.isfinite(sigma[row])]
         placed = np.flatnonzero(np.isfinite(joints).all(axis=1))
@@ -242,8 +242,8 @@ def _log_bodies(
     motion = motion_of(take, person, arrays, np.eye(3))
     index = np.zeros(0, dtype=np.intp) if motion is None else motion.index
     appears = np.diff(index, prepend=-1 if identity in drawn else -2) > 1
-    gone = np.setdiff1d(np.r_[0, index + 1], index)
-    for at in gone[gone < len(take.frames)].tolist():
+    absent = np.setdiff1d(np.r_[0, index + 1], index)
+    for at in absent[absent < len(take.frames)].tolist():
         _set_time(stream, take, at)
         stream.log(f"{person_path(identity)}/body", rr.Clear(recursive=True))
     shapes = drawn.pop(identity, {})
@@ -262,10 +262,10 @@ def _log_bodies(
         near = arrays.weights[kept].max(axis=0) > 0.1
         bends = turns[:, bone, None].mT @ turns[:, near]
         for n, at in enumerate(index.tolist()):
-            alike = (bends[n] * shapes.get(bone, 0.0)).sum(axis=(1, 2))  # 1 + 2 cos of the bend
+            trace = (bends[n] * shapes.get(bone, 0.0)).sum(axis=(1, 2))  # 1 + 2 cos of the bend
             # Bend of a joint, radians, after which the shapes of the parts nearby
             # are logged again.
-            if appears[n] or alike.min() < 1 + 2 * math.cos(0.35):
+            if appears[n] or trace.min() < 1 + 2 * math.cos(0.35):
                 shapes[bone] = bends[n]
                 turn, way = motion.rotations[n, None], motion.pelvis[n, None]
                 vertices = skin(arrays, motion.rest.betas[None], turn, way, kept)[0]

@@ -130,8 +130,8 @@ def check_definition(name: str, text: str) -> None:
         for kind, field in (each.split() for each in FIELDS[own_name].split(";")):
             inner, _, array = kind.partition("[")
             has, _, has_array = found.get(field, "").partition("[")
-            alike = _FAMILY.get(inner, "message") == _FAMILY.get(has, "message") and has != ""
-            if not alike or array != has_array:
+            same_family = _FAMILY.get(inner, "message") == _FAMILY.get(has, "message") and has != ""
+            if not same_family or array != has_array:
                 raise ValueError(f"{other} has no {field} of {kind}")
             if inner in FIELDS:
                 waiting.append((inner, has))

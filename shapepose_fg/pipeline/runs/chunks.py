@@ -130,12 +130,14 @@ def same_people(before: Border, after: Border) -> dict[int, int]:
     shared = np.intersect1d(before.frame, after.frame)
     before, after = (each.rows(np.isin(each.frame, shared)) for each in (before, after))
     old, new = np.unique(before.track), np.unique(after.track)
-    alike = np.zeros((len(old), len(new)))
+    similarity = np.zeros((len(old), len(new)))
     for i, a in enumerate(old):
         rows_before = before.rows(before.track == a)
-        alike[i] = [_alike(rows_before, after.rows(after.track == b)) for b in new]
-    rows, columns = least_cost_pairs(-alike)
-    return {int(new[k]): int(old[i]) for i, k in zip(rows, columns, strict=True) if alike[i, k] > 0}
+        similarity[i] = [_alike(rows_before, after.rows(after.track == b)) for b in new]
+    rows, columns = least_cost_pairs(-similarity)
+    return {
+        int(new[k]): int(old[i]) for i, k in zip(rows, columns, strict=True) if similarity[i, k] > 0
+    }
 
 
 def _alike(a: Border, b: Border) -> float:

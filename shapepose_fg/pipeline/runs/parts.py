@@ -151,9 +151,9 @@ class Parts:
         name = self._followed
         if name is None:
             return None
-        there = {"at", *(key.partition(".")[0] for key in self.kept.keys(name))}
+        names = {"at", *(key.partition(".")[0] for key in self.kept.keys(name))}
         columns = {
-            key: column for key, column in _FOLLOWED.items() if key.partition(".")[0] in there
+            key: column for key, column in _FOLLOWED.items() if key.partition(".")[0] in names
         }
         joints, size = nobody.joints.mean.shape[1:]
         found = self.kept.columns(name, columns, {"J": joints, "S": size})
