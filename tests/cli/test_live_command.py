@@ -65,6 +65,19 @@ def test_people_come_out_as_lines(tmp_path, cameras, five_cameras, two_people):
         assert np.linalg.norm(joints[order] - two_people, axis=-1).mean() < 0.01
 
 
+@pytest.mark.slow
+def test_all_frames_of_a_file_are_refined(tmp_path, cameras, five_cameras, two_people):
+    """A file is read faster than its windows are solved."""
+    (tmp_path / "in.jsonl").write_text(lines(five_cameras, two_people, 60))
+    given = ["--calibration", cameras, "--detections", str(tmp_path / "in.jsonl")]
+    with pytest.raises(SystemExit) as ended:
+        main(["live", *given, "--workers", "2", "--output", str(tmp_path / "out.jsonl")])
+    assert ended.value.code == 0
+    told = [json.loads(line) for line in (tmp_path / "out.jsonl").read_text().splitlines()]
+    settled = [each["time_s"] for each in told if each["kind"] == "settled"]
+    assert settled == pytest.approx(np.arange(60) / 10)
+
+
 def test_cameras_that_are_not_wanted_are_passed_over(
     tmp_path, cameras, five_cameras, two_people, capsys
 ):

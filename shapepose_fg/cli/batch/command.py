@@ -20,7 +20,7 @@ from shapepose_fg.cli.options import (
     option,
 )
 from shapepose_fg.cli.stopping import Stopped
-from shapepose_fg.cli.terminal import bars, note, show, warn
+from shapepose_fg.cli.terminal import bars, note, show, show_written, warn
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.result_files import PEOPLE
 from shapepose_fg.core.result_files import RUN as RUN_FILE
@@ -106,7 +106,7 @@ def _run(
                 )
                 raise Stopped(stop.number, where) from None
     show(batch_status.summary(time.monotonic() - begin))
-    print(f"written  {output / BATCH}")
+    show_written([str(output / BATCH)])
     for name in (failed := batch_status.names("failed")):
         warn(f"{name}: {batch_status.of[name].reasons[-1]}")
     if len(failed) > 0:

@@ -136,7 +136,7 @@ class Skeletons:
 
 
 def draw_skeletons(picture: Picture, view: PictureView, people: Skeletons) -> None:
-    """Draw bones, joints (rings if they are inferred) and labels on `picture`."""
+    """Draw bones, joints (dark if they are inferred) and labels on `picture`."""
     stroke = stroke_of(view.size)
     # Number of straight segments in which a bone is drawn, because lens distortion curves
     # it.
