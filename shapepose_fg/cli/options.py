@@ -283,8 +283,10 @@ class ProjectOptions(DetectionOptions):
         INPUT, "Pose2Sim project: use its cameras, detections and frame rate."
     )
 
-    def completed(self, tell: Callable[..., None] = note) -> "tuple[Self, Pose2SimProject | None]":
-        """The options with the missing paths filled in from the project, and the project; `tell`
+    def completed(
+        self, notify: Callable[..., None] = note
+    ) -> "tuple[Self, Pose2SimProject | None]":
+        """The options with the missing paths filled in from the project, and the project; `notify`
         receives its notes.
         """
         if self.project is None:
@@ -292,7 +294,7 @@ class ProjectOptions(DetectionOptions):
         from shapepose_fg.io.pose2sim_project import read_pose2sim_project
 
         source = read_pose2sim_project(self.project)
-        tell(*source.notes)
+        notify(*source.notes)
         calibration, detections = (
             self.calibration or source.calibration,
             self.detections or source.detections,

@@ -608,6 +608,6 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
 
 def _without(detections: Detections, rig: Rig) -> Detections:
     """Detections without those of dark cameras."""
-    gone = np.zeros(len(rig), dtype=bool)
-    gone[list(rig.dark)] = True
-    return detections.only(~gone[detections.view]) if gone[detections.view].any() else detections
+    dark = np.zeros(len(rig), dtype=bool)
+    dark[list(rig.dark)] = True
+    return detections.only(~dark[detections.view]) if dark[detections.view].any() else detections

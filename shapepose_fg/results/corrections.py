@@ -124,11 +124,11 @@ def refuse_corrected(folder: Path) -> None:
     """Raise InputError if `folder` has a result that was corrected by hand, which a new result
     would overwrite.
     """
-    there = [name for name in (CORRECTIONS, UNCORRECTED) if (folder / name).exists()]
-    if len(there) > 0:
+    present = [name for name in (CORRECTIONS, UNCORRECTED) if (folder / name).exists()]
+    if len(present) > 0:
         cure = f"give another folder, or delete {CORRECTIONS} and {UNCORRECTED} first"
         raise InputError(
-            f"{folder}: this result was corrected by hand ({' and '.join(there)}); {cure}"
+            f"{folder}: this result was corrected by hand ({' and '.join(present)}); {cure}"
         )
 
 

@@ -291,7 +291,7 @@ def look_at_all(
 
 def _look_at(entry: Entry, folder: Path, begun: bool) -> int:
     """Check one recording; returns the size of its detections, bytes."""
-    known = prepare(entry.request, folder, tell=lambda *_: None)
+    known = prepare(entry.request, folder, notify=lambda *_: None)
     asked = known.request
     _, places, _ = find_places(known.detections, asked.rig())
     find_skeleton(asked.skeleton)

@@ -157,10 +157,10 @@ def find_places(path: Path, rig: Rig) -> tuple[DetectionFormat, list[Path], list
         )
     for form in FORMATS:
         found = [_named(folder, name, form.names) for name in rig.names]
-        there = [place for place in found if place is not None]
-        if len(there) == len(rig):
-            return form, there, []
-        if len(there) > 0:
+        places = [place for place in found if place is not None]
+        if len(places) == len(rig):
+            return form, places, []
+        if len(places) > 0:
             missing = rig.names[found.index(None)]
             raise InputError(
                 f'{folder / form.names[0].format(missing)}: the detections of camera "{missing}"'
@@ -267,8 +267,8 @@ def _of_all_cameras(file: Path, names: Sequence[str]) -> DetectionFormat | None:
 
 def _unfiltered(files: list[Path]) -> list[Path]:
     """Files without DeepLabCut's `_filtered` versions, if unfiltered ones exist."""
-    there = {each.name for each in files}
-    return [each for each in files if each.name.replace("_filtered", "") not in there - {each.name}]
+    names = {each.name for each in files}
+    return [each for each in files if each.name.replace("_filtered", "") not in names - {each.name}]
 
 
 def _read_folder(place: Path, camera: Camera) -> CameraPeople:
