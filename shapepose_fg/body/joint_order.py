@@ -154,8 +154,8 @@ def _logs(people: Array, first: Index, second: Index) -> Array:
 
 def _mean(values: Array) -> Array:
     """(N,) mean of the finite values in each row (N, M); NaN if there are none."""
-    there = np.isfinite(values)
-    total, count = np.where(there, values, 0.0).sum(axis=1), there.sum(axis=1)
+    known = np.isfinite(values)
+    total, count = np.where(known, values, 0.0).sum(axis=1), known.sum(axis=1)
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 

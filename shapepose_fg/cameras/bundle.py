@@ -225,9 +225,9 @@ def _information(
     for n, view in enumerate(seen):
         last.push_back(X(view))
         last.push_back(C(view))
-        at, ours = n * 15, view * Q
-        to[at : at + 6, ours : ours + 6] = np.eye(6)
-        to[at + 6 : at + 15, ours + 6 : ours + Q] = _lens_columns(rig.cameras[view])
+        at, columns = n * 15, view * Q
+        to[at : at + 6, columns : columns + 6] = np.eye(6)
+        to[at + 6 : at + 15, columns + 6 : columns + Q] = _lens_columns(rig.cameras[view])
     last.push_back(B(0))
     _, rest = graph.linearize(values).eliminatePartialMultifrontal(first)
     information = rest.hessian(last)[0][: len(to), : len(to)]  # the lens is fixed to the body

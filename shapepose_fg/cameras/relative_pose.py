@@ -254,11 +254,11 @@ def refined_pose(R: Array, t: Array, a: Array, b: Array, size: Array) -> tuple[A
 def _rows(tracks: CameraTracks, looks: Index) -> Index:
     """(K, F) the row of each track at each compared frame, -1 where it has none."""
     begins = tracks.frame[tracks.first]
-    there = (looks >= begins[:, None]) & (looks <= tracks.lasts[:, None])
-    return np.where(there, tracks.first[:, None] + looks - begins[:, None], -1)
+    inside = (looks >= begins[:, None]) & (looks <= tracks.lasts[:, None])
+    return np.where(inside, tracks.first[:, None] + looks - begins[:, None], -1)
 
 
 def _at_once(rows: Index) -> Mask:
     """(K, K) whether tracks overlap in time, and so are different people."""
-    there = (rows >= 0).astype(np.float64)
-    return np.asarray(there @ there.T > 0)
+    present = (rows >= 0).astype(np.float64)
+    return np.asarray(present @ present.T > 0)

@@ -1,7 +1,9 @@
 """The command `live`: online reconstruction from detections as they arrive."""
 
 import os
+import stat
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from shapepose_fg.cli.options import (
@@ -72,6 +74,7 @@ def live(
         OnlineReconstructor(rig, skeleton=joints, lag_s=lag, workers=workers) as people,
     ):
         frames, jumps, status = 0, 0, None
+        is_file = _is_file(detections)
 
         def push(*view: Any) -> None:
             nonlocal frames, jumps, status
@@ -81,6 +84,8 @@ def live(
                 frames = report.frames
                 publish("now", people.people())
                 publish("settled", people.settled())
+                if is_file:
+                    people.catch_up()
             if report.jumps > jumps:
                 jumps = report.jumps
                 of_cameras(f"the times of all cameras jumped to {view[2]:.2f} s")
@@ -96,7 +101,18 @@ def live(
         publish("settled", people.finish())
         report = people.report()
     out = f"{report.dropped} measurements were dropped (late, repeated, or at the wrong time)"
+    if report.unrefined > 0:
+        out += f"; {report.unrefined} frames were not refined, because solving did not keep up"
     note(f"{report.frames} frames, {report.late} of them late; {out}")
+
+
+def _is_file(detections: str | None) -> bool:
+    """Whether the input is a file on disk: it can wait for windows to be solved."""
+    try:
+        mode = os.fstat(0).st_mode if detections in (None, "-") else Path(detections).stat().st_mode
+    except OSError:
+        return False
+    return stat.S_ISREG(mode)
 
 
 def _say(

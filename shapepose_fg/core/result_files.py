@@ -164,21 +164,21 @@ class SavedTable(ExitStack, Generic[T]):
         names = (*kind.ROWS, *kind.shared(), *meanings, RUN_ID)
         self._npz = self.enter_context(NpzFile(file, names, f"{cure}, or run one first"))
         try:
-            there = self._npz.names
-            for name in there:
+            stored = self._npz.names
+            for name in stored:
                 self._npz.shape(name)  # report a damaged array before a missing one
             added = {name for name, column in self._columns.items() if column.missing is not None}
-            added |= {f"{name}_names" for name in added if name not in there}
+            added |= {f"{name}_names" for name in added if name not in stored}
             for name in (*kind.ROWS, *kind.shared(), *meanings):
-                if name not in there and name not in added:
+                if name not in stored and name not in added:
                     raise InputError(f"{file}: column {name} is missing; {cure}")
-            for name in meanings.keys() & set(there):
+            for name in meanings.keys() & set(stored):
                 words = self._npz.array(name)
                 # Files of earlier versions have fewer codes; new codes are appended.
                 if not (len(words) > 0 and np.array_equal(words, meanings[name][: len(words)])):
                     raise InputError(f"{file}: {name} are not those of this version; {cure}")
-            self.run_id = self._npz.array(RUN_ID) if RUN_ID in there else None
-            self._rows = [name for name in kind.ROWS if name in there]
+            self.run_id = self._npz.array(RUN_ID) if RUN_ID in stored else None
+            self._rows = [name for name in kind.ROWS if name in stored]
             self.count = (self._npz.shape(self._rows[0]) or (0,))[0]
             """Number of rows."""
             for name in self._rows:

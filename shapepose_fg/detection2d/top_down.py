@@ -156,12 +156,12 @@ class TopDownNetwork:
         """The beginning of MMPose's JSON of a video, with the layout of the joints unless it was
         guessed.
         """
-        alike = [
+        candidates = [
             each
             for each in SKELETONS.values()
             if each.keypoint_count == self.skeleton.keypoint_count
         ]
-        named = self.form.skeleton in SKELETONS or alike == [self.skeleton]
+        named = self.form.skeleton in SKELETONS or candidates == [self.skeleton]
         meta = {"dataset_name": self.skeleton.name} if named else {}
         return f'{{"meta_info": {json.dumps(meta)}, "instance_info": ['
 

@@ -93,10 +93,10 @@ def draft(
     fitted = JointTargets(np.zeros((N, J, 3)), np.zeros((N, J, 3, 3)))
     body, near = BodyFit.failed(np.full(N, FitStatus.TOO_FEW_JOINTS), J), np.zeros(N, dtype=bool)
     if last is not None:
-        here, there = _unchanged(observations, last.observations)
-        fitted.put(here, last.fitted.rows(there))
-        body.put(here, last.body.rows(there))
-        near[here] = body.ok[here]
+        unchanged, previous = _unchanged(observations, last.observations)
+        fitted.put(unchanged, last.fitted.rows(previous))
+        body.put(unchanged, last.body.rows(previous))
+        near[unchanged] = body.ok[unchanged]
     asked = new = np.flatnonzero(~near)
     evidence = evidence.rows(new)
     for reach_m in (None, *NARROWING_M):  # None: at triangulated joints, as above
@@ -124,9 +124,9 @@ def _unchanged(now: Observations, before: Observations) -> tuple[Index, Index]:
     these rows.
     """
     keys = pair_keys(*((each.frame, each.track) for each in (now, before)))
-    _, here, there = np.intersect1d(*keys, assume_unique=True, return_indices=True)
-    same = (now.xy[here] == before.xy[there]).all(axis=(1, 2, 3))
-    return here[same], there[same]
+    _, index, previous = np.intersect1d(*keys, assume_unique=True, return_indices=True)
+    same = (now.xy[index] == before.xy[previous]).all(axis=(1, 2, 3))
+    return index[same], previous[same]
 
 
 def joint_targets(evidence: ViewEvidence, enough: Mask) -> JointTargets:

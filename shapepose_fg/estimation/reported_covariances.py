@@ -134,9 +134,9 @@ def correlation_features(marginals: Marginals) -> tuple[float, float]:
     shown = np.linalg.inv(views + prior)
     of_body = (flat @ (shown @ views @ shown)).reshape(slope.shape) @ slope.mT
     kept = np.eye(3) - gain
-    alone = np.trace(kept @ of_body @ kept.mT + variance * kept, axis1=-2, axis2=-1)
+    one_frame = np.trace(kept @ of_body @ kept.mT + variance * kept, axis1=-2, axis2=-1)
     over_time = np.trace(marginals.joints()[some], axis1=-2, axis2=-1)
-    return _correlated_share(marginals), float(np.exp(np.log(alone / over_time)[seen].mean()))
+    return _correlated_share(marginals), float(np.exp(np.log(one_frame / over_time)[seen].mean()))
 
 
 def _correlated_share(marginals: Marginals) -> float:

@@ -326,8 +326,8 @@ def tied(people: Sequence[PersonGraph]) -> tuple[PersonGraph, ...]:
     together, found = dict[int, list[PersonGraph]](), list[PersonGraph]()
     for person in people:
         group = together.setdefault(id(person.window.ties), [])
-        alone = len(person.window.ties.people) == 1
-        found.append(person if alone else replace(person, together=group))
+        uncoupled = len(person.window.ties.people) == 1
+        found.append(person if uncoupled else replace(person, together=group))
         group.append(found[-1])
     return tuple(found)
 

@@ -33,9 +33,9 @@ def match_names(cameras: Sequence[str], names: Sequence[str]) -> list[int] | Non
     if all(len(each) == 1 for each in found) and len({each[0] for each in found}) == len(found):
         return [each[0] for each in found]
     for part in (_one_number_each, _own_words):
-        wanted, there = part(cameras), part(names)
-        if wanted is not None and there is not None and set(wanted) <= set(there):
-            return [there.index(each) for each in wanted]
+        wanted, offered = part(cameras), part(names)
+        if wanted is not None and offered is not None and set(wanted) <= set(offered):
+            return [offered.index(each) for each in wanted]
     return None
 
 

@@ -67,8 +67,8 @@ class Pose2SimProject:
         """File name of a person, without extension, in Pose2Sim's style; `person` None for the only
         one.
         """
-        who = "" if person is None else f"_P{person}"
-        return f"{self.name}{who}_{first}-{last}"
+        suffix = "" if person is None else f"_P{person}"
+        return f"{self.name}{suffix}_{first}-{last}"
 
     def span(self, count: int) -> range:
         """Wanted frames of a recording of `count` frames, counted from 0; InputError if there are
@@ -244,10 +244,10 @@ def _calibration(session: Path, folder: Path) -> Path:
     files.sort(key=lambda file: file.suffix != ".toml")  # the newest stays first within each kind
     found = next((each for each in (*files, rooms[0]) if is_calibration(each)), None)
     if found is None:
-        there = listing(sorted(each.name for each in rooms[0].iterdir()))
+        names = listing(sorted(each.name for each in rooms[0].iterdir()))
         cure = "run Pose2Sim's calibration, or put a format of docs/calibration_files.md there"
         raise InputError(
-            f"{rooms[0]}: there is no calibration in a known format; it contains {there}; {cure}"
+            f"{rooms[0]}: there is no calibration in a known format; it contains {names}; {cure}"
         )
     return found
 

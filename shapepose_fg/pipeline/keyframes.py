@@ -95,8 +95,10 @@ def tracked_rows(rows: Reconstruction) -> Mask:
     )
     order = np.lexsort((rows.frame, rows.person))
     inside = np.zeros(len(rows), dtype=bool)
-    for mine in np.split(order, np.flatnonzero(np.diff(rows.person[order])) + 1):
-        inside[mine] = (np.cumsum(seen[mine]) > 0) & (np.cumsum(seen[mine][::-1])[::-1] > 0)
+    for rows_of_person in np.split(order, np.flatnonzero(np.diff(rows.person[order])) + 1):
+        inside[rows_of_person] = (np.cumsum(seen[rows_of_person]) > 0) & (
+            np.cumsum(seen[rows_of_person][::-1])[::-1] > 0
+        )
     return seen | ~inside
 
 
@@ -112,8 +114,10 @@ def with_rows_like(
     new = np.flatnonzero(~np.isin(asked, known))
     after = np.searchsorted(known, asked[new])
     first, second = (order[np.clip(each, 0, len(order) - 1)] for each in (after - 1, after))
-    ours = (solved.person[first] == rows.person[new]) & (solved.person[second] == rows.person[new])
-    first, second, new = first[ours], second[ours], new[ours]
+    same_person = (solved.person[first] == rows.person[new]) & (
+        solved.person[second] == rows.person[new]
+    )
+    first, second, new = first[same_person], second[same_person], new[same_person]
     return _with_interpolated(solved, first, second, rows.frame[new], rows.time_s[new], motion)
 
 
@@ -206,17 +210,17 @@ def with_bodies_between(rows: Reconstruction) -> Reconstruction:
     """
     columns = {name: getattr(rows, name).copy() for name in BODY}
     status, order = rows.status.copy(), np.lexsort((rows.time_s, rows.person))
-    for mine in np.split(order, np.flatnonzero(np.diff(rows.person[order])) + 1):
-        ok = np.isfinite(rows.betas[mine]).all(axis=1)
-        known_s = rows.time_s[mine[ok]]
-        after = np.searchsorted(known_s, rows.time_s[mine])
+    for rows_of_person in np.split(order, np.flatnonzero(np.diff(rows.person[order])) + 1):
+        ok = np.isfinite(rows.betas[rows_of_person]).all(axis=1)
+        known_s = rows.time_s[rows_of_person[ok]]
+        after = np.searchsorted(known_s, rows.time_s[rows_of_person])
         inside = ~ok & (after > 0) & (after < len(known_s))
         if not inside.any():
             continue
-        first, second, new = after[inside] - 1, after[inside], mine[inside]
+        first, second, new = after[inside] - 1, after[inside], rows_of_person[inside]
         lasts_s = known_s[second] - known_s[first]
         share = (rows.time_s[new] - known_s[first]) / lasts_s
-        betas, orient, pose, transl = (columns[name][mine[ok]] for name in BODY)
+        betas, orient, pose, transl = (columns[name][rows_of_person[ok]] for name in BODY)
         turns = _quaternions(np.concatenate([orient[:, None], pose], axis=1)).reshape(
             len(betas), -1
         )

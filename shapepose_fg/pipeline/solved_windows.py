@@ -110,7 +110,7 @@ class SolvedWindows:
                         spans, state = engine.follow(state, given, last=last)
                         next_id = state.follow.next_id
                     else:
-                        spans = [engine.alone(self.book.watched(given))]
+                        spans = [engine.isolated_frames(self.book.watched(given))]
                 behind = Checkpoint(
                     batch.stop, next_id, state if config.temporal and not last else None
                 )
@@ -134,7 +134,7 @@ class SolvedWindows:
         name = identities.name
         for found in pool.map(solve_chunk, jobs()):
             chunk, read = waiting.popleft()
-            names = identities.names(found.begins, alone=chunk.first == chunk.own.start)
+            names = identities.names(found.begins, isolated=chunk.first == chunk.own.start)
             identities.remember(found.ends, names)
             for part in found.parts:
                 notes, rows, behind = part.notes, part.rows, None

@@ -67,10 +67,10 @@ def keep(kept: KeptArrays, rig: Rig) -> None:
 def refine(
     windows: SolvedWindows,
     camera_factors: CameraFactors | None = None,
-    tell: Callable[[int], object] = lambda done: None,
+    report: Callable[[int], object] = lambda done: None,
 ) -> Rig:
     """The rig of `windows` with trajectories refined by the people of the recording, and their
-    covariances. `tell` gets the number of frames that are done.
+    covariances. `report` gets the number of frames that are done.
     """
     rig, time_s = windows.setup.rig, windows.times.of_views(len(windows.setup.rig))
     frames = np.arange(windows.frames.start, windows.frames.stop)
@@ -88,7 +88,7 @@ def refine(
             poses[own[0] :] = passing.corrected(whole.odometry[own[0] :])
             poses[own] = graph.poses
             of_people += graph.of_poses()
-            tell(int(own[-1]) + 1)
+            report(int(own[-1]) + 1)
     poses, covariance = _smoothed(whole, poses, of_people)
     refined = [
         _refined(trajectory, whole.time_s, poses[:, n], whole.odometry[:, n], covariance[:, n])

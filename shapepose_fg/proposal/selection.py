@@ -65,11 +65,13 @@ class Evidence:
         """Compute the evidence for hypotheses in a frame."""
         chosen, detections = people.chosen, frame.detections
         has, weight = chosen >= 0, np.zeros(chosen.shape)
-        whose, which = np.ascontiguousarray(np.nonzero(has)[0]), chosen[has]
-        affinity, neighbours = own_affinity(whose, which, chosen, frame.arrays)
+        person, detection = np.ascontiguousarray(np.nonzero(has)[0]), chosen[has]
+        affinity, neighbours = own_affinity(person, detection, chosen, frame.arrays)
         near = np.exp(-0.5 * (np.nan_to_num(people.gap_m[has], posinf=1.0) / DETECTOR_M) ** 2)
         weight[has] = (
-            detections.confidence[which] * np.where(neighbours > 0, affinity, LEAST_AFFINITY) * near
+            detections.confidence[detection]
+            * np.where(neighbours > 0, affinity, LEAST_AFFINITY)
+            * near
         )
         weight[has.sum(axis=2) < 2] *= _SINGLE
         xy, depth = frame.rig.project(people.places)
@@ -102,10 +104,10 @@ def _bones(people: PossiblePeople, frame: Frame) -> Array:
     known = (twice & twice[:, parents])[:, core]
     off = np.log(np.maximum(share[:, core], 1e-3) / _USUAL)
     sigma = np.hypot(_SPREAD, DETECTOR_M / (_USUAL * frame.longest_m[core]))
-    mine = np.exp(-0.5 * (off / sigma) ** 2) / sigma
+    of_people = np.exp(-0.5 * (off / sigma) ** 2) / sigma
     phantoms = np.exp(-0.5 * (off / _PHANTOMS_SPREAD) ** 2) / _PHANTOMS_SPREAD
-    # Far from both distributions `mine` vanishes, and `_ASTRAY` bounds the ratio.
-    ratio = (1 - _ASTRAY) * mine / np.maximum(phantoms, 1e-300) + _ASTRAY
+    # Far from both distributions `of_people` vanishes, and `_ASTRAY` bounds the ratio.
+    ratio = (1 - _ASTRAY) * of_people / np.maximum(phantoms, 1e-300) + _ASTRAY
     return np.asarray(
         _BONE * np.log(ratio).sum(axis=1, where=known) - _BROKEN * broken, dtype=np.float64
     )

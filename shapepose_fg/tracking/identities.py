@@ -141,7 +141,7 @@ def _with_detections(
     return replace(chosen, start=start, stop=stop)
 
 
-def alone(tracker: Tracker, given: Input, next_id: int) -> Decided:
+def isolated_frame(tracker: Tracker, given: Input, next_id: int) -> Decided:
     """Process an isolated frame: people found by stage I, numbered from `next_id` on."""
     nobody, none = (
         tracker.nobody(),
@@ -149,8 +149,8 @@ def alone(tracker: Tracker, given: Input, next_id: int) -> Decided:
     )
     for _ in range(_ROUNDS):
         places, candidate = tracker.newcomers(nobody, none, given.detections, given.rig)
-        there = np.arange(len(places))
-        found = tracker.at(places, there, 0 * there, float(given.time_s.mean()))
+        index = np.arange(len(places))
+        found = tracker.at(places, index, 0 * index, float(given.time_s.mean()))
         before, given = given, correct_swaps_now(tracker, found, given, followed=False)[1]
         if given is before:
             break
@@ -161,11 +161,11 @@ def _rows(
     given: Input, t: int, found: Hypotheses, chosen: SelectedTracks, identity: Index
 ) -> Observations:
     """The people of a frame as observations; uncertain joints are NaN."""
-    here = np.flatnonzero(chosen.during(t) & (identity >= 0))
-    who = chosen.hypothesis[here]
-    own = found.candidate[who, t].astype(np.intp)
-    evidence = own_evidence(own, found.weight[who, t], found.price[who, t])
-    return observed(given, own, found.places[who, t], identity[here], evidence)
+    index = np.flatnonzero(chosen.during(t) & (identity >= 0))
+    hypothesis = chosen.hypothesis[index]
+    own = found.candidate[hypothesis, t].astype(np.intp)
+    evidence = own_evidence(own, found.weight[hypothesis, t], found.price[hypothesis, t])
+    return observed(given, own, found.places[hypothesis, t], identity[index], evidence)
 
 
 def observed(

@@ -47,14 +47,14 @@ def reassociate(
         evidence = rows.evidence[index]
         while least is not None and len(index) > 0:
             evidence = probabilities_of(frame, candidate, joints[index], skeleton)
-            gone = people_to_remove(evidence, joints[index], skeleton, least)
-            if not gone.any():
+            removed = people_to_remove(evidence, joints[index], skeleton, least)
+            if not removed.any():
                 break
-            index, evidence = index[~gone], evidence[~gone]
+            index, evidence = index[~removed], evidence[~removed]
             candidate, probability = _reassigned(frame, joints[index], sigma_m[index], skeleton)
-        who = {name: getattr(rows, name)[index] for name in ("track", "frame", "time_s")}
+        columns = {name: getattr(rows, name)[index] for name in ("track", "frame", "time_s")}
         sure = {"probability": probability, "evidence": evidence}
-        parts.append(Observations.of(candidate, frame.detections, joints[index], **who, **sure))
+        parts.append(Observations.of(candidate, frame.detections, joints[index], **columns, **sure))
     return Observations.concatenate(parts)
 
 
@@ -75,9 +75,11 @@ def _reassigned(
 
 def probabilities_of(frame: Input, candidate: Index, joints: Array, skeleton: Skeleton) -> Array:
     """(P,) existence probability of each person of a frame."""
-    there = Frame(frame.detections, frame.rig, skeleton, longest_bones(skeleton))
+    of_frame = Frame(frame.detections, frame.rig, skeleton, longest_bones(skeleton))
     return existence(
-        PossiblePeople(joints, candidate, gaps(joints, candidate, there)), there, PRIOR_WITH_BODY
+        PossiblePeople(joints, candidate, gaps(joints, candidate, of_frame)),
+        of_frame,
+        PRIOR_WITH_BODY,
     )
 
 

@@ -95,8 +95,8 @@ class _Compared:
         fits = apart_of[number, best] < _FITS
         log = _prior(len(states)) + (same - turned)[number, 1:, best] @ states.T / 2
         log -= np.logaddexp.reduce(log, axis=1, keepdims=True)
-        who, log = np.where(fits, ids[best], -1), np.where(fits[:, None], log, 0.0)
-        return cls(groups, who, log)
+        person, log = np.where(fits, ids[best], -1), np.where(fits[:, None], log, 0.0)
+        return cls(groups, person, log)
 
     def exchanged(self, skeleton: Skeleton) -> Mask:
         """(G, K) parts most probably swapped that may be corrected: another view is right, or all
@@ -127,12 +127,12 @@ class _Compared:
             found.mirrored.copy(),
             np.zeros(part.max()),
         )
-        for group, who, exchanged in zip(
+        for group, person, exchanged in zip(
             self.groups, self.who.tolist(), self.exchanged(skeleton), strict=True
         ):
-            if who >= 0 and (who in own or exchanged.any()):
-                of, (turned, doubt) = part[found.joint[group]], own.get(who, (right, right))
-                if who in own:
+            if person >= 0 and (person in own or exchanged.any()):
+                of, (turned, doubt) = part[found.joint[group]], own.get(person, (right, right))
+                if person in own:
                     mirrored[group] = np.append(0.0, doubt)[of]
                 change = exchanged != turned
                 if change.any() and not _doubtful(doubt, skeleton):

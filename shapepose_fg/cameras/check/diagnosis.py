@@ -61,11 +61,11 @@ def _same_detections(evidence: Evidence, rig: Rig, first: int, second: int) -> b
     distance = np.linalg.norm(
         raw[0].reshape(one.xy.shape)[i] - raw[1].reshape(other.xy.shape)[j], axis=-1
     )
-    there = ~np.isnan(distance)
+    known = ~np.isnan(distance)
     # Maximum distance, px, between detections of one picture stored with pixel accuracy.
-    alike = (there & (distance < 0.6)).sum(axis=1) >= 0.9 * np.maximum(there.sum(axis=1), 1)
-    alike &= there.sum(axis=1) >= 3
-    return bool(len(np.unique(i[alike])) >= 0.8 * len(one))
+    equal = (known & (distance < 0.6)).sum(axis=1) >= 0.9 * np.maximum(known.sum(axis=1), 1)
+    equal &= known.sum(axis=1) >= 3
+    return bool(len(np.unique(i[equal])) >= 0.8 * len(one))
 
 
 def other_sizes(given: Sequence[str], rig: Rig) -> tuple[Finding, ...]:
@@ -261,14 +261,14 @@ def _without_duplicates(setup: SetupHypothesis, rig: Rig) -> tuple[list[Finding]
     """Duplicated cameras, and the evidence without the one of each pair that fits the
     others less.
     """
-    findings, evidence, gone = list[Finding](), setup.evidence, set[int]()
+    findings, evidence, removed = list[Finding](), setup.evidence, set[int]()
     for found in duplicates(rig, evidence):
-        if gone.isdisjoint(found.cameras):
-            gone.add(min(found.cameras[::-1], key=lambda view: setup.scores[view] - 1e-6 * view))
+        if removed.isdisjoint(found.cameras):
+            removed.add(min(found.cameras[::-1], key=lambda view: setup.scores[view] - 1e-6 * view))
             findings.append(found)
-    if gone:
+    if removed:
         seen = evidence.sightings
-        evidence = replace(evidence, sightings=seen.rows(~np.isin(seen.view, list(gone))))
+        evidence = replace(evidence, sightings=seen.rows(~np.isin(seen.view, list(removed))))
     return findings, evidence
 
 
@@ -277,9 +277,9 @@ def _without_people(setup: SetupHypothesis) -> list[Finding]:
     seen = np.bincount(setup.sightings.view, minlength=setup.view_count)
     if seen.sum() == 0:
         return _nobody_placed(setup)
-    gone = (seen == 0) & (setup.evidence.stopped < _STOPPED) & (seen.sum() >= MIN_SIGHTINGS)
-    gone = np.flatnonzero(gone).tolist()
-    return [Finding(Kind.NOBODY, tuple(gone))] if gone else []
+    views = (seen == 0) & (setup.evidence.stopped < _STOPPED) & (seen.sum() >= MIN_SIGHTINGS)
+    views = np.flatnonzero(views).tolist()
+    return [Finding(Kind.NOBODY, tuple(views))] if views else []
 
 
 def _stopped(setup: SetupHypothesis) -> list[Finding]:

@@ -79,10 +79,12 @@ def gather(detections: DetectionSequence, frames: range, views: int) -> Evidence
         if (
             sum(len(detections[t]) > 0 for t in spread.tolist()) < MOST_FRAMES // 4
         ):  # people are present only at times
-            there = np.array(
+            occupied = np.array(
                 [t for t in frames if len(detections[t]) > 0] or [frames.start], dtype=np.intp
             )
-            spread = there[np.unique(np.linspace(0, len(there) - 1, MOST_FRAMES).astype(np.intp))]
+            spread = occupied[
+                np.unique(np.linspace(0, len(occupied) - 1, MOST_FRAMES).astype(np.intp))
+            ]
         # Number of frames of a longer recording with neighbours used.
         every = max(1, MOST_FRAMES // 16)
         near = [np.arange(t - most, t + most + 1) for t in spread[::every]]
@@ -93,8 +95,8 @@ def gather(detections: DetectionSequence, frames: range, views: int) -> Evidence
     sightings = Sightings.of(pictures, wanted.tolist())
     for frame in wanted.tolist():
         stopped[list(pictures.repeated(frame))] += 1 / len(wanted)
-    here = sightings.rows(np.isin(sightings.frame, spread))
-    _, each = np.unique(here.frame, return_counts=True)
+    in_frames = sightings.rows(np.isin(sightings.frame, spread))
+    _, each = np.unique(in_frames.frame, return_counts=True)
     pairs = int((each * (each - 1) // 2).sum())
     if pairs > _MOST_PAIRS:
         spread = spread[:: -(-pairs // _MOST_PAIRS)]
@@ -137,9 +139,9 @@ class SetupHypothesis:
     def seeing(self, view: int, change: Callable[[Sightings], Sightings]) -> "SetupHypothesis":
         """Return the set-up with changed detections of one camera."""
         every = self.evidence.sightings
-        mine = np.flatnonzero(every.view == view)
-        xy, confidence, new = every.xy.copy(), every.confidence.copy(), change(every.rows(mine))
-        xy[mine], confidence[mine] = new.xy, new.confidence
+        rows = np.flatnonzero(every.view == view)
+        xy, confidence, new = every.xy.copy(), every.confidence.copy(), change(every.rows(rows))
+        xy[rows], confidence[rows] = new.xy, new.confidence
         return replace(
             self,
             evidence=replace(self.evidence, sightings=replace(every, xy=xy, confidence=confidence)),
@@ -220,9 +222,9 @@ class SetupHypothesis:
         person, sighting = person[near], sighting[near]
         away = seen.xy[sighting] - camera.project(others.points[person])[0]
         away /= seen.size_px[sighting][:, None, None]
-        who = followed(others.frame, others.points)[person]
-        for each in np.unique(who).tolist():
-            away[who == each] -= median_over(away[who == each])
+        identity = followed(others.frame, others.points)[person]
+        for each in np.unique(identity).tolist():
+            away[identity == each] -= median_over(away[identity == each])
         miss = np.linalg.norm(away, axis=-1)
         left = np.maximum(1 - median_of(miss) / GATE, 0.0)
         return float(left.sum() / max(possible_matches(others.frame, seen.frame), 1))

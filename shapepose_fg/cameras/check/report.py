@@ -193,11 +193,11 @@ def _camera_figures(diagnosis: Diagnosis, rig: Rig) -> tuple[CameraFigures, ...]
     late = diagnosis.corrected.lag + remaining  # corrected and remaining offset
     found = []
     for view, name in enumerate(rig.names):
-        others, mine, camera = setup.others(view), setup.seen_by(view), setup.camera(view)
-        matched = match(others, mine, camera)
+        others, own, camera = setup.others(view), setup.seen_by(view), setup.camera(view)
+        matched = match(others, own, camera)
         points = others.points[matched.person]
         at, depth = camera.project(points)
-        out_px = miss_px(at, depth, mine.xy[matched.sighting])
+        out_px = miss_px(at, depth, own.xy[matched.sighting])
         figures = CameraFigures(
             camera=name,
             people=int(seen[view]),
@@ -509,9 +509,12 @@ def unseen(
         for view in range(len(names)):
             joints = np.bincount(found.joint[found.view == view], minlength=max(core) + 1)
             seen[row, view] = np.median(joints[core])
-    by_two, here = float(np.sort(seen, axis=1)[:, -2].mean()), float(per_frame[looked_at].mean())
+    by_two, mean_rows = (
+        float(np.sort(seen, axis=1)[:, -2].mean()),
+        float(per_frame[looked_at].mean()),
+    )
     # Minimum number of missing people per frame, and minimum share of them, for a warning.
-    if by_two - here < max(0.5, 0.1 * by_two):
+    if by_two - mean_rows < max(0.5, 0.1 * by_two):
         return []
     why = "the others are seen too little, or the cameras do not agree on them"
     # Duration, s, below which people seen by two cameras may lack evidence.
@@ -524,7 +527,7 @@ def unseen(
     most = " and ".join(names[view] for view in two)
     return [
         (
-            f"two cameras see {by_two:.1f} people per frame, but {here:.1f} are found: {why} "
+            f"two cameras see {by_two:.1f} people per frame, but {mean_rows:.1f} are found: {why} "
             f"({most} see most)"
         )
     ]

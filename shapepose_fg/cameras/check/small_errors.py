@@ -141,10 +141,10 @@ class SmallErrors:
         done = np.zeros(to.shape[1])
         if before is not None:
             done[: len(sigma)] = before / sigma
-        there = np.flatnonzero(to.any(axis=1))
-        to = to[there]
-        H = to.T @ np.array([each.H[np.ix_(there, there)] for each in marginals]) @ to
-        g = np.array([each.g[there] for each in marginals]) @ to - done
+        columns = np.flatnonzero(to.any(axis=1))
+        to = to[columns]
+        H = to.T @ np.array([each.H[np.ix_(columns, columns)] for each in marginals]) @ to
+        g = np.array([each.g[columns] for each in marginals]) @ to - done
         known = H + np.eye(len(done))
         best = np.linalg.solve(known, g[..., None])[..., 0]
         gain = (g * best).sum(axis=1) - done @ done - np.linalg.slogdet(known)[1]

@@ -162,8 +162,8 @@ def _add_likeness(
             )
             square = dots**2 / np.maximum(energy, 1e-12)
             place = begin_other - begin_one + apart + len(significance) // 2
-            alike = (stop - start >= least) & (dots > 0) & (square > _LEAST_ALIKE**2)
-            alike &= (place >= 0) & (place < len(significance))
-            significance[place[alike]] -= (stop - start)[alike] * np.log(
-                np.maximum(1 - square[alike], 1e-6)
+            significant = (stop - start >= least) & (dots > 0) & (square > _LEAST_ALIKE**2)
+            significant &= (place >= 0) & (place < len(significance))
+            significance[place[significant]] -= (stop - start)[significant] * np.log(
+                np.maximum(1 - square[significant], 1e-6)
             )

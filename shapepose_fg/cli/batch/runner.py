@@ -28,7 +28,7 @@ from shapepose_fg.cli.batch.table import LOG, Entry
 from shapepose_fg.cli.reconstruct.request import OUTPUTS, Request, prepare
 from shapepose_fg.cli.reconstruct.run import Ended, carry_out
 from shapepose_fg.cli.stopping import Stopped, stoppable
-from shapepose_fg.cli.terminal import note, use_any_streams
+from shapepose_fg.cli.terminal import forget_notes, note, use_any_streams
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.result_files import PEOPLE
 from shapepose_fg.core.storage.files import files_below, inside, open_regular
@@ -221,6 +221,7 @@ def _lead(assignment: Assignment) -> Ended | str:
     failure. All output is appended to the log of the recording.
     """
     use_any_streams()
+    forget_notes()
     log = inside(assignment.folder, LOG)
     with log.open("ab", buffering=0) as stream:
         stream.write(f"--- {time.strftime('%Y-%m-%d %H:%M:%S')}\n".encode())
@@ -290,7 +291,7 @@ def look_at_all(
 
 def _look_at(entry: Entry, folder: Path, begun: bool) -> int:
     """Check one recording; returns the size of its detections, bytes."""
-    known = prepare(entry.request, folder, tell=lambda *_: None)
+    known = prepare(entry.request, folder, notify=lambda *_: None)
     asked = known.request
     _, places, _ = find_places(known.detections, asked.rig())
     find_skeleton(asked.skeleton)

@@ -20,7 +20,7 @@ from shapepose_fg.cli.found_cameras import MOST_S, found_clocks, show_clocks
 from shapepose_fg.cli.reconstruct.request import OUTPUTS, Prepared
 from shapepose_fg.cli.reconstruct.summary import check_setup, show_check, summary_table
 from shapepose_fg.cli.stopping import Stopped
-from shapepose_fg.cli.terminal import note, progress, show
+from shapepose_fg.cli.terminal import note, note_of_reading, progress, show, show_written
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError, failure, naming
 from shapepose_fg.core.provenance import ReadInputs, checksums, program_digest, versions
@@ -98,7 +98,7 @@ def carry_out(
         recording, times = read_recording(
             known.detections, rig, known.skeleton, kept, asked.fps, asked.timestamps
         )
-        note(*recording.notes)
+        note_of_reading(*recording.notes)
         count = len(recording)
         span, cuts = known.span(count, recording.first), known.cuts(count)
         execution = replace(execution, chunk_frames=asked.chunk_frames).with_workers(len(span))
@@ -321,13 +321,13 @@ class _Run:
         else:
             (output / MOMENTS).unlink(missing_ok=True)
         summary = summary_table(result, people, self.task, seconds, unchecked=checked is None)
-        for n, written in enumerate(self._written(result, people, rig, every)):
-            summary.add_row("" if n > 0 else "written", written)
+        written = self._written(result, people, rig, every)
         if file is not None and known is not None and result.shapes is not None:
             manifest.write_people(kept, file, known.updated(result.shapes))
-            summary.add_row("", f"{file}  shapes of {len(result.shapes)} people")
+            written.append(f"{file}  shapes of {len(result.shapes)} people")
         manifest.end_run(output)
         show(summary)
+        show_written(written)
         if checked is not None:
             show_check(checked)
         count = len(result.parts_of) if self.task.config.temporal else None

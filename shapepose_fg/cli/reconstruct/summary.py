@@ -56,7 +56,7 @@ def summary_table(
     run, counts, span, cameras = result.run, result.counts(), task.whole()[0], len(task.rig)
     per_frame = np.bincount(result.columns()["frame"].array() - span.start, minlength=len(span))
     table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
-    table.add_column(style="bold")
+    table.add_column(style="bold", min_width=len("written"))  # the line after the table
     table.add_column(overflow="fold")
     table.add_row(
         "frames", f"{len(span)} ({span.start}:{span.stop}) of {cameras} cameras{rate_words(run)}"

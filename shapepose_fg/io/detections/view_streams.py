@@ -217,11 +217,12 @@ def in_moments(recording: DetectionTable, picture: Index, kept: KeptArrays) -> D
 
 def _frames_of(recording: DetectionTable, view: int, picture: Index, begin: int) -> ViewCandidates:
     """Candidates of a view in the frames `picture`, renumbered from `begin` on; -1 for none."""
-    there = np.flatnonzero(picture >= 0)
-    every = [recording[frame] for frame in picture[there].tolist()]
+    present = np.flatnonzero(picture >= 0)
+    every = [recording[frame] for frame in picture[present].tolist()]
     parts = [each.only(each.view == view) for each in every]
     frames = [
-        np.full(len(part), begin + frame) for part, frame in zip(parts, there.tolist(), strict=True)
+        np.full(len(part), begin + frame)
+        for part, frame in zip(parts, present.tolist(), strict=True)
     ]
     return _joined([_NOTHING, *map(ViewCandidates, frames, parts)])
 

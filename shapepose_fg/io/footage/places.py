@@ -36,8 +36,8 @@ def per_camera(
             )
         name = text[:cut]
         if name not in cameras:
-            there = " ".join(cameras)
-            raise InputError(f"{option} {text}: there is no camera {name!r}; there are {there}")
+            known = " ".join(cameras)
+            raise InputError(f"{option} {text}: there is no camera {name!r}; there are {known}")
         if name in values:
             raise InputError(f"{option} {text}: camera {name} is given twice; give it once")
         values[name] = text[cut + 1 :]

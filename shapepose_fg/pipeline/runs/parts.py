@@ -122,11 +122,11 @@ class Parts:
                 rows.check_ranges()
                 table.check_ranges()
                 notes = Notes.from_dict(self.kept.about(_name(n)))
-                mine = range(done, min(done + notes.frames, frames.stop))
+                expected = range(done, min(done + notes.frames, frames.stop))
                 known = all(each.joint < len(joint_names) for each in notes.problems)
-                if not (known and _are_of(rows, mine, frame_s)):
+                if not (known and _are_of(rows, expected, frame_s)):
                     raise ValueError("its rows are not of this run")
-                done = mine.stop
+                done = expected.stop
 
     def drop(self, n: int) -> None:
         """Remove the rows of a part."""
@@ -151,9 +151,9 @@ class Parts:
         name = self._followed
         if name is None:
             return None
-        there = {"at", *(key.partition(".")[0] for key in self.kept.keys(name))}
+        names = {"at", *(key.partition(".")[0] for key in self.kept.keys(name))}
         columns = {
-            key: column for key, column in _FOLLOWED.items() if key.partition(".")[0] in there
+            key: column for key, column in _FOLLOWED.items() if key.partition(".")[0] in names
         }
         joints, size = nobody.joints.mean.shape[1:]
         found = self.kept.columns(name, columns, {"J": joints, "S": size})

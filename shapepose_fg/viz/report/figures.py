@@ -184,18 +184,18 @@ def angle_curves(people: Reconstruction, up: Axis, model: BodyModel) -> dict[int
     # row. Of longer recordings the beginning is drawn: steps over 0.15 s would not show a gait.
     most, times_s = 640 // max(len(chosen), 1), people.time_s
     times_s = np.where(np.isfinite(times_s), times_s, people.frame / ASSUMED_FPS)
-    for who in chosen:
-        rows = np.flatnonzero(people.person == who)
+    for person in chosen:
+        rows = np.flatnonzero(people.person == person)
         rows = rows[np.argsort(people.frame[rows], kind="stable")]
         longest = max(1, int(0.15 * len(rows) / max(float(np.ptp(times_s[rows])), 0.15)))
         rows = rows[:: min(-(-len(rows) // most), longest)][:most]
         angles = joint_angles(people.rows(rows), up, model)
-        drawn[who] = [
+        drawn[person] = [
             Curve.of(name, angles, people.frame[rows])
             for name in CURVES
             if np.isfinite(angles.degrees).any()
         ]
-    return {who: curves for who, curves in drawn.items() if curves}
+    return {person: curves for person, curves in drawn.items() if curves}
 
 
 def known_counts(people: Reconstruction, by: Whole | None = None) -> NDArray[np.int64]:
