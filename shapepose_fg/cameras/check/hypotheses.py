@@ -111,7 +111,8 @@ def mistake_of_cameras(look: Look, rng: np.random.Generator) -> Change | None:
             for change in _of_all(few)
         ]
     found = [(gain, change) for gain, change in found if gain > GAIN / look.view_count]
-    for view in range(look.view_count if look.cameras_used > 2 else 0):
+    # A camera that moves by little is looked for among all, once none is far off.
+    for view in (weak or range(look.view_count)) if look.cameras_used > 2 else ():
         changes = [
             Change(finding, after, freedom) for finding, after, freedom in motions(look, view, rng)
         ]
