@@ -70,12 +70,12 @@ def load_graph(file: str | Path) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Valu
             place = f"factor {n}"
             graph.push_back(_factor(record))
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RuntimeError) as error:
-        said = (
+        problem = (
             f"{error} is missing"
             if isinstance(error, KeyError)
             else str(error).strip().splitlines()[0]
         )
-        raise ValueError(f"{file}: {place}: {said[:120]}; {_CURE}") from None
+        raise ValueError(f"{file}: {place}: {problem[:120]}; {_CURE}") from None
     return graph, values
 
 

@@ -143,8 +143,8 @@ class PeopleInGraph:
         for one in sightings:
             self._add(one, made)
         self._last = {
-            who: (time_s, frame)
-            for who, (time_s, frame) in self._last.items()
+            person: (time_s, frame)
+            for person, (time_s, frame) in self._last.items()
             if not made.times_s or time_s.max() > max(made.times_s.values()) - self._link_s
         }
         return made

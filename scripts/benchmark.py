@@ -145,21 +145,21 @@ def spend(tree: Path, options: Sequence[str], output: Path) -> Spent:
         "--overwrite",
     ]
     environment = os.environ | _ENVIRONMENT | {"PYTHONPATH": str(tree)}
-    with tempfile.TemporaryFile() as said:
+    with tempfile.TemporaryFile() as output_file:
         start = time.perf_counter()
         process = subprocess.Popen(
             [*command, "--output", str(output)],
             cwd=output.parent,
             env=environment,
-            stdout=said,
-            stderr=said,
+            stdout=output_file,
+            stderr=output_file,
         )
         _, status, used = os.wait4(process.pid, 0)
         wall_s = time.perf_counter() - start
         process.returncode = os.waitstatus_to_exitcode(status)
-        said.seek(0)
+        output_file.seek(0)
         if process.returncode != 0:
-            raise SystemExit(f"{tree}: {' '.join(command)} failed:\n{said.read().decode()}")
+            raise SystemExit(f"{tree}: {' '.join(command)} failed:\n{output_file.read().decode()}")
     peak_mib = used.ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
     stages_s = json.loads((output / "run.json").read_text(encoding="utf-8"))["seconds"]
     cpu_s = math.nan if "--workers" in options else used.ru_utime + used.ru_stime

@@ -77,11 +77,11 @@ def main(
             begin, place = time.monotonic(), room / f"{Path(each).name}-{which}"
             place.mkdir(parents=True, exist_ok=True)
             try:
-                said = tried(each, which, place, tests.split()) if tries else built(place)
+                result = tried(each, which, place, tests.split()) if tries else built(place)
             except RuntimeError as error:
-                failed, said = True, f"failed: {error}"
+                failed, result = True, f"failed: {error}"
             minutes = (time.monotonic() - begin) / 60
-            print(f"{each}, {which}: {said} ({minutes:.0f} min)", flush=True)
+            print(f"{each}, {which}: {result} ({minutes:.0f} min)", flush=True)
     sys.exit(failed)
 
 

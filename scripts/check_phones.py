@@ -73,27 +73,27 @@ def measure(room: int, mocap: Mocap, folder: Path, logs: bool) -> str:
         folder / "times.csv",
     ]
     words += ["--trajectory", f"{names[-1]}={folder / 'log.tum'}"]
-    said, rig_file = io.StringIO(), folder / "found.json"
-    with contextlib.redirect_stdout(said), contextlib.suppress(SystemExit):
+    printed, rig_file = io.StringIO(), folder / "found.json"
+    with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
         command(["calibrate", *map(str, words), "--output", str(rig_file)])
     row = f"| {LAYOUTS[room // 2 % 3]} | {1 + room % 2} |"
     if not rig_file.exists():
         return f"{row} refused | | | | |"
-    rig, told = read_rig(rig_file), json.loads(said.getvalue())
+    rig, found = read_rig(rig_file), json.loads(printed.getvalue())
     by = similarity(rig.only(names[:-1]), truth)
     turn, move = errors(rig.wTc[:-1], truth.wTc, by)
     sure = 2 * np.array(
-        [(each["sigma_turn_deg"], each["sigma_move_mm"]) for each in told["cameras"]]
+        [(each["sigma_turn_deg"], each["sigma_move_mm"]) for each in found["cameras"]]
     )
     frame_s = np.genfromtxt(folder / "times.csv", delimiter=",", skip_header=1)[:, -1]
     poses = rig.trajectories[0].at(frame_s) @ rig.cameras[-1].bTc
     degrees, mm = (float((each**2).mean() ** 0.5) for each in errors(poses, phones[-1].wTc, by))
-    carried = told["moving"][names[-1]]
+    carried = found["moving"][names[-1]]
     inside = (np.stack([turn, move]) < sure.T).sum(axis=1)
     return (
         f"{row} {turn.max():.2f}° ({sure[:, 0].max():.2f}) | {move.max():.0f} mm "
         f"({sure[:, 1].max():.0f}) | {inside[0]}, {inside[1]} of {len(turn)} | "
-        f"{100 * by[2] - 100:+.1f} % ({200 * told['sigma_scale']:.1f}) | "
+        f"{100 * by[2] - 100:+.1f} % ({200 * found['sigma_scale']:.1f}) | "
         f"{degrees:.2f}° ({carried['within_deg']:.2f}), {mm:.0f} mm ({carried['within_mm']:.0f}) |"
     )
 

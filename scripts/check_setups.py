@@ -89,8 +89,8 @@ def main(
                 counts[str(name)].append([str(each) == "True" for each in (first_named, named)])
         print(f"\n| {kind} | checks | {titles}\n|---|{'---|' * titles.count('|')}---|")
         for name, each in counts.items():
-            told = np.sum(each, axis=0)[: titles.count("|")]
-            print(f"| {name} | {len(each)} | {' | '.join(map(str, told))} |")
+            sums = np.sum(each, axis=0)[: titles.count("|")]
+            print(f"| {name} | {len(each)} | {' | '.join(map(str, sums))} |")
 
 
 def _of_several(finding: Finding) -> bool:

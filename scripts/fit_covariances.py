@@ -164,8 +164,8 @@ def errors_in_frames(marginals: Marginals, truth: np.ndarray) -> Columns:
     """
     found, squared = squared_errors(marginals, truth)
     views = marginals.window.last.evidence.inlier[found.row].sum(axis=-1)
-    sigma_m, told, used = association_features(marginals)
-    rejected = 1 - used / np.maximum(told, 1e-9)
+    sigma_m, evidence, used = association_features(marginals)
+    rejected = 1 - used / np.maximum(evidence, 1e-9)
     signs = (np.repeat(each[found.row, None], 25, 1) for each in (sigma_m, rejected))
     seen = views > 0
     return tuple(each[seen] for each in (squared, views, *signs))
@@ -177,8 +177,8 @@ def errors_over_time(marginals: Marginals, truth: np.ndarray) -> Columns:
     """
     found, squared = squared_errors(marginals, truth)
     seen = marginals.window.last.evidence.inlier[found.row].any(axis=-1)
-    _, told, used = association_features(marginals)
-    rejected = 1 - used.sum() / max(told.sum(), 1e-9)
+    _, evidence, used = association_features(marginals)
+    rejected = 1 - used.sum() / max(evidence.sum(), 1e-9)
     return squared[seen], rejected, *map(np.array, correlation_features(marginals))
 
 

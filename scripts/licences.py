@@ -26,7 +26,7 @@ EXTRAS = (
     "frames",
     "train",
 )
-HEAD = """# Licences of what is installed with it
+HEAD = """# Licences of the installed packages
 
 With this page you can check the licences of all packages that are installed. `pip install
 shapepose-fg` installs the first list, and its extras the second. The names of the licences are

@@ -68,12 +68,12 @@ def measure(scene: Scene) -> tuple[Array, Array, Array]:
     matches = match_people(people.frame, people.joints, joints_by_frame(truth))
     numbers = np.unique(truth.person)[matches.person]
     from_start = np.isin(numbers, numbers[matches.frame < FPS])
-    there = np.flatnonzero(from_start & (matches.frame >= 3 * FPS))
+    scored = np.flatnonzero(from_start & (matches.frame >= 3 * FPS))
     rows = [
         np.flatnonzero((truth.frame == frame) & (truth.person == person))[0]
-        for frame, person in zip(matches.frame[there], numbers[there], strict=True)
+        for frame, person in zip(matches.frame[scored], numbers[scored], strict=True)
     ]
-    people, truth = people.rows(matches.row[there]), truth.rows(np.array(rows))
+    people, truth = people.rows(matches.row[scored]), truth.rows(np.array(rows))
     found, true = (joint_angles(each, scene.rig.up) for each in (people, truth))
     error = (found.degrees - true.degrees + 180) % 360 - 180
     sides = [elbows(people, truth, error[:, NAMES.index(f"{s}_elbow_flexion")], s) for s in SIDES]

@@ -15,7 +15,7 @@ from typing import Annotated
 from typer import Option, Typer
 
 from shapepose_fg.cameras.check.biases import COMMON
-from shapepose_fg.cameras.check.evidence import Look, gather
+from shapepose_fg.cameras.check.evidence import SetupHypothesis, gather
 from shapepose_fg.cameras.check.small_errors import SmallErrors
 from shapepose_fg.core.bounds import Axis
 from shapepose_fg.io.calibration import read_rig
@@ -38,7 +38,7 @@ def main(
     """Print the six most likely sizes of biases."""
     rig = read_rig(calibration, up=up)
     seen = read_detections(detections, rig)
-    problem = SmallErrors.of(Look.given(gather(seen, range(len(seen)), len(rig)), rig))
+    problem = SmallErrors.of(SetupHypothesis.given(gather(seen, range(len(seen)), len(rig)), rig))
     found = []
     for shift, larger in product(RATIOS, RATIOS):
         marginals = problem.residuals.marginals(problem.given, LEVELS, shift, larger, COMMON)

@@ -16,11 +16,11 @@ WRISTS = [BODY_25.index("RWrist"), BODY_25.index("LWrist")]
 def hold_hands(window, keys):
     """R = |a wrist of one - the other wrist of the other| - 0.14 m, where they are near."""
     for other in window.partners:
-        mine, theirs = window.shared(other)
+        rows, other_rows = window.shared(other)
         for wrist, others in (WRISTS, WRISTS[::-1]):
-            apart = window.first[mine, wrist] - other.first[theirs, others]
+            apart = window.first[rows, wrist] - other.first[other_rows, others]
             if np.nanmedian(np.linalg.norm(apart, axis=1)) < 0.30:
-                for pair in zip(keys[mine, wrist], other.keys[theirs, others], strict=True):
+                for pair in zip(keys[rows, wrist], other.keys[other_rows, others], strict=True):
                     yield gtsam.RangeFactor3(*map(int, pair), 0.14, isotropic(1, 0.01))
 
 

@@ -162,13 +162,13 @@ def joint_angles(
         raise InputError(f"up={axis}: must be the axis of the world that points up, such as 'z'")
     world = opensim_axes(axis)
     model = model_of(people.run) if model is None else model
-    there = np.flatnonzero(with_body(*(getattr(people, name) for name in BODY)))
+    with_angles = np.flatnonzero(with_body(*(getattr(people, name) for name in BODY)))
     names = _names(definitions)
     degrees = np.full((len(people), len(names)), np.nan)
     covariance = np.full((*degrees.shape, len(names)), np.nan)
     model = model.with_keypoints(tuple(people.joint_names.tolist()))
-    for start in range(0, len(there), BATCH):
-        rows = there[start : start + BATCH]
+    for start in range(0, len(with_angles), BATCH):
+        rows = with_angles[start : start + BATCH]
         part = people.rows(rows)
         posed = BodyParameters(*(getattr(part, name) for name in BODY))
         betas, local, rotations = _rotations(part, model, posed)

@@ -86,9 +86,9 @@ def fit_of_order(people: Array, points: Sequence[str]) -> Array:
     both, distances = known[first] & known[second], _distances(people.shape[-1])
     mean = np.where(both, distances.mean[place[first], place[second]], 0.0)
     sigma = np.where(both, distances.sigma[place[first], place[second]], _OUTLIER_SIGMA)
-    said = np.where(both, logs - mean, np.nan)
+    deviation = np.where(both, logs - mean, np.nan)
     count = np.isfinite(logs).sum(axis=1)
-    off = logs - mean - _mean(said)[:, None]
+    off = logs - mean - _mean(deviation)[:, None]
     # Minimum number of distances for a person to be informative: seven joints.
     return np.where(count >= 20, _mean(_log_density(off, sigma)), np.nan)
 
@@ -112,18 +112,18 @@ def exchanges(
     logs = logs - _mean(logs - mean[first, second])[:, None]
     # Mean log-likelihood over people if joints k and m of the file are a and b of the body: (k, m,
     # a, b).
-    worth = np.zeros((count, count, count, count))
+    likelihood = np.zeros((count, count, count, count))
     for n, (k, m) in enumerate(zip(first.tolist(), second.tolist(), strict=True)):
         seen = logs[np.isfinite(logs[:, n]), n]
-        said = _log_density(seen[:, None, None] - mean, sigma).sum(axis=0) / max(len(logs), 1)
-        worth[k, m] = worth[m, k] = said
+        fit = _log_density(seen[:, None, None] - mean, sigma).sum(axis=0) / max(len(logs), 1)
+        likelihood[k, m] = likelihood[m, k] = fit
     order = np.arange(count)
     moves = [[pair] for pair in zip(first.tolist(), second.tolist(), strict=True)] + [
         list(each) for each in groups
     ]
 
     def total(order: Index) -> float:
-        return float(worth[order[first], order[second], first, second].sum())
+        return float(likelihood[order[first], order[second], first, second].sum())
 
     best = total(order)
     for _ in range(4 * count):
@@ -154,8 +154,8 @@ def _logs(people: Array, first: Index, second: Index) -> Array:
 
 def _mean(values: Array) -> Array:
     """(N,) mean of the finite values in each row (N, M); NaN if there are none."""
-    there = np.isfinite(values)
-    total, count = np.where(there, values, 0.0).sum(axis=1), there.sum(axis=1)
+    known = np.isfinite(values)
+    total, count = np.where(known, values, 0.0).sum(axis=1), known.sum(axis=1)
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 

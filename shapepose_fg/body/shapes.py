@@ -23,9 +23,9 @@ def recognise(found: SubjectShapes, known: SubjectShapes, ratio: float = 10.0) -
     """
     if found.body != known.body:
         raise ValueError("shapes must be of the same body model")
-    whose = np.full(len(found), -1, dtype=np.intp)
+    match = np.full(len(found), -1, dtype=np.intp)
     if len(found) == 0 or len(known) == 0:
-        return whose
+        return match
     eye = np.eye(found.betas.shape[1])
     seen = found.information - eye  # information of the recording
     gradient = np.einsum("gij,gj->gi", found.information, found.betas)
@@ -34,8 +34,8 @@ def recognise(found: SubjectShapes, known: SubjectShapes, ratio: float = 10.0) -
     gain = np.maximum(factor - np.log(ratio), 0.0)
     rows, columns = least_cost_pairs(-gain)
     kept = gain[rows, columns] > 0
-    whose[rows[kept]] = columns[kept]
-    return whose
+    match[rows[kept]] = columns[kept]
+    return match
 
 
 def _log_evidence(seen: Array, gradient: Array, mean: Array, information: Array) -> Array:

@@ -225,9 +225,9 @@ def _information(
     for n, view in enumerate(seen):
         last.push_back(X(view))
         last.push_back(C(view))
-        at, ours = n * 15, view * Q
-        to[at : at + 6, ours : ours + 6] = np.eye(6)
-        to[at + 6 : at + 15, ours + 6 : ours + Q] = _lens_columns(rig.cameras[view])
+        at, columns = n * 15, view * Q
+        to[at : at + 6, columns : columns + 6] = np.eye(6)
+        to[at + 6 : at + 15, columns + 6 : columns + Q] = _lens_columns(rig.cameras[view])
     last.push_back(B(0))
     _, rest = graph.linearize(values).eliminatePartialMultifrontal(first)
     information = rest.hessian(last)[0][: len(to), : len(to)]  # the lens is fixed to the body
@@ -293,7 +293,7 @@ def settle(
     given: Rig,
     times: FrameTimes,
     freedom: Freedom | Sequence[Freedom],
-    told: Callable[[int], None],
+    advance: Callable[[int], None],
     reference: int | None = None,
     scale: Callable[[Array], float] | None = None,
 ) -> Adjusted:
@@ -302,7 +302,7 @@ def settle(
 
     The prior has the `freedom` about the cameras `given`. With `scale`, a function from the
     people's joints (P, J, 3) to metres per unit, only the lenses have a prior, and the rig is
-    scaled. `told` gets the number of rounds that are done. Raises Undetermined if too few people
+    scaled. `advance` gets the number of rounds that are done. Raises Undetermined if too few people
     are seen.
     """
     adjusted: Adjusted | None = None
@@ -326,7 +326,7 @@ def settle(
             adjusted = grown(adjusted, factor)
         before, now = now, adjusted.rig
         still = apart(before, now)[0].max() < _STILL_DEG
-        told(rounds - step if still else 1)
+        advance(rounds - step if still else 1)
         if still:
             break
     assert adjusted is not None

@@ -600,9 +600,9 @@ class _Fit:
         """(P, P) covariance of the sum of `J` (N, J, 2, P) times errors of unit variance, which are
         correlated over time, and between the joints of a person as those of `away` (N, J, 2) are.
         """
-        alike = np.einsum("njc,nkc->jk", away, away)
-        size = np.sqrt(np.diag(alike)) + _TINY
-        J = np.einsum("njcp,jk->nkcp", J, symmetric_root(alike / size / size[:, None]))
+        correlation = np.einsum("njc,nkc->jk", away, away)
+        size = np.sqrt(np.diag(correlation)) + _TINY
+        J = np.einsum("njcp,jk->nkcp", J, symmetric_root(correlation / size / size[:, None]))
         total = np.zeros((J.shape[-1],) * 2)
         for track in np.unique(self.placed.track).tolist():
             rows = self.placed.track == track
@@ -715,10 +715,10 @@ def _nearest(own: Array, times: Array) -> Index:
     """(M,) frame, of those at `own` (T,), ascending or NaN, nearest to each time; -1 if half a
     moment lies between.
     """
-    there = np.flatnonzero(np.isfinite(own))
-    after = np.searchsorted(own[there], times).clip(1, len(there) - 1)
-    nearer = times - own[there[after - 1]] < own[there[after]] - times
-    frame = there[after - nearer]
+    finite = np.flatnonzero(np.isfinite(own))
+    after = np.searchsorted(own[finite], times).clip(1, len(finite) - 1)
+    nearer = times - own[finite[after - 1]] < own[finite[after]] - times
+    frame = finite[after - nearer]
     return np.where(np.abs(own[frame] - times) <= LOOK_S / 2, frame, -1)
 
 

@@ -108,8 +108,8 @@ def _through_lenses(
     """The sightings with their pixels distorted, or undistorted."""
     xy = sightings.xy.copy()
     for view, camera in enumerate(rig.cameras):
-        here = sightings.view == view
-        xy[here] = change(camera, xy[here].reshape(-1, 2)).reshape(xy[here].shape)
+        of_view = sightings.view == view
+        xy[of_view] = change(camera, xy[of_view].reshape(-1, 2)).reshape(xy[of_view].shape)
     return replace(sightings, xy=xy)
 
 

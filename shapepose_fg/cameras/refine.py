@@ -19,7 +19,7 @@ from shapepose_fg.cameras.bundle import (
     scaled,
     settle,
 )
-from shapepose_fg.cameras.check.diagnosis import put_right
+from shapepose_fg.cameras.check.diagnosis import correct_gross_mistakes
 from shapepose_fg.cameras.check.evidence import gather
 from shapepose_fg.cameras.check.findings import SURE, Finding, Kind
 from shapepose_fg.cameras.check.small_errors import SmallErrors
@@ -142,7 +142,7 @@ def refine(
     cameras.
     """
     freedom = Freedom() if freedom is None else freedom
-    given, right, findings = put_right(gather(detections, frames, len(rig)), rig)
+    given, right, findings = correct_gross_mistakes(gather(detections, frames, len(rig)), rig)
     footage, start = (
         Footage.of(detections, rig, times, frames),
         _found_again(findings, right.views, rig),
@@ -154,7 +154,7 @@ def refine(
         given=start,
         times=times,
         freedom=freedom,
-        told=Steps(progress, 3 * ROUNDS),
+        advance=Steps(progress, 3 * ROUNDS),
         reference=reference,
     )
     found = fit(footage)
@@ -209,8 +209,8 @@ def _undetermined(adjusted: Adjusted, freedom: Freedom, counts: Index) -> list[s
     notes = []
     for view, camera in enumerate(adjusted.rig.cameras):
         if counts[view] < LEAST_PEOPLE:
-            few = f"shares only {counts[view]} people with other cameras, too few"
-            notes.append(f"camera {camera.name}: {few}; it is not changed")
+            shortage = f"shares only {counts[view]} people with other cameras, too few"
+            notes.append(f"camera {camera.name}: {shortage}; it is not changed")
             continue
         sigmas = {name: adjusted.sigma(part)[view] for name, part in PARTS.items()}
         unknown = [

@@ -101,14 +101,14 @@ class Together:
         """Which pairs of tracks (K,) are one person each, greedily by residual, and their total
         score.
         """
-        worth = np.maximum(1 - miss / _GATE, 0.0) * self.count
-        order = np.argsort(-worth, kind="stable")
+        score = np.maximum(1 - miss / _GATE, 0.0) * self.count
+        order = np.argsort(-score, kind="stable")
         kept, (a, b) = np.zeros(len(miss), dtype=bool), self.tracks.T
-        for n in order[worth[order] > 0].tolist():
+        for n in order[score[order] > 0].tolist():
             # A track cannot be two people at once.
             rival = ((a == a[n]) & self.alike[1][b[n], b]) | ((b == b[n]) & self.alike[0][a[n], a])
             kept[n] = not (kept & rival).any()
-        return kept, float(worth[kept].sum() / max(self.possible, 1))
+        return kept, float(score[kept].sum() / max(self.possible, 1))
 
     def joints(self, kept: Mask) -> tuple[Array, Array, Array]:
         """Rays (N, J, 3) of both cameras for the pairs of tracks that are `kept`, and
@@ -254,11 +254,11 @@ def refined_pose(R: Array, t: Array, a: Array, b: Array, size: Array) -> tuple[A
 def _rows(tracks: CameraTracks, looks: Index) -> Index:
     """(K, F) the row of each track at each compared frame, -1 where it has none."""
     begins = tracks.frame[tracks.first]
-    there = (looks >= begins[:, None]) & (looks <= tracks.lasts[:, None])
-    return np.where(there, tracks.first[:, None] + looks - begins[:, None], -1)
+    inside = (looks >= begins[:, None]) & (looks <= tracks.lasts[:, None])
+    return np.where(inside, tracks.first[:, None] + looks - begins[:, None], -1)
 
 
 def _at_once(rows: Index) -> Mask:
     """(K, K) whether tracks overlap in time, and so are different people."""
-    there = (rows >= 0).astype(np.float64)
-    return np.asarray(there @ there.T > 0)
+    present = (rows >= 0).astype(np.float64)
+    return np.asarray(present @ present.T > 0)

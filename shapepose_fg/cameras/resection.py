@@ -86,11 +86,11 @@ def independent(others: Others) -> float:
     )
 
 
-def likelihood(score: float, worth: float, freedom: int) -> float:
+def likelihood(score: float, count: float, freedom: int) -> float:
     """Log-likelihood, up to a constant, of errors with this mean (`Match.score`), less BIC's
     penalty.
     """
-    return worth * score * GATE / ERROR - 0.5 * freedom * float(np.log(max(worth, 2.0)))
+    return count * score * GATE / ERROR - 0.5 * freedom * float(np.log(max(count, 2.0)))
 
 
 def match(others: Others, seen: Sightings, camera: Pinhole) -> Match:
@@ -203,10 +203,10 @@ def best_of(
 ) -> Pinhole | None:
     """Return the camera with the best score for all people, among exact fits to single people."""
     step = max(1, len(others) // 40)
-    few = others.rows(slice(None, None, step))
+    sample = others.rows(slice(None, None, step))
     tried = [each for points, xy in pairs if (each := fitted(points, xy, camera)) is not None]
     score, best = max(
-        ((match(few, seen, each).score, each) for each in tried),
+        ((match(sample, seen, each).score, each) for each in tried),
         key=lambda pair: pair[0],
         default=(0, None),
     )

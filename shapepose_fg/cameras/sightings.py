@@ -79,9 +79,9 @@ def size_of(xy: Array) -> Array:
     """(...) size of people with joints xy (..., J, 2), pixels; 1 if nothing is seen."""
     seen = ~np.isnan(xy[..., :1])
     count = np.maximum(seen.sum(axis=-2), 1)
-    here = np.where(seen, xy, 0.0)
-    mean = here.sum(axis=-2) / count
-    variance = (np.where(seen, (here - mean[..., None, :]) ** 2, 0.0).sum(axis=-2) / count).sum(
+    xy0 = np.where(seen, xy, 0.0)
+    mean = xy0.sum(axis=-2) / count
+    variance = (np.where(seen, (xy0 - mean[..., None, :]) ** 2, 0.0).sum(axis=-2) / count).sum(
         axis=-1
     )
     # Stature of a standing person over the root of the joints' summed variances: 1 / 0.29 for a
@@ -202,9 +202,11 @@ class Pairs:
             supported = (
                 free[thirds[live]] & (thirds[live] >= 0) & allowed & (self.third_error[live] < GATE)
             )
-            worth = 1 - self.error[live] / GATE
-            worth = worth + np.where(supported, 1 - self.third_error[live] / GATE, 0).sum(axis=1)
-            best = least_of_each(self.frame[live], -worth)
+            support = 1 - self.error[live] / GATE
+            support = support + np.where(supported, 1 - self.third_error[live] / GATE, 0).sum(
+                axis=1
+            )
+            best = least_of_each(self.frame[live], -support)
             member = np.where(supported[best], thirds[live[best]], -1)
             chosen = live[best]
             member[np.arange(len(best))[:, None], self.views[chosen]] = members[chosen]
@@ -357,20 +359,20 @@ def follow(frame: Index, away: Callable[[Index, Index], Array], reach: float, ga
 
     `away` are the distances (A, B) of rows (A,) of earlier frames from rows (B,).
     """
-    who, last, count = np.full(len(frame), -1, dtype=np.intp), np.zeros(0, dtype=np.intp), 0
+    identity, last, count = np.full(len(frame), -1, dtype=np.intp), np.zeros(0, dtype=np.intp), 0
     for now in np.unique(frame).tolist():
-        here, last = np.flatnonzero(frame == now), last[frame[last] >= now - gap]
+        current, last = np.flatnonzero(frame == now), last[frame[last] >= now - gap]
         if len(last) > 0:
-            far = away(last, here)
+            far = away(last, current)
             nearest = far.argmin(axis=1)
             mutual = far.argmin(axis=0)[nearest] == np.arange(len(last))
             mutual &= far.min(axis=1) < reach
-            who[here[nearest[mutual]]] = who[last[mutual]]
-        new = here[who[here] < 0]
-        who[new] = count + np.arange(len(new))
+            identity[current[nearest[mutual]]] = identity[last[mutual]]
+        new = current[identity[current] < 0]
+        identity[new] = count + np.arange(len(new))
         count += len(new)
-        last = np.concatenate([here, last[~np.isin(who[last], who[here])]])
-    return who
+        last = np.concatenate([current, last[~np.isin(identity[last], identity[current])]])
+    return identity
 
 
 def followed(frame: Index, points: Array) -> Index:
@@ -390,5 +392,5 @@ def followed(frame: Index, points: Array) -> Index:
 
 def _middle(points: Array) -> Array:
     """(N, n) mean over the points (N, J, n) that are not NaN; 0 if there are none."""
-    there = ~np.isnan(points[..., :1])
-    return np.asarray(np.where(there, points, 0.0).sum(axis=1) / np.maximum(there.sum(axis=1), 1))
+    known = ~np.isnan(points[..., :1])
+    return np.asarray(np.where(known, points, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1))

@@ -66,13 +66,13 @@ def build_of(points: Array, skeleton: Skeleton) -> Build:
     sides = [[joint(s + a) - joint(s + b) for s in "RL"] for a, b, *_ in _BONES]
     lengths = np.linalg.norm(sides, axis=-1)  # (bones, 2, P)
     enough = np.isfinite(lengths).sum(axis=(0, 1)) >= 3
-    said = [
+    terms = [
         (np.log(np.nanmedian(each) / share), weight)
         for each, (*_, share, weight) in zip(lengths[..., enough], _BONES, strict=True)
         if np.isfinite(each).any()
     ]
-    logs, weights = np.array(said).reshape(-1, 2).T
-    stature = float(np.exp(np.average(logs, weights=weights))) if said else np.nan
+    logs, weights = np.array(terms).reshape(-1, 2).T
+    stature = float(np.exp(np.average(logs, weights=weights))) if terms else np.nan
     trunk = (joint("RShoulder") + joint("LShoulder") - joint("RHip") - joint("LHip")) / 2
     trunk = trunk[~np.isnan(trunk).any(axis=1)]
     trunk = trunk / np.maximum(np.linalg.norm(trunk, axis=1, keepdims=True), 1e-12)

@@ -186,12 +186,12 @@ def chosen(
     def best(view: int, placed: dict[int, int]) -> tuple[float, int]:
         low, high = min(placed.values()) - half, max(placed.values()) + half
         tried = np.arange(low, high + 1)
-        worth = np.sum(
+        score = np.sum(
             [fit(one, view, tried - at) for one, at in placed.items()], axis=0
         ) / np.sqrt(len(placed))
-        top = int(np.argmax(worth))
+        top = int(np.argmax(score))
         far = np.abs(tried - tried[top]) * step > around
-        return float(worth[top] - worth[far].max(initial=0.0)), int(tried[top])
+        return float(score[top] - score[far].max(initial=0.0)), int(tried[top])
 
     margins = {pair: best(pair[1], {pair[0]: 0})[0] for pair in curves}
     root = max(margins, key=lambda pair: margins[pair])[0]

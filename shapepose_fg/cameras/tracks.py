@@ -184,9 +184,9 @@ def _followed(seen: Sightings) -> list[Index]:
         apart_px = np.linalg.norm(seen.xy[one][:, None] - seen.xy[other], axis=-1)
         return median_of(apart_px / seen.size_px[other][:, None], MIN_JOINTS)
 
-    who = follow(seen.frame, away, _SAME, 2)
-    order = np.lexsort((seen.frame, who))
-    return np.split(order, np.flatnonzero(np.diff(who[order])) + 1)
+    identity = follow(seen.frame, away, _SAME, 2)
+    order = np.lexsort((seen.frame, identity))
+    return np.split(order, np.flatnonzero(np.diff(identity[order])) + 1)
 
 
 def _smoothed(rays: Array, frame: Index, width: float) -> tuple[Array, Array]:
@@ -211,11 +211,11 @@ def lines(values: Array, width: float) -> tuple[Array, Array]:
     def around(each: Array, power: int) -> Array:
         return np.asarray(correlate1d(each, near * apart**power, axis=0, mode="constant"))
 
-    there, full = known.astype(np.float64), np.where(known, values, 0.0)
+    known_share, full = known.astype(np.float64), np.where(known, values, 0.0)
     w0, w1, w2, y0, y1 = (
-        around(there, 0),
-        around(there, 1),
-        around(there, 2),
+        around(known_share, 0),
+        around(known_share, 1),
+        around(known_share, 2),
         around(full, 0),
         around(full, 1),
     )
@@ -237,10 +237,10 @@ def fast_part(values: Array, known: Mask, track: Index, width: float) -> Array:
     """
     result = np.zeros_like(values)
     for rows in np.split(np.arange(len(track)), np.flatnonzero(np.diff(track)) + 1):
-        there, here = known[rows], np.where(known[rows], values[rows], 0.0)
+        is_known, filled = known[rows], np.where(known[rows], values[rows], 0.0)
         weight, total = (
             gaussian_filter1d(each, width, axis=0, mode="constant")
-            for each in (there.astype(np.float64), here)
+            for each in (is_known.astype(np.float64), filled)
         )
-        result[rows] = np.where(there, here - total / np.maximum(weight, 1e-9), 0.0)
+        result[rows] = np.where(is_known, filled - total / np.maximum(weight, 1e-9), 0.0)
     return result

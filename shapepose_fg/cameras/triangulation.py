@@ -40,10 +40,10 @@ def observed(groups: Groups, sightings: Sightings) -> tuple[Array, Array, Array]
     """Detections (P, J, V, 2), confidences (P, J, V) and sizes (P, V) of groups; NaN, 0 and NaN if
     missing.
     """
-    there = groups.member >= 0
-    xy = np.where(there[..., None, None], sightings.xy[groups.member], np.nan)
-    confidence = np.where(there[..., None], sightings.confidence[groups.member], 0.0)
-    size = np.where(there, sightings.size_px[groups.member], np.nan)
+    has_sighting = groups.member >= 0
+    xy = np.where(has_sighting[..., None, None], sightings.xy[groups.member], np.nan)
+    confidence = np.where(has_sighting[..., None], sightings.confidence[groups.member], 0.0)
+    size = np.where(has_sighting, sightings.size_px[groups.member], np.nan)
     return np.moveaxis(xy, 1, 2), np.moveaxis(confidence, 1, 2), size
 
 

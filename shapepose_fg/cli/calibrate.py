@@ -240,11 +240,11 @@ def calibrate(
         remarks=found.notes,
     )
     if as_json:
-        told = found.as_dict() | (
+        content = found.as_dict() | (
             {} if clocks is None else {"clocks": clocks.as_dict(rig)["cameras"]}
         )
-        told |= {"moving": {name: each.as_dict() for name, each in starts.items()}}
-        show_json(told)
+        content |= {"moving": {name: each.as_dict() for name, each in starts.items()}}
+        show_json(content)
     else:
         show(table(("camera", *heads), [(name, *each) for name, each in rows], caption=_CAPTION))
         show("\n".join(lines[1:]))
@@ -344,14 +344,14 @@ def _world(found: "Calibrated", stature: float | None, distances: list[str]) -> 
 
     world = found.world
     if distances:
-        whose = f"{' '.join(distances)}, which makes people {world.stature_m:.2f} m tall (median)"
+        source = f"{' '.join(distances)}, which makes people {world.stature_m:.2f} m tall (median)"
     else:
-        whose = (
+        source = (
             f"median stature {stature:g} m"
             if stature is not None
             else "assumed median stature 1.70 m"
         )
-        whose += f", {world.persons} people at once"
+        source += f", {world.persons} people at once"
     level = (
         "from feet on the floor"
         if world.floor is not None
@@ -365,7 +365,7 @@ def _world(found: "Calibrated", stature: float | None, distances: list[str]) -> 
     )
     better = "; a distance measured between two cameras, --distance, gives lengths to about 1 %"
     return [
-        f"scale: {whose}; one sigma is {100 * world.sigma_scale:.1f} %",
+        f"scale: {source}; one sigma is {100 * world.sigma_scale:.1f} %",
         f"up: z, {level}; the floor is at 0",
         (
             "error of a joint against the other cameras, on frames that were not used: "

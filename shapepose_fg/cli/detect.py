@@ -230,4 +230,4 @@ def _next_command(
     skeleton = Path(network.settings["network"].get("skeleton") or "")
     files |= {"--skeleton": skeleton} if skeleton.is_file() else {}
     options = {name: file.resolve() for name, file in files.items() if file is not None}
-    return next_reconstruct(options | cameras.said())
+    return next_reconstruct(options | cameras.calibration_options())

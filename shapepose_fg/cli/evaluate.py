@@ -78,7 +78,7 @@ def show_scores(scores: "Mapping[str, Score]", format: str = "text") -> None:
         every = {name: each.as_dict() for name, each in scores.items()}
         print(json.dumps(every if len(every) > 1 else next(iter(every.values())), indent=2))
         return
-    note(*dict.fromkeys(told for each in scores.values() for told in each.notes))
+    note(*dict.fromkeys(message for each in scores.values() for message in each.notes))
     tables = [
         (["result", *FIGURES.values()], [[n, *_cells(e.figures)] for n, e in scores.items()]),
         _pcp("limb", scores, limbs=True),

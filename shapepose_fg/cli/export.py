@@ -40,4 +40,4 @@ def export(
     done = export_result(take.results, wanted, output, **how, **more)
     for file in dict.fromkeys(file for written in done.values() for file in written.files):
         print(file)
-    note(*dict.fromkeys(told for written in done.values() for told in written.notes))
+    note(*dict.fromkeys(message for written in done.values() for message in written.notes))

@@ -11,7 +11,7 @@ import numpy as np
 from annotated_types import Interval
 
 from shapepose_fg.cli.options import RESULT, frame_range, option
-from shapepose_fg.cli.terminal import note, progress, show, table
+from shapepose_fg.cli.terminal import note, note_of_reading, progress, show, table
 from shapepose_fg.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ def found_clocks(
         recording, times = read_recording(
             detections, rig, skeleton, Path(folder), fps, own_frames=True
         )
-        note(*recording.notes)
+        note_of_reading(*recording.notes)
         if times is None or len(times) < 2:
             raise InputError("--fps: missing; give the frame rate of the cameras")
         span = frame_range(frames, len(recording), recording.first)

@@ -1,7 +1,9 @@
 """The command `live`: online reconstruction from detections as they arrive."""
 
 import os
+import stat
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from shapepose_fg.cli.options import (
@@ -71,20 +73,23 @@ def live(
         published(output or (), rig, of_readers, covariances) as publish,
         OnlineReconstructor(rig, skeleton=joints, lag_s=lag, workers=workers) as people,
     ):
-        frames, jumps, said = 0, 0, None
+        frames, jumps, status = 0, 0, None
+        is_file = _is_file(detections)
 
         def push(*view: Any) -> None:
-            nonlocal frames, jumps, said
+            nonlocal frames, jumps, status
             people.push_view(*view)
             report = people.report()
             if report.frames > frames:
                 frames = report.frames
                 publish("now", people.people())
                 publish("settled", people.settled())
+                if is_file:
+                    people.catch_up()
             if report.jumps > jumps:
                 jumps = report.jumps
                 of_cameras(f"the times of all cameras jumped to {view[2]:.2f} s")
-            said = _say(people, said, of_cameras)
+            status = _say(people, status, of_cameras)
 
         if os.isatty(0) if detections is None else detections.startswith("tcp:"):
             note(f"reads from {detections or 'this terminal'} until Ctrl-C")
@@ -96,7 +101,18 @@ def live(
         publish("settled", people.finish())
         report = people.report()
     out = f"{report.dropped} measurements were dropped (late, repeated, or at the wrong time)"
+    if report.unrefined > 0:
+        out += f"; {report.unrefined} frames were not refined, because solving did not keep up"
     note(f"{report.frames} frames, {report.late} of them late; {out}")
+
+
+def _is_file(detections: str | None) -> bool:
+    """Whether the input is a file on disk: it can wait for windows to be solved."""
+    try:
+        mode = os.fstat(0).st_mode if detections in (None, "-") else Path(detections).stat().st_mode
+    except OSError:
+        return False
+    return stat.S_ISREG(mode)
 
 
 def _say(

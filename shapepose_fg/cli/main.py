@@ -30,7 +30,7 @@ from shapepose_fg.cli.setup import check_calibration
 from shapepose_fg.cli.simulate import simulate
 from shapepose_fg.cli.stopping import Stopped, stoppable
 from shapepose_fg.cli.synchronise import synchronise
-from shapepose_fg.cli.terminal import note_log, say, use_any_streams
+from shapepose_fg.cli.terminal import forget_notes, note_log, say, use_any_streams
 from shapepose_fg.cli.tracks import tracks
 from shapepose_fg.cli.train_fitter import train_fitter
 from shapepose_fg.cli.view import view
@@ -75,6 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line. An error is one sentence on stderr and exit code 2."""
     use_any_streams()
     note_log()
+    forget_notes()
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     if arguments == ["--version"]:
         arguments = ["version"]

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Self, cast, get_type_hints
 import typer
 from annotated_types import Interval
 
-from shapepose_fg.cli.terminal import note
+from shapepose_fg.cli.terminal import note, note_of_reading
 from shapepose_fg.core.bounds import Axis, Unit, interval_of, violated
 from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.frame_times import LEAST_FPS, MOST_FPS
@@ -201,10 +201,10 @@ class CameraOptions:
         size = picture_size(self.image_size)
         chosen = {"cameras": names_of(self.cameras), "without": names_of(self.without) or ()}
         found = read_rig(self.calibration, up=self.up, unit=self.unit, image_size=size, **chosen)
-        note(*found.notes)
+        note_of_reading(*found.notes)
         return found
 
-    def said(self) -> dict[str, object]:
+    def calibration_options(self) -> dict[str, object]:
         """The options about the calibration, to be repeated in the next command."""
         names = ("up", "unit", "image_size", "cameras", "without")
         return {f"--{name.replace('_', '-')}": getattr(self, name) for name in names}
@@ -283,8 +283,10 @@ class ProjectOptions(DetectionOptions):
         INPUT, "Pose2Sim project: use its cameras, detections and frame rate."
     )
 
-    def completed(self, tell: Callable[..., None] = note) -> "tuple[Self, Pose2SimProject | None]":
-        """The options with the missing paths filled in from the project, and the project; `tell`
+    def completed(
+        self, notify: Callable[..., None] = note
+    ) -> "tuple[Self, Pose2SimProject | None]":
+        """The options with the missing paths filled in from the project, and the project; `notify`
         receives its notes.
         """
         if self.project is None:
@@ -292,7 +294,7 @@ class ProjectOptions(DetectionOptions):
         from shapepose_fg.io.pose2sim_project import read_pose2sim_project
 
         source = read_pose2sim_project(self.project)
-        tell(*source.notes)
+        notify(*source.notes)
         calibration, detections = (
             self.calibration or source.calibration,
             self.detections or source.detections,
@@ -333,7 +335,7 @@ class TimeOptions:
         recording, times = read_recording(
             detections, rig, skeleton, kept, self.fps, self.timestamps, own_frames=own_frames
         )
-        note(*recording.notes)
+        note_of_reading(*recording.notes)
         return recording, times
 
 

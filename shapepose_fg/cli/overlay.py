@@ -20,7 +20,7 @@ from shapepose_fg.cli.options import (
     option,
 )
 from shapepose_fg.cli.pictures import PictureOptions
-from shapepose_fg.cli.terminal import note, progress
+from shapepose_fg.cli.terminal import note, progress, show_written
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_times import ASSUMED_FPS
 from shapepose_fg.core.result_files import results_folder
@@ -68,7 +68,7 @@ def overlay(
 ) -> None:
     """Draw a result over the videos or pictures from which it was made: as mp4, or still pictures.
 
-    Each person has a colour. Dots are joints that were detected, dark rings joints that were
+    Each person has a colour. White dots are joints that were seen, dark dots joints that were
     inferred; squares are 2D detections that were used, red crosses those that were not. By default,
     the videos are those in which `detect` ran.
     """
@@ -96,13 +96,13 @@ def overlay(
         if drawn.stills is not None:
             chosen, fps = _stills(drawn.stills, length), None
         else:
-            told = [
+            covered = [
                 each
                 for span in covered_frames(run) or [range(length)]
                 for each in span
                 if each < length
             ]
-            chosen, fps = told if frames is None else frame_range(frames, length), _fps(run)
+            chosen, fps = covered if frames is None else frame_range(frames, length), _fps(run)
         if len(chosen) == 0:
             raise InputError(
                 f"{folder}: none of its frames has a picture; give the videos that it was made from"
@@ -112,8 +112,7 @@ def overlay(
             written = write_overlay(
                 over, chosen, output or inside(folder, "overlay"), width, fps, done
             )
-        for path in written:
-            print(f"written  {path}")
+        show_written(map(str, written))
 
 
 def _fps(run: Mapping[str, Any]) -> float:

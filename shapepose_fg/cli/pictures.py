@@ -32,7 +32,7 @@ class PictureOptions:
     )
     image_placement: list[str] | None = option(
         INPUT,
-        "How pictures of another size were made: scale, letterbox, crop, crop-centre.",
+        "How pictures of another size were made: scale, letterbox, crop, crop-centre; or same.",
         metavar="KIND|CAMERA=KIND",
     )
 

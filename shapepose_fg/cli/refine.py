@@ -134,7 +134,7 @@ def refine_calibration(
         print(f"{output}: {form}")
         # Our own rig file defines axis, unit and picture sizes itself.
         options = {"--calibration": output} | seen.given()
-        options |= {} if form == "rig file" else seen.said()
+        options |= {} if form == "rig file" else seen.calibration_options()
         print(
             next_reconstruct(
                 options | rate.given() | ({} if seen.source else {"--output": "results"})

@@ -17,6 +17,7 @@ from shapepose_fg.cli.options import (
     frame_range,
     frames_option,
     grouped,
+    next_reconstruct,
     option,
     workers_option,
 )
@@ -93,10 +94,11 @@ def simulate(
     )
     for what, path in written.items():
         print(f"{what:<12}{path}")
-    timing = f"--fps {part.fps:g}" + (
-        f" --cuts {','.join(map(str, part.cuts))}" if part.cuts else ""
-    )
-    print(
-        f"try: shapepose-fg reconstruct --calibration {written['cameras']} --detections "
-        f"{written['detections']} {timing} --output {output / 'results'}"
-    )
+    options = {
+        "--calibration": written["cameras"],
+        "--detections": written["detections"],
+        "--fps": float(part.fps),
+        "--cuts": ",".join(map(str, part.cuts)) or None,
+        "--output": output / "results",
+    }
+    print(next_reconstruct(options))

@@ -58,7 +58,7 @@ def synchronise(
             f"for videos: shapepose-fg detect {shlex.join(words)} and the other options as before"
         )
         if output is not None:
-            options = seen.given() | seen.said() | {"--timestamps": output}
+            options = seen.given() | seen.calibration_options() | {"--timestamps": output}
             calibration = {"--calibration": seen.calibration, "--output": "results"}
             options = options if given.project is not None else calibration | options
             print(f"{output}: times of {len(taken_s)} frames")

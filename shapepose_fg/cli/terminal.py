@@ -88,10 +88,26 @@ def console(*, stderr: bool = False) -> "Console":
 
 
 def show(content: "RenderableType") -> None:
-    """Print on stdout; colours only on a terminal. Text is not parsed as markup, because it
-    contains names and paths.
+    """Print on stdout; colours only on a terminal, elsewhere without blanks at the ends of lines.
+    Text is not parsed as markup, because it contains names and paths.
     """
-    console().print(content, crop=False, highlight=False)
+    on = console()
+    if on.is_terminal:
+        on.print(content, crop=False, highlight=False)
+        return
+    with on.capture() as printed:
+        on.print(content, crop=False, highlight=False)
+    print("\n".join(line.rstrip() for line in printed.get().split("\n")), end="")
+
+
+def show_written(lines: Iterable[str]) -> None:
+    """Print the paths of written files on stdout, one line each: a path is never broken."""
+    from rich.text import Text
+
+    on = console()
+    for n, line in enumerate(lines):
+        head = "written  " if n == 0 else "         "
+        on.print(Text.assemble((head, "bold"), line), soft_wrap=True)
 
 
 def show_json(value: Any) -> None:
@@ -141,6 +157,23 @@ def note(*messages: str) -> None:
     """Print notes on stderr, one line each."""
     for message in messages:
         say("note", message, "bold")
+
+
+_noted = set[str]()
+"""Notes of readers that the running command has printed."""
+
+
+def note_of_reading(*messages: str) -> None:
+    """Print the notes of a reader that this command has not printed yet: some commands read their
+    input twice.
+    """
+    note(*dict.fromkeys(each for each in messages if each not in _noted))
+    _noted.update(messages)
+
+
+def forget_notes() -> None:
+    """Begin a new command, in which every note is printed again."""
+    _noted.clear()
 
 
 def warn(message: str) -> None:
@@ -214,6 +247,11 @@ def _is_terminal(on: "Console") -> bool:
     return on.file.isatty() and not on.is_dumb_terminal
 
 
+def _time_words(time_s: float) -> str:
+    """A duration in words, to about two digits."""
+    return f"{time_s:.0f} s" if time_s < 100 else f"{time_s / 60:.0f} min"
+
+
 _EVERY_S = 15.0
 """Interval between lines of progress if stderr is not a terminal, s."""
 
@@ -230,7 +268,7 @@ def progress(what: str, unit: str = "frames") -> Iterator[Callable[[int, int], N
         if total and done > 0 and (now := time.monotonic()) - last >= _EVERY_S:
             last = now
             left = (now - begin) * (total - done) / done
-            say(what, f"{done} of {total} {unit}, {left / 60:.0f} min left", "bold")
+            say(what, f"{done} of {total} {unit}, {_time_words(left)} left", "bold")
 
     with bars(unit) as shown:
         task = shown.add_task(what, total=None)

@@ -1,5 +1,6 @@
 """The command `tracks`: lists the people of a result over time, and corrects identities by hand."""
 
+import shlex
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -72,7 +73,7 @@ def tracks(
     if not as_json:
         show(_tracks_table(results))
     if action not in ("list", "undo"):
-        print(f"to undo it: shapepose-fg tracks {results} undo")
+        print(f"to undo it: {shlex.join(['shapepose-fg', 'tracks', str(results), 'undo'])}")
     if action != "list":
         _renew_report(results_folder(results))
 

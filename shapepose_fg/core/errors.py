@@ -77,8 +77,8 @@ def naming(
     except InputError:
         raise
     except caught as error:
-        said = [*str(error).splitlines(), type(error).__name__][0] if kinds else error
-        raise InputError(f"{place}: {words.format(said)}{'; ' if cure else ''}{cure}") from None
+        problem = [*str(error).splitlines(), type(error).__name__][0] if kinds else error
+        raise InputError(f"{place}: {words.format(problem)}{'; ' if cure else ''}{cure}") from None
 
 
 def optional(module: str, extra: str) -> ModuleType:

@@ -137,11 +137,11 @@ class FrameTimes:
 
 def rate_words(run: Mapping[str, Any]) -> str:
     """The rate in a result's `run` in words, and whether it was assumed; empty if unknown."""
-    told = run.get("time") or {}
-    if told.get("fps") is None:
+    entry = run.get("time") or {}
+    if entry.get("fps") is None:
         return ""
-    assumed = " (assumed; give --fps)" if told.get("source") == "assumed" else ""
-    return f", {told['fps']:.6g} Hz{assumed}"
+    assumed = " (assumed; give --fps)" if entry.get("source") == "assumed" else ""
+    return f", {entry['fps']:.6g} Hz{assumed}"
 
 
 def check_cuts(cuts: Sequence[int], frames: int) -> tuple[int, ...]:

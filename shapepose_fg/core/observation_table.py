@@ -128,7 +128,7 @@ class ObservationTable(Table):
         independent of `gate`. `carried` are the observations extrapolated to the frames' times, for
         asynchronous views.
         """
-        here = observations if carried is None else carried
+        at_frame_times = observations if carried is None else carried
         seen = observations.seen
         if rig.moves:
             projected, depth = Views.of(rig, observations.time_s).pixels(joints)
@@ -147,7 +147,7 @@ class ObservationTable(Table):
             candidate=np.where(seen, place, -1),
             xy=np.where(seen[..., None], observations.xy, np.nan),
             confidence=np.where(seen, observations.confidence, 0.0),
-            residual_px=np.where(ahead, projected - here.xy, np.nan),
+            residual_px=np.where(ahead, projected - at_frame_times.xy, np.nan),
             gate=gate,
             probability=np.where(seen, observations.probability, 0.0),
             lead_s=observations.time_s - observations.time_s.mean(axis=1, keepdims=True),

@@ -65,18 +65,18 @@ def repeated_views(before: Detections, now: Detections, views: int) -> Mask:
     """(V,) the views with detections equal to those of the frame before, if other views have new
     ones.
     """
-    there, was = (np.bincount(each.view, minlength=views) for each in (now, before))
-    alike = (there == was) & (there >= _LEAST)
+    count, count_before = (np.bincount(each.view, minlength=views) for each in (now, before))
+    equal_counts = (count == count_before) & (count >= _LEAST)
     sums = (np.bincount(each.view, each.confidence, views) for each in (now, before))
-    alike &= np.equal(*sums)  # equal pictures have equal sums, different ones hardly ever
-    if not alike.any():
-        return alike
-    one, other = (each.only(alike[each.view]) for each in (before, now))
+    equal_counts &= np.equal(*sums)  # equal pictures have equal sums, different ones hardly ever
+    if not equal_counts.any():
+        return equal_counts
+    one, other = (each.only(equal_counts[each.view]) for each in (before, now))
     one, other = (each.rows(np.argsort(each.view, kind="stable")) for each in (one, other))
     same = (
         (one.joint == other.joint)
         & (one.xy == other.xy).all(axis=1)
         & (one.confidence == other.confidence)
     )
-    alike[other.view[~same]] = False
-    return alike & bool((there[~alike] > 0).any())
+    equal_counts[other.view[~same]] = False
+    return equal_counts & bool((count[~equal_counts] > 0).any())

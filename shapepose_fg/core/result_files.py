@@ -50,15 +50,15 @@ def set_aside(folder: Path) -> list[str]:
 
     Returns a sentence about each.
     """
-    told = []
+    notes = []
     for made in (folder / name for name in ("export", "overlay")):
         if made.is_dir():
             names = (
                 made.with_name(f"{made.name}-older{number}") for number in chain([""], count(2))
             )
             made.rename(free := next(path for path in names if not path.exists()))
-            told.append(f"{made} belongs to the previous result; it was renamed to {free.name}")
-    return told
+            notes.append(f"{made} belongs to the previous result; it was renamed to {free.name}")
+    return notes
 
 
 def write_result(
@@ -91,7 +91,8 @@ def write_result(
         # The id is read after all columns before it have been written.
         last = {RUN_ID: Pieces(np.dtype(f"U{_DIGITS}"), (), lambda: (np.array(id_text()),))}
         write_npz(
-            stream, {name: _told(name, each, digest.update) for name, each in people.items()} | last
+            stream,
+            {name: _with_digest(name, each, digest.update) for name, each in people.items()} | last,
         )
 
     def write_observations(stream: BinaryIO) -> None:
@@ -134,17 +135,17 @@ def check_id(people_id: object, other_id: object, file: Path) -> None:
     )
 
 
-def _told(name: str, column: Pieces, tell: Any) -> Pieces:
+def _with_digest(name: str, column: Pieces, update: Any) -> Pieces:
     """Return the column; when its pieces are read, its name, type, shape and bytes are passed to
-    `tell`.
+    `update`.
     """
 
     def pieces() -> Iterator[NDArray[Any]]:
-        tell(f"{name} {column.dtype} {column.shape}\n".encode())
+        update(f"{name} {column.dtype} {column.shape}\n".encode())
         for piece in column.pieces():
             same = np.ascontiguousarray(piece, dtype=column.dtype).reshape(piece.shape)
             if same.size > 0:
-                tell(same.reshape(-1).view(np.uint8))
+                update(same.reshape(-1).view(np.uint8))
             yield same
 
     return replace(column, pieces=pieces)
@@ -159,25 +160,25 @@ class SavedTable(ExitStack, Generic[T]):
         """
         super().__init__()
         self.file, self.kind, self.cure = file, kind, cure
-        self._columns, told = columns_of(kind), kind.meanings()
-        names = (*kind.ROWS, *kind.shared(), *told, RUN_ID)
+        self._columns, meanings = columns_of(kind), kind.meanings()
+        names = (*kind.ROWS, *kind.shared(), *meanings, RUN_ID)
         self._npz = self.enter_context(NpzFile(file, names, f"{cure}, or run one first"))
         try:
-            there = self._npz.names
-            for name in there:
+            stored = self._npz.names
+            for name in stored:
                 self._npz.shape(name)  # report a damaged array before a missing one
             added = {name for name, column in self._columns.items() if column.missing is not None}
-            added |= {f"{name}_names" for name in added if name not in there}
-            for name in (*kind.ROWS, *kind.shared(), *told):
-                if name not in there and name not in added:
+            added |= {f"{name}_names" for name in added if name not in stored}
+            for name in (*kind.ROWS, *kind.shared(), *meanings):
+                if name not in stored and name not in added:
                     raise InputError(f"{file}: column {name} is missing; {cure}")
-            for name in told.keys() & set(there):
+            for name in meanings.keys() & set(stored):
                 words = self._npz.array(name)
                 # Files of earlier versions have fewer codes; new codes are appended.
-                if not (len(words) > 0 and np.array_equal(words, told[name][: len(words)])):
+                if not (len(words) > 0 and np.array_equal(words, meanings[name][: len(words)])):
                     raise InputError(f"{file}: {name} are not those of this version; {cure}")
-            self.run_id = self._npz.array(RUN_ID) if RUN_ID in there else None
-            self._rows = [name for name in kind.ROWS if name in there]
+            self.run_id = self._npz.array(RUN_ID) if RUN_ID in stored else None
+            self._rows = [name for name in kind.ROWS if name in stored]
             self.count = (self._npz.shape(self._rows[0]) or (0,))[0]
             """Number of rows."""
             for name in self._rows:

@@ -47,9 +47,9 @@ class SubjectShapes(Table):
             axis=(1, 2)
         )
         if not finite.all():
-            whose = names[np.argmin(finite)]
+            wrong = names[np.argmin(finite)]
             raise ValueError(
-                f"betas and information must be finite, but those of {whose!r} are not"
+                f"betas and information must be finite, but those of {wrong!r} are not"
             )
         largest = float(np.abs(self.information).max(initial=0.0))
         symmetric = np.allclose(
@@ -103,8 +103,8 @@ class SubjectShapes(Table):
         """
         file = Path(file)
         columns: Any = read_npz(file, _COLUMNS, _CURE)
-        whose = columns.get("body", np.zeros(0))
-        if whose.shape != () or whose.dtype.kind != "U" or str(whose) != body:
+        stored_body = columns.get("body", np.zeros(0))
+        if stored_body.shape != () or stored_body.dtype.kind != "U" or str(stored_body) != body:
             raise InputError(
                 f"{file}: these are shapes of another body model, and betas of one model do not "
                 "fit another; give their model with --body, or another file"

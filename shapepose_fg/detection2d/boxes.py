@@ -70,9 +70,9 @@ class BoxNetwork:
         # Written so that NaN counts as below the minimum.
         # Largest coordinate of a box, pixels of the input.
         sound = (np.abs(boxes) < 1e6).all(axis=1) & (boxes[:, 2:] > boxes[:, :2]).all(axis=1)
-        there = np.flatnonzero((score > (self.form.min_score or least)) & sound)
-        there = there[np.argsort(-score[there], kind="stable")]
-        boxes, score = boxes[there] / scale, score[there]
+        index = np.flatnonzero((score > (self.form.min_score or least)) & sound)
+        index = index[np.argsort(-score[index], kind="stable")]
+        boxes, score = boxes[index] / scale, score[index]
         if least == _LEAST:
             # Widths and heights include the last pixel.
             rectangles = np.column_stack([boxes[:, :2], boxes[:, 2:] - boxes[:, :2] + 1])

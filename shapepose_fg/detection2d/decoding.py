@@ -68,8 +68,8 @@ def decode(output: NDArray[np.float32], skeleton: TextSkeleton) -> PictureCandid
     affinity = line_integrals(
         output[len(skeleton.joints) + 1 :], xy[pairs[:, 0]], xy[pairs[:, 1]], limb
     )
-    there = affinity > 0
-    return PictureCandidates(joint, xy, score, pairs[there], limb[there], affinity[there])
+    positive = affinity > 0
+    return PictureCandidates(joint, xy, score, pairs[positive], limb[positive], affinity[positive])
 
 
 def peaks(heat: NDArray[np.float32], min_score: float = 0.1) -> tuple[Index, Array, Array]:

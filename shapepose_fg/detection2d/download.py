@@ -71,14 +71,14 @@ def named_file(
     differs later.
     """
     kept, pin = (user_cache("networks") / f"{name}.{ending}" for ending in ("onnx", "sha256"))
-    there = kept.is_file()
-    if not there and not fetch:
+    exists = kept.is_file()
+    if not exists and not fetch:
         raise InputError(
             f"{name}: this network has not been downloaded yet; give --download {name}, or the "
             "path of a file"
         )
     content = (
-        read_bytes(kept, MOST_BYTES) if there else _fetched(named_networks()[name].file, progress)
+        read_bytes(kept, MOST_BYTES) if exists else _fetched(named_networks()[name].file, progress)
     )
     digest = hashlib.sha256(content).hexdigest()
     if not pin.is_file():
@@ -87,11 +87,11 @@ def named_file(
     pinned = read_text(pin, most=SMALL).strip()
     if digest != pinned:
         raise InputError(
-            f"{kept}: the sha256 of {'the file' if there else 'the download'} is {digest}, but "
+            f"{kept}: the sha256 of {'the file' if exists else 'the download'} is {digest}, but "
             f"{pinned[:64]} was pinned at first use; if the change is intended, delete the file "
             f"and {pin.name} beside it"
         )
-    if not there:
+    if not exists:
         write_content(kept, content)
     return kept
 
@@ -138,12 +138,12 @@ def _fetched(file: str, progress: Callable[[int, int], object]) -> bytes:
             http.client.HTTPException,
             *_BROKEN,
         ) as error:
-            told = (
+            reason = (
                 error
                 if isinstance(error, urllib.error.HTTPError)
                 else getattr(error, "reason", error)
             )
-            problems.append(f"{base}/{file} ({told})")
+            problems.append(f"{base}/{file} ({reason})")
     raise InputError(
         f"the network cannot be downloaded from {' or '.join(problems)}; download it by hand and "
         f"give --network the path of the {_INSIDE} in it"

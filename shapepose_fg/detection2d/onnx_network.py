@@ -136,13 +136,13 @@ def runtime_for(device: str) -> tuple[Any, str, str]:
     """
     onnxruntime: Any = optional("onnxruntime", "detect")
     kind, _, number = device.partition(":")
-    provider, there = (
+    provider, available = (
         f"{PROVIDERS.get(kind)}ExecutionProvider",
         onnxruntime.get_available_providers(),
     )
-    if provider not in there or not (number or "0").isdecimal():
+    if provider not in available or not (number or "0").isdecimal():
         known = " ".join(
-            name for name, each in PROVIDERS.items() if f"{each}ExecutionProvider" in there
+            name for name, each in PROVIDERS.items() if f"{each}ExecutionProvider" in available
         )
         raise InputError(
             f"--device {device}: the installed onnxruntime supports {known}; install the "

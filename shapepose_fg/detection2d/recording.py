@@ -16,19 +16,25 @@ from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.camera import Camera
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.frame_sets import FrameSets
+from shapepose_fg.core.run_summary import difference
 from shapepose_fg.core.storage.files import inside, read_json, write_atomically, write_content
 from shapepose_fg.detection2d.decoding import PictureCandidates
 from shapepose_fg.detection2d.opening import Network
 from shapepose_fg.detection2d.top_down import PicturePeople
 from shapepose_fg.detection2d.upright import UprightView, roll_of
 from shapepose_fg.io.footage.footage import Footage, Progress
-from shapepose_fg.io.footage.placement import FOOTAGE, CameraFootage, Placement, write_used_footage
+from shapepose_fg.io.footage.placement import (
+    FOOTAGE,
+    UNFINISHED,
+    UNFINISHED_SETTINGS,
+    CameraFootage,
+    Placement,
+    write_used_footage,
+)
 from shapepose_fg.io.timestamps import nameable, write_timestamps
 
 BLOCK = 16
 """Number of frame sets in a block. An interrupted run loses at most one block."""
-_UNFINISHED = "unfinished"
-_SETTINGS = "settings.json"
 
 
 @dataclass(frozen=True)
@@ -78,9 +84,8 @@ class DetectionRun:
     @property
     def settings(self) -> dict[str, Any]:
         """All settings that affect the detections; equal in a resumed run."""
-        cameras = [
-            {
-                "name": each.camera.name,
+        cameras = {
+            each.camera.name: {
                 "path": str(each.footage.path.resolve()),
                 "state": _state(each.footage.path),
                 "placement": str(each.placement.kind),
@@ -88,7 +93,7 @@ class DetectionRun:
                 "frames": self.moments.picture[:, view].tolist(),
             }
             for view, each in enumerate(self.cameras)
-        ]
+        }
         return {**self.cameras[0].network.settings, "cameras": cameras}
 
 
@@ -102,9 +107,9 @@ def run_detection(
     pictures. Blocks of an interrupted run with the same settings are reused, with the same
     resulting files. InputError if the folder has other detections, or a run with other settings.
     """
-    unfinished = inside(run.output, _UNFINISHED)
+    unfinished = inside(run.output, UNFINISHED)
     _refuse_others(run, unfinished)
-    write_content(unfinished / _SETTINGS, json.dumps(run.settings, allow_nan=False))
+    write_content(unfinished / UNFINISHED_SETTINGS, json.dumps(run.settings, allow_nan=False))
     total, views = len(run.moments), len(run.cameras)
     files, counts = list[Path](), np.zeros((2, views), dtype=np.intp)
     for start in range(0, total, BLOCK):
@@ -192,16 +197,14 @@ def _refuse_others(run: DetectionRun, unfinished: Path) -> None:
             " camera in the calibration"
         )
     places = [run.output / f"{name}{suffix}" for name in names for suffix in (".txt", ".json")]
-    if (unfinished / _SETTINGS).is_file():
-        before, now = read_json(unfinished / _SETTINGS), run.settings
-        if before != now:
-            differ = [
-                key for key in now if not isinstance(before, dict) or before.get(key) != now[key]
-            ]
+    if (unfinished / UNFINISHED_SETTINGS).is_file():
+        found = difference(read_json(unfinished / UNFINISHED_SETTINGS), run.settings)
+        if found is not None:
+            name, was, now = found
+            how = f" ({was} then, {now} now)" if max(len(repr(was)), len(repr(now))) <= 40 else ""
             raise InputError(
-                f"{unfinished}: there is an interrupted run with different "
-                f"{' and '.join(differ)}; start it with the same options to continue, or delete "
-                "this folder"
+                f"{unfinished}: the interrupted run had another {name}{how}; start it with the "
+                "same options to continue, or delete this folder"
             )
     elif unfinished.exists() and any(unfinished.iterdir()):
         raise InputError(

@@ -142,7 +142,7 @@ class TopDownNetwork:
     @property
     def settings(self) -> dict[str, Any]:
         """All settings that affect the detections."""
-        said = [
+        descriptions = [
             part
             and {
                 "sha256": part.network.sha256,
@@ -150,18 +150,18 @@ class TopDownNetwork:
             }
             for part in (self, self.boxes)
         ]
-        return {"network": said[0], "detection": {"boxes": said[1]}}
+        return {"network": descriptions[0], "detection": {"boxes": descriptions[1]}}
 
     def head(self, frames: int) -> str:
         """The beginning of MMPose's JSON of a video, with the layout of the joints unless it was
         guessed.
         """
-        alike = [
+        candidates = [
             each
             for each in SKELETONS.values()
             if each.keypoint_count == self.skeleton.keypoint_count
         ]
-        named = self.form.skeleton in SKELETONS or alike == [self.skeleton]
+        named = self.form.skeleton in SKELETONS or candidates == [self.skeleton]
         meta = {"dataset_name": self.skeleton.name} if named else {}
         return f'{{"meta_info": {json.dumps(meta)}, "instance_info": ['
 

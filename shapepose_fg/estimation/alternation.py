@@ -131,8 +131,8 @@ def _problems(
         ran = person.touched & (away > RUNAWAY_M)
         reasons[person.rows] = np.where(ran, "diverged from its views", reasons[person.rows])
         if person.failure:
-            there = finite[person.rows]
-            reasons[person.rows] = np.where(there, person.failure, reasons[person.rows])
+            solved = finite[person.rows]
+            reasons[person.rows] = np.where(solved, person.failure, reasons[person.rows])
     return tuple(
         Problem(int(n), int(rows.track[n]), int(rows.frame[n]), int(j), str(reasons[n, j]))
         for n, j in np.argwhere(reasons != "")

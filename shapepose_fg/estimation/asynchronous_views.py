@@ -52,8 +52,8 @@ def carried_to_frames(
     lead_s = leads(observations, views)
     if not lead_s.any():
         return observations
-    there = points[:, :, None] + lead_s[..., None] * velocity[:, :, None]
-    away = views.project_apart(there)[0] - views.project(points)[0]
+    exposed = points[:, :, None] + lead_s[..., None] * velocity[:, :, None]
+    away = views.project_apart(exposed)[0] - views.project(points)[0]
     return replace(observations, xy=observations.xy - np.where(np.isfinite(away), away, 0.0))
 
 

@@ -63,11 +63,11 @@ class BodyFrames(BodyWindow):
             step = np.empty((len(left), self.energy.num_free))
             solved(system, damping[left], step, np.empty(len(left)))
             step[:, 10:13] = (at.root @ step[:, 10:13, None])[..., 0]
-            there, new = part._after(at, part.last, step[:, :10], step[:, 10:])
+            next_state, new = part._after(at, part.last, step[:, :10], step[:, 10:])
             better = _better(new, part.last)
-            moved = new.bodies + there.deviation - part.last.bodies - at.deviation
+            moved = new.bodies + next_state.deviation - part.last.bodies - at.deviation
             small = np.linalg.norm(moved, axis=-1).mean(axis=-1) < SETTLED_M
-            state.put(left[better], there.rows(better))
+            state.put(left[better], next_state.rows(better))
             self.last.put(left[better], new.rows(better))
             worse = np.maximum(10 * damping[left], 1e-2)
             damping[left] = np.where(better, np.maximum(damping[left] / 5, 1e-6), worse)
@@ -87,12 +87,12 @@ class BodyFrames(BodyWindow):
 
     def take(self, state: BodyState, shape: Array, pose: Array) -> BodyState:
         """The states after another step; rows that the step makes worse keep their state."""
-        there, new = self._after(state, self.last, shape, pose)
+        moved, new = self._after(state, self.last, shape, pose)
         worse = ~_better(new, self.last)
         new.put(worse, self.last.rows(worse))
-        there.put(worse, state.rows(worse))
+        moved.put(worse, state.rows(worse))
         self.last = new
-        return there
+        return moved
 
     def covariances(self, state: BodyState) -> Marginals:
         """Marginal covariances of every row's variables, around the last solution."""

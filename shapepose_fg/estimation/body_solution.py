@@ -212,5 +212,5 @@ def _filled(free: Array, ok: Mask, times_s: Array) -> Array:
     """Bodies (T, P), where those that are not `ok` (T,) are replaced by the nearest in time that
     are.
     """
-    there = np.flatnonzero(ok)
-    return free[there[np.abs(times_s[:, None] - times_s[there]).argmin(axis=1)]]
+    known = np.flatnonzero(ok)
+    return free[known[np.abs(times_s[:, None] - times_s[known]).argmin(axis=1)]]

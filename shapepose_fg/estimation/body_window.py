@@ -186,25 +186,25 @@ class BodyWindow:
 
     def _descended(self, state: BodyState) -> BodyState:
         """The state of least cost; the solver starts at `state`, where `last` is linearised."""
-        here, damping, done = self.last, DAMPING, False
+        around, damping, done = self.last, DAMPING, False
         for _ in range(STEPS):
             if done:
                 break
-            there, new = self._after(state, here, *self._step(state, here, damping))
-            if not new.cost <= here.cost + 1e-3 * abs(here.cost):
+            moved_state, new = self._after(state, around, *self._step(state, around, damping))
+            if not new.cost <= around.cost + 1e-3 * abs(around.cost):
                 damping = max(10 * damping, 1e-2)
                 if damping > 1e3:
                     break
                 continue
-            off = new.bodies + there.deviation - here.bodies - state.deviation
+            off = new.bodies + moved_state.deviation - around.bodies - state.deviation
             moved = np.linalg.norm(off, axis=-1).mean()
-            state, here, damping, done = (
-                there,
+            state, around, damping, done = (
+                moved_state,
                 new,
                 max(damping / 5, 1e-6),
                 bool(moved < SETTLED_M),
             )
-        self.last = here
+        self.last = around
         return state
 
     def hold(self, state: BodyState, feet: Index) -> None:
@@ -223,9 +223,9 @@ class BodyWindow:
         if not np.isfinite(density).any():
             return
         evidence = self.last.evidence
-        told = np.where(seen[..., None, None], evidence.information[:, feet], 0.0)
-        told = JointTargets(evidence.target[:, feet], told)
-        information, pull = held_in_place(told, density, self.times_s)
+        information = np.where(seen[..., None, None], evidence.information[:, feet], 0.0)
+        targets = JointTargets(evidence.target[:, feet], information)
+        information, pull = held_in_place(targets, density, self.times_s)
         information[~seen], pull[~seen] = 0.0, 0.0
         scale = np.trace(information, axis1=-2, axis2=-1)
         known = information + 1e-9 * scale[..., None, None] * np.eye(3)
@@ -233,7 +233,7 @@ class BodyWindow:
         self.standing.xyz[:, feet] = (inverses(known) @ pull[..., None])[..., 0]
         self.walk[:, feet] = np.where(seen[1:] & seen[:-1], density, np.inf)
         # Detectors' errors last: all frames of a stance together say as much as one.
-        own = np.trace(told.information, axis1=-2, axis2=-1)
+        own = np.trace(targets.information, axis1=-2, axis2=-1)
         share = np.where(scale > 0, own / np.maximum(own + scale, 1e-9), 1.0)
         self.standing.information[:, feet] = share[..., None, None] * information
         self.sigmas_px[:, feet] /= np.sqrt(share)[..., None]
@@ -243,20 +243,20 @@ class BodyWindow:
         """The state after another step of betas (10,) and poses (T, N) from the solution; the
         solution itself if the step makes it worse.
         """
-        there, new = self._after(state, self.last, shape, pose)
+        moved, new = self._after(state, self.last, shape, pose)
         if not new.cost <= self.last.cost + 1e-3 * abs(self.last.cost):
             return state
         self.last = new
-        return there
+        return moved
 
     def _after(
-        self, state: BodyState, here: Around, shape: Array, pose: Array
+        self, state: BodyState, around: Around, shape: Array, pose: Array
     ) -> tuple[BodyState, Around]:
         """State after a step, with the best deviations, and the model around it."""
-        there = state.moved(shape, pose)
-        bodies = self._bodies(there)
-        there = replace(there, deviation=self._deviation(here, bodies))
-        return there, self.around(there, bodies)
+        moved = state.moved(shape, pose)
+        bodies = self._bodies(moved)
+        moved = replace(moved, deviation=self._deviation(around, bodies))
+        return moved, self.around(moved, bodies)
 
     def joints(self, state: BodyState) -> Array:
         """(T, J, 3) X, metres in the world."""
@@ -354,15 +354,15 @@ class BodyWindow:
     def _bodies(self, state: BodyState) -> Array:
         return self.energy.model.keypoints(self.energy.complete(state.free))
 
-    def said_by(self, state: BodyState, joints: Mask) -> Array:
+    def information_from(self, state: BodyState, joints: Mask) -> Array:
         """(T, M, P) normal equations of each frame's body from some `joints` (J,) only, without
         priors, around the last solution.
         """
         weighed = self.last.gain / self.variance[..., None, None] * joints[:, None, None]
         targets, T = EnergyTargets(self.last.target, weighed), len(self)
         whole = self.energy.linearise(state.free, targets, 1e9, self._held, nothing(T)).system
-        alone = EnergyTargets(self.last.target, np.zeros_like(weighed))
-        prior = self.energy.linearise(state.free, alone, 1e9, self._held, nothing(T)).system
+        no_targets = EnergyTargets(self.last.target, np.zeros_like(weighed))
+        prior = self.energy.linearise(state.free, no_targets, 1e9, self._held, nothing(T)).system
         return np.asarray(whole - prior)
 
     def deviation(self, bodies: Array) -> Array:
@@ -371,11 +371,11 @@ class BodyWindow:
         """
         return self._deviation(self.last, bodies)
 
-    def _deviation(self, here: Around, bodies: Array) -> Array:
+    def _deviation(self, around: Around, bodies: Array) -> Array:
         """X - J that is best for bodies that have moved."""
-        seen = np.asarray(here.gain.any(axis=(-1, -2)))
-        away = np.where(seen[..., None], here.target - bodies, 0.0)
-        return (here.gain @ away[..., None])[..., 0]
+        seen = np.asarray(around.gain.any(axis=(-1, -2)))
+        away = np.where(seen[..., None], around.target - bodies, 0.0)
+        return (around.gain @ away[..., None])[..., 0]
 
     def _faster(self, bodies: Array) -> Array:
         """(T - 1, J) how many times the mean density of acceleration each joint has, at least 1."""
@@ -395,11 +395,11 @@ class BodyWindow:
         energy, pull = self.links.at(root, others)
         return energy, pull[:T]
 
-    def _eliminated(self, root: Array, here: Around, damping: float) -> tuple[Array, Array]:
+    def _eliminated(self, root: Array, around: Around, damping: float) -> tuple[Array, Array]:
         """The factor of the poses and what is left of the betas
         (`body/kernels/solving.eliminated`).
         """
-        T, N = here.pull.shape
+        T, N = around.pull.shape
         if self.links is None:
             diagonal, beyond = np.zeros((T, N)), np.zeros((T, N, 1))
         else:
@@ -408,16 +408,16 @@ class BodyWindow:
             )
         M = (beyond.shape[-1] + 1) * N + 11
         kept, front = np.zeros((T, M, -(-N // 16) * 16)), np.zeros((M, M))
-        eliminated(here.system, root, diagonal + HELD, beyond, here.pull, damping, kept, front)
+        eliminated(around.system, root, diagonal + HELD, beyond, around.pull, damping, kept, front)
         return kept, front
 
-    def _step(self, state: BodyState, here: Around, damping: float) -> tuple[Array, Array]:
+    def _step(self, state: BodyState, around: Around, damping: float) -> tuple[Array, Array]:
         """Steps of betas (10,) and poses (T, N)."""
-        kept, front = self._eliminated(state.root, here, damping)
+        kept, front = self._eliminated(state.root, around, damping)
         whole = _symmetric(front[-10:, -10:]) + np.eye(10)
         whole += damping * np.diag(np.diag(whole))
         coefficients = np.append(1.0, -np.linalg.solve(whole, front[-10:, -11] + state.betas))
-        pose = np.empty(here.pull.shape)
+        pose = np.empty(around.pull.shape)
         put_back(kept, coefficients, pose)
         return coefficients[1:], pose
 

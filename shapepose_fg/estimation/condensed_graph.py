@@ -69,7 +69,7 @@ def frame_systems(
     """
     system, turn, P = window.last.system, state.root, window.energy.num_free
     if joints is not None:
-        system = window.said_by(state, joints)
+        system = window.information_from(state, joints)
     lower = np.tril(system[:, :P])
     H, pull = lower + np.tril(lower, -1).mT, -system[:, P]
     H[:, 10:13] = turn @ H[:, 10:13]

@@ -127,10 +127,10 @@ def smoothed(log: Array, times_s: Array) -> Array:
     forward, backward = np.empty_like(seen), np.ones_like(seen)
     forward[0] = feet.first * seen[0]
     for t in range(1, len(seen)):
-        told = forward[t - 1] @ turn[t - 1] * seen[t]
-        forward[t] = told / told.sum(axis=1, keepdims=True)
+        unnormalised = forward[t - 1] @ turn[t - 1] * seen[t]
+        forward[t] = unnormalised / unnormalised.sum(axis=1, keepdims=True)
     for t in range(len(seen) - 2, -1, -1):
-        told = (seen[t + 1] * backward[t + 1]) @ turn[t].T
-        backward[t] = told / told.sum(axis=1, keepdims=True)
+        unnormalised = (seen[t + 1] * backward[t + 1]) @ turn[t].T
+        backward[t] = unnormalised / unnormalised.sum(axis=1, keepdims=True)
     both = forward * backward
     return both / both.sum(axis=2, keepdims=True)

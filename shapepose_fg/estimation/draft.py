@@ -12,7 +12,7 @@ from shapepose_fg.body.fitting.fitter import (
     FitStatus,
     JointTargets,
 )
-from shapepose_fg.core.arrays import Array, Index, Mask
+from shapepose_fg.core.arrays import Array, Index, Mask, pair_keys
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.rows import Rows
@@ -81,7 +81,7 @@ def draft(
     From the views, and from the body where these are weak or contradict it. Measurements are
     linearised at triangulated joints, then at the body's, with a decreasing kernel (`NARROWING_M`).
     Rows with the same detections as in the `last` estimate start from its body, with the narrowest
-    kernel; others from a body fitted to the triangulated joints: without it a crowd before three
+    kernel; others from a body fitted to the triangulated joints: without it a crowd with three
     cameras lost two points of F1. As a joint's views also determine the body, the covariances are
     too small.
     """
@@ -93,10 +93,10 @@ def draft(
     fitted = JointTargets(np.zeros((N, J, 3)), np.zeros((N, J, 3, 3)))
     body, near = BodyFit.failed(np.full(N, FitStatus.TOO_FEW_JOINTS), J), np.zeros(N, dtype=bool)
     if last is not None:
-        here, there = _unchanged(observations, last.observations)
-        fitted.put(here, last.fitted.rows(there))
-        body.put(here, last.body.rows(there))
-        near[here] = body.ok[here]
+        unchanged, previous = _unchanged(observations, last.observations)
+        fitted.put(unchanged, last.fitted.rows(previous))
+        body.put(unchanged, last.body.rows(previous))
+        near[unchanged] = body.ok[unchanged]
     asked = new = np.flatnonzero(~near)
     evidence = evidence.rows(new)
     for reach_m in (None, *NARROWING_M):  # None: at triangulated joints, as above
@@ -123,11 +123,10 @@ def _unchanged(now: Observations, before: Observations) -> tuple[Index, Index]:
     """(K,) rows with the same detections as in the row of their track and frame `before`, and (K,)
     these rows.
     """
-    width = int(max(now.track.max(initial=0), before.track.max(initial=0))) + 1
-    names = [each.frame * width + each.track for each in (now, before)]
-    _, here, there = np.intersect1d(*names, assume_unique=True, return_indices=True)
-    same = (now.xy[here] == before.xy[there]).all(axis=(1, 2, 3))
-    return here[same], there[same]
+    keys = pair_keys(*((each.frame, each.track) for each in (now, before)))
+    _, index, previous = np.intersect1d(*keys, assume_unique=True, return_indices=True)
+    same = (now.xy[index] == before.xy[previous]).all(axis=(1, 2, 3))
+    return index[same], previous[same]
 
 
 def joint_targets(evidence: ViewEvidence, enough: Mask) -> JointTargets:

@@ -31,8 +31,8 @@ def factor_evidence(window: PersonWindow, t: int, joint: int) -> list[FactorEvid
     user factors on this joint and frame. Factors in other frames contribute by motion.
     """
     key, ties = int(window.keys[t, joint]), window.ties
-    mine = [factor for factor in ties.active if key in factor.keys]
-    if len(mine) == 0 or window.failure:
+    own_factors = [factor for factor in ties.active if key in factor.keys]
+    if len(own_factors) == 0 or window.failure:
         return []
     first = window.graph.size() - len(ties.active)  # user factors are last
     without = {first + n for n, factor in enumerate(ties.active) if key in factor.keys}
@@ -41,13 +41,13 @@ def factor_evidence(window: PersonWindow, t: int, joint: int) -> list[FactorEvid
         if n not in without:
             rest.push_back(window.graph.at(n))
     wide = gtsam.noiseModel.Isotropic.Sigma(3, 100.0)  # for joints determined by these factors only
-    for other in {other for factor in mine for other in factor.keys}:
+    for other in {other for factor in own_factors for other in factor.keys}:
         if window.ties.start.exists(other):
             continue
         rest.push_back(gtsam.PriorFactorPoint3(other, window.values.atPoint3(other), wide))
     try:
         marginals = gtsam.Marginals(rest, window.values)
-        return [_evidence(factor, key, window, marginals) for factor in mine]
+        return [_evidence(factor, key, window, marginals) for factor in own_factors]
     except RuntimeError:  # a user variable is otherwise undetermined
         return []
 

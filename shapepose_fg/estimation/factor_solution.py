@@ -51,7 +51,7 @@ def solve_with_factors(
 def _solved(
     people: list[BodyGraph], ties: CoupledGraph, config: WindowGraphConfig
 ) -> list[FactorSolution]:
-    few = replace(config, max_iterations=min(config.max_iterations, _STEPS))
+    limited = replace(config, max_iterations=min(config.max_iterations, _STEPS))
     before = [(each.state, each.window.last) for each in people]
     for each in people:
         each.refresh()
@@ -61,7 +61,7 @@ def _solved(
             if len(ties.active) == 0:
                 return []
             order = ordering(people, values)
-            values = descend(graph, values, order, few, over_time=people[0].temporal)
+            values = descend(graph, values, order, limited, over_time=people[0].temporal)
             moved = [each.take(values) for each in people]
             _keep_own(ties, values)
             for each in people:

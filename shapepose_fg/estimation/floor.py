@@ -74,12 +74,12 @@ def find_floor(points: Array, look: Index, up: Array, tilt_rad: float = TILT_RAD
     correlated. A robust fit of a plane, level up to `tilt_rad`, starts at the height at which most
     measurements agree.
     """
-    numbers, whose, count = np.unique(look, return_inverse=True, return_counts=True)
+    numbers, group, count = np.unique(look, return_inverse=True, return_counts=True)
     if len(numbers) < LEAST_LOOKS:
         return (
             f"{len(numbers)} measurements of standing feet, but at least {LEAST_LOOKS} are needed"
         )
-    weight, height = 1.0 / count[whose], points @ up
+    weight, height = 1.0 / count[group], points @ up
     order = np.argsort(height, kind="stable")
     total = np.concatenate([[0.0], np.cumsum(weight[order])])
     within = (

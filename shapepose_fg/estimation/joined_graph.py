@@ -97,16 +97,16 @@ class JoinedPeople:
         )
         goes = reported_with_poses(*seen) if views.carried is not None else None
         for frame in np.unique(people.frame).tolist():
-            here = np.flatnonzero(people.frame == frame)
-            cameras = self._cameras(frame, rows.time_s[here[0]])
+            in_frame = np.flatnonzero(people.frame == frame)
+            cameras = self._cameras(frame, rows.time_s[in_frame[0]])
             made = self._people.add(
                 Sighting(
                     int(people.person[n]), frame, float(people.time_s[n]), people.joints[n], xy[n],
                     sigmas[n], density[n], cameras,
                 )
-                for n in here.tolist()
+                for n in in_frame.tolist()
             )  # fmt: skip
-            for n in here.tolist():
+            for n in in_frame.tolist():
                 self._report(people, n, views, None if goes is None else goes[n], made)
             yield frame, made
 

@@ -43,12 +43,12 @@ def limbs_that_hide(joints: Sequence[str]) -> tuple[Index, Array]:
     limbs = _TRUNK | {
         (f"{s}{a}", f"{s}{b}"): width for s in "RL" for (a, b), width in ARMS_AND_LEGS.items()
     }
-    there = [
+    present = [
         (joints.index(a), joints.index(b), w)
         for (a, b), w in limbs.items()
         if {a, b} <= set(joints)
     ]
-    table = np.array(there).reshape(-1, 3)
+    table = np.array(present).reshape(-1, 3)
     return table[:, :2].astype(np.intp), table[:, 2]
 
 
@@ -67,11 +67,13 @@ def elsewhere_variance(
     focal = np.broadcast_to(views.focal_px, (len(joints), depth.shape[2]))
     missed = np.zeros(joints.shape[:2])
     for number in np.unique(frame[row]).tolist():
-        here, of_frame = frame[row] == number, np.flatnonzero(frame == number)
+        in_frame, of_frame = frame[row] == number, np.flatnonzero(frame == number)
         hidden = _behind_limbs(
-            (xy, depth), (row[here], joint[here]), of_frame, focal[row[here]], limbs
+            (xy, depth), (row[in_frame], joint[in_frame]), of_frame, focal[row[in_frame]], limbs
         )
-        missed[row[here], joint[here]] = (inside[row[here], joint[here]] & ~hidden).sum(axis=-1)
+        missed[row[in_frame], joint[in_frame]] = (
+            inside[row[in_frame], joint[in_frame]] & ~hidden
+        ).sum(axis=-1)
     unusual = UNUSUAL / (UNUSUAL + MISSED**missed)
     return np.where(missed >= LEAST_VIEWS, unusual * ELSEWHERE_M**2, 0.0)
 

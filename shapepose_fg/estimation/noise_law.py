@@ -93,9 +93,9 @@ class NoiseLaw:
     @classmethod
     def read(cls, run: Any, path: Path) -> "NoiseLaw":
         """The law in `run`, the content of the run.json at `path`; otherwise as `load`."""
-        told = run.get("noise_law") if isinstance(run, dict) else None
+        saved = run.get("noise_law") if isinstance(run, dict) else None
         try:
-            return cls.shipped() if told is None else cls.from_dict(told)
+            return cls.shipped() if saved is None else cls.from_dict(saved)
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise InputError(
                 f"{path}: noise_law is damaged ({error}); reconstruct the recording again"
@@ -183,27 +183,27 @@ class Residuals:
             off = np.nan_to_num(np.linalg.norm(evidence.residual_px, axis=-1)) / np.where(
                 good, sigmas, 1.0
             )
-            there = (evidence.inlier == good).all(axis=-1) & (off < _AGREE_SIGMA).all(axis=-1)
-            there &= every.seen[..., view] & (evidence.sigma_m < KNOWN_M)
-            row, joint = np.nonzero(there)
-            xy, depth, slope = views.rows(row).project(evidence.target[there][:, None])
+            agree = (evidence.inlier == good).all(axis=-1) & (off < _AGREE_SIGMA).all(axis=-1)
+            agree &= every.seen[..., view] & (evidence.sigma_m < KNOWN_M)
+            row, joint = np.nonzero(agree)
+            xy, depth, slope = views.rows(row).project(evidence.target[agree][:, None])
             focal = np.broadcast_to(views.focal_px, (len(chosen), len(views)))[row, view]
             length = depth[:, 0, view] / focal
-            off_m = length[:, None] * (xy[:, 0, view] - every.xy[there][:, view])
+            off_m = length[:, None] * (xy[:, 0, view] - every.xy[agree][:, view])
             slope = length[:, None, None] * slope[:, 0, view]
-            covariance = slope @ inverses(evidence.information[there]) @ slope.mT
+            covariance = slope @ inverses(evidence.information[agree]) @ slope.mT
             variance, whole = np.linalg.eigvalsh(covariance), np.square(off_m).sum(axis=1)
             along = np.einsum("ni,nij,nj->n", off_m, covariance, off_m) - variance[:, 0] * whole
             second = np.clip(along / np.maximum(np.ptp(variance, axis=1), 1e-12), 0.0, whole)
             squared = np.column_stack([whole - second, second])
-            score = every.confidence[there][:, view]
+            score = every.confidence[agree][:, view]
             known = np.isfinite(squared + variance).all(axis=1)
             columns = (
                 score,
                 core_sigma_m(score, config) * scatter[joint],
                 squared,
                 variance,
-                rows.confidence[there],
+                rows.confidence[agree],
             )
             parts.append([column[known] for column in columns])
         return cls(*(np.concatenate(column) for column in zip(*parts, strict=True)))
@@ -223,11 +223,11 @@ class Residuals:
         count, expected = total(np.ones(len(score))), np.square(prior.times)
         squared_times, gross = expected, np.array(prior.gross)
         for _ in range(_ROUNDS):
-            theirs = np.where(seen, squared_times[of_others], 0.0).sum(axis=1) / np.maximum(
+            of_views = np.where(seen, squared_times[of_others], 0.0).sum(axis=1) / np.maximum(
                 seen.sum(axis=1), 1
             )
             others, own = (
-                self.others * theirs[:, None],
+                self.others * of_views[:, None],
                 (squared_times[score] * self.scatter**2)[:, None],
             )
             likely = [

@@ -94,10 +94,10 @@ def covariance_factors(marginals: Marginals, noise: float) -> Array:
     frequent with such detectors.
     """
     association = AssociationUncertainty.measured()
-    sigma_m, told, used = association_features(marginals)
+    sigma_m, evidence, used = association_features(marginals)
     if not marginals.window.over_time:
-        return association.in_frames(sigma_m, 1 - used / np.maximum(told, 1e-9))
-    rejected = 1 - used.sum(keepdims=True) / max(told.sum(), 1e-9)
+        return association.in_frames(sigma_m, 1 - used / np.maximum(evidence, 1e-9))
+    rejected = 1 - used.sum(keepdims=True) / max(evidence.sum(), 1e-9)
     correlated = CorrelatedErrors.measured().factor(*correlation_features(marginals))
     return np.sqrt(noise) * correlated * association.of_rejected(rejected)
 
@@ -108,9 +108,9 @@ def association_features(marginals: Marginals) -> tuple[Array, Array, Array]:
     """
     window = marginals.window
     sigma_m = np.sqrt(np.trace(marginals.joints(), axis1=-2, axis2=-1) / 3).mean(axis=1)
-    told = window.config.weight(window.observations.confidence) * window.observations.seen
-    used = told * window.last.evidence.inlier
-    return sigma_m, told.sum(axis=(1, 2)), used.sum(axis=(1, 2))
+    weight = window.config.weight(window.observations.confidence) * window.observations.seen
+    used = weight * window.last.evidence.inlier
+    return sigma_m, weight.sum(axis=(1, 2)), used.sum(axis=(1, 2))
 
 
 def correlation_features(marginals: Marginals) -> tuple[float, float]:
@@ -134,9 +134,9 @@ def correlation_features(marginals: Marginals) -> tuple[float, float]:
     shown = np.linalg.inv(views + prior)
     of_body = (flat @ (shown @ views @ shown)).reshape(slope.shape) @ slope.mT
     kept = np.eye(3) - gain
-    alone = np.trace(kept @ of_body @ kept.mT + variance * kept, axis1=-2, axis2=-1)
+    one_frame = np.trace(kept @ of_body @ kept.mT + variance * kept, axis1=-2, axis2=-1)
     over_time = np.trace(marginals.joints()[some], axis1=-2, axis2=-1)
-    return _correlated_share(marginals), float(np.exp(np.log(alone / over_time)[seen].mean()))
+    return _correlated_share(marginals), float(np.exp(np.log(one_frame / over_time)[seen].mean()))
 
 
 def _correlated_share(marginals: Marginals) -> float:

@@ -31,11 +31,11 @@ def smoothed(
     NaN for joints of a track that are never estimated.
     """
     times, at = np.unique(time_s, return_inverse=True)
-    people, who = np.unique(track, return_inverse=True)
+    people, row = np.unique(track, return_inverse=True)
     T, J, C = len(times), joints.shape[1], len(people) * joints.shape[1]
     place, variance = np.full((len(people), J, T, 3), np.nan), np.full((len(people), J, T), np.nan)
-    place[who, :, at] = joints
-    variance[who, :, at] = 4 * np.trace(covariance, axis1=-2, axis2=-1) / 3 + LEAST_SIGMA_M**2
+    place[row, :, at] = joints
+    variance[row, :, at] = 4 * np.trace(covariance, axis1=-2, axis2=-1) / 3 + LEAST_SIGMA_M**2
     by_time = np.moveaxis(place, 2, 0).reshape(T, C, 3), np.moveaxis(variance, 2, 0).reshape(T, C)
     speed, turning = (each.reshape(T - 1, len(people), J) for each in motion_of(*by_time, times))
     known = np.asarray(np.isfinite(variance) & np.isfinite(place).all(axis=-1))
@@ -56,8 +56,8 @@ def smoothed(
         mean, of_mean = np.moveaxis(states[..., 0], 0, -1), spread[..., 0, 0]
         apart = ((place - mean) ** 2).sum(axis=-1) / (of_mean + 1.0 / information)
         weight = information / (1 + apart / KERNEL)
-    ever = np.asarray(known.any(axis=2))[who]
-    mean, of_mean = (each.reshape(-1, J, *each.shape[1:])[who, :, at] for each in (mean, of_mean))
+    ever = np.asarray(known.any(axis=2))[row]
+    mean, of_mean = (each.reshape(-1, J, *each.shape[1:])[row, :, at] for each in (mean, of_mean))
     isotropic = of_mean[..., None, None] * np.eye(3)
     return np.where(ever[..., None], mean, np.nan), np.where(
         ever[..., None, None], isotropic, np.nan

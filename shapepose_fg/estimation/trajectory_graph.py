@@ -189,9 +189,11 @@ class TrajectoryGraph:
         self._at = np.searchsorted(mounted.frames, rows.frame)
         self._joint_keys = np.zeros(rows.confidence.shape[:2], dtype=np.int64)
         for track in np.unique(rows.track).tolist():
-            mine = rows.track == track
-            frames = rows.frame[mine, None]
-            self._joint_keys[mine] = joint_keys(track, np.arange(rows.confidence.shape[1]), frames)
+            of_track = rows.track == track
+            frames = rows.frame[of_track, None]
+            self._joint_keys[of_track] = joint_keys(
+                track, np.arange(rows.confidence.shape[1]), frames
+            )
         self._lenses = [make_calibration(camera.K) for camera in mounted.rig.cameras]
         self._still = [make_camera(camera.K, camera.wTc) for camera in mounted.rig.cameras]
 
@@ -217,12 +219,12 @@ class TrajectoryGraph:
             return []
         linear = self.graph.linearize(self.values)
         _, rest = linear.eliminatePartialSequential(gtsam.Ordering(joints))
-        here = gtsam.Values()
+        values = gtsam.Values()
         for key, pose in zip(self.keys.ravel().tolist(), self.poses.reshape(-1, 4, 4), strict=True):
-            here.insert(key, gtsam.Pose3(pose))
+            values.insert(key, gtsam.Pose3(pose))
         factors = (rest.at(n) for n in range(rest.size()))
         return [
-            gtsam.LinearContainerFactor(each, here)
+            gtsam.LinearContainerFactor(each, values)
             for each in factors
             if each is not None and each.size() > 0
         ]
@@ -263,11 +265,11 @@ class TrajectoryGraph:
             kernel,
         )
         deque(map(self.graph.add, seen), maxlen=0)
-        there = chosen.any(axis=2)
-        joints = self._joint_keys[there].tolist()
-        deque(map(self.values.insert, joints, points[there]), maxlen=0)
+        used = chosen.any(axis=2)
+        joints = self._joint_keys[used].tolist()
+        deque(map(self.values.insert, joints, points[used]), maxlen=0)
         near = isotropic(3, UNDETERMINED_M)
-        deque(map(self.graph.addPriorPoint3, joints, points[there], [near] * len(joints)), maxlen=0)
+        deque(map(self.graph.addPriorPoint3, joints, points[used], [near] * len(joints)), maxlen=0)
         for factor in self._own(self, self.keys) if self._own is not None else ():
             self.graph.add(factor)
         return joints

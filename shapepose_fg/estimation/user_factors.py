@@ -204,10 +204,10 @@ class PersonWindow:
 
     def shared(self, other: "PersonWindow") -> tuple[Index, Index]:
         """Rows (S,) of this person and of another in their common frames."""
-        _, mine, theirs = np.intersect1d(
+        _, rows, other_rows = np.intersect1d(
             self.frames, other.frames, assume_unique=True, return_indices=True
         )
-        return mine, theirs
+        return rows, other_rows
 
     def add(self, item: gtsam.NonlinearFactor | gtsam.Values, name: str = "") -> None:
         """Add a user factor, which stays through all alternations, or initial values of user
@@ -223,7 +223,7 @@ class PersonWindow:
             self._add_start(item)
             return
         nodes, touched = list[tuple[int, int]](), list[tuple[PersonWindow, int]]()
-        whose = f"your factor{f' ({name})' if name else ''}"
+        what = f"your factor{f' ({name})' if name else ''}"
         for key in item.keys():  # noqa: SIM118 - GTSAM's, not a dictionary's
             person = next((each for each in (self, *self.people) if key in each._own), None)
             if person is not None:
@@ -234,7 +234,7 @@ class PersonWindow:
             holder = self._holder(key)
             if holder is None:
                 raise ValueError(
-                    f"{whose} uses {format_key(key)}, which is not in this window: use keys of "
+                    f"{what} uses {format_key(key)}, which is not in this window: use keys of "
                     "its people (`keys`, `velocity_keys`, `body_keys` and `shape_key` of "
                     "`window.people`; people are not in every frame), or first yield gtsam.Values "
                     "with the initial value of your variable"
@@ -245,7 +245,7 @@ class PersonWindow:
             self.ties.take_in(person.ties)
             person.touched[joint : joint + 1] |= joint >= 0
         if len(touched) == 0 and len(nodes) == 0:
-            raise ValueError(f"{whose} has no variable; give it the keys of joints")
+            raise ValueError(f"{what} has no variable; give it the keys of joints")
         self.ties.factors.append(UserFactor(item, tuple(item.keys()), name))
         self.ties.tie(nodes)
 
@@ -291,12 +291,12 @@ def add_factors(people: Sequence[PersonWindow], functions: Sequence[FactorFuncti
     """Add the factors of user functions to the people of a window; if all have a single frame, to
     those of each frame.
     """
-    alone = all(len(person) == 1 for person in people)
+    single_frames = all(len(person) == 1 for person in people)
     together: dict[int, list[PersonWindow]] = {}
     for person in people:
-        together.setdefault(int(person.frames[0]) if alone else 0, []).append(person)
+        together.setdefault(int(person.frames[0]) if single_frames else 0, []).append(person)
     for person in people:
-        person.people = together[int(person.frames[0]) if alone else 0]
+        person.people = together[int(person.frames[0]) if single_frames else 0]
     for function in functions:
         for person in people:
             for item in function(person, person.keys):

@@ -220,15 +220,15 @@ class PersonGraph:
         t, joint, kind = found[0].tolist()
         frame, time_s = int(self.frames[t]), float(self.window.times_s[t])
         if kind == keys.shape[-1] - 1:
-            said = "the joints of the frame do not determine it"
-            return NotDetermined(self.person, "body", frame, time_s, said)
+            missing = "the joints of the frame do not determine it"
+            return NotDetermined(self.person, "body", frame, time_s, missing)
         views = int(self.window.seen[t, joint].sum())
         saw = {0: "no camera saw it", 1: "only one camera saw it"}.get(
             views, f"{views} cameras saw it"
         )
         says = "constrains" if self.window.of_body(t, joint).any() else "does not constrain"
-        said = f"{saw}, and the body {says} it"
-        return NotDetermined(self.person, str(joint_names[joint]), frame, time_s, said)
+        missing = f"{saw}, and the body {says} it"
+        return NotDetermined(self.person, str(joint_names[joint]), frame, time_s, missing)
 
 
 @dataclass(frozen=True)
@@ -326,8 +326,8 @@ def tied(people: Sequence[PersonGraph]) -> tuple[PersonGraph, ...]:
     together, found = dict[int, list[PersonGraph]](), list[PersonGraph]()
     for person in people:
         group = together.setdefault(id(person.window.ties), [])
-        alone = len(person.window.ties.people) == 1
-        found.append(person if alone else replace(person, together=group))
+        uncoupled = len(person.window.ties.people) == 1
+        found.append(person if uncoupled else replace(person, together=group))
         group.append(found[-1])
     return tuple(found)
 

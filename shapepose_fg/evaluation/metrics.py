@@ -110,16 +110,17 @@ def match_people(
         near = cost[at_row, at_person] < MAX_DISTANCE_M
         at_row, at_person = at_row[near], at_person[near]
         pairs += [
-            (row, index, who) for row, who in zip(rows[at_row], people[at_person], strict=True)
+            (row, index, person)
+            for row, person in zip(rows[at_row], people[at_person], strict=True)
         ]
-        missed += [(index, who) for who in np.setdiff1d(people, people[at_person])]
+        missed += [(index, person) for person in np.setdiff1d(people, people[at_person])]
         for left in np.setdiff1d(np.arange(len(rows)), at_row):
             (duplicated if (cost[left] < MAX_DISTANCE_M).any() else invented).append(
                 int(rows[left])
             )
-    row, at, who = np.array(pairs, dtype=np.intp).reshape(-1, 3).T
+    row, at, person = np.array(pairs, dtype=np.intp).reshape(-1, 3).T
     twice, nowhere = (np.array(each, dtype=np.intp) for each in (duplicated, invented))
-    return Matches(row, at, who, twice, nowhere, np.array(missed, dtype=np.intp).reshape(-1, 2))
+    return Matches(row, at, person, twice, nowhere, np.array(missed, dtype=np.intp).reshape(-1, 2))
 
 
 def mean_distance(predicted: Array, truth: Array) -> Array:

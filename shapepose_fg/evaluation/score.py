@@ -261,8 +261,8 @@ def _limbs(
     index = np.array([*ends.values()], dtype=np.intp).reshape(-1, 2)
     length = np.linalg.norm(truth.joints[:, index[:, 0]] - truth.joints[:, index[:, 1]], axis=2)
     error = np.linalg.norm(nearest - truth.joints, axis=2)[:, index].mean(axis=2)
-    persons, who = np.unique(truth.person, return_inverse=True)
-    member = (who == np.arange(len(persons))[:, None]).astype(np.int64)
+    persons, person_index = np.unique(truth.person, return_inverse=True)
+    member = (person_index == np.arange(len(persons))[:, None]).astype(np.int64)
     return [*ends], persons.tolist(), member @ (error <= length / 2), member @ np.isfinite(length)
 
 

@@ -111,16 +111,16 @@ def read_shelf_ground_truth(path: Path | str) -> PlainPeople:
             f"must say {len(SHELF_JOINTS)} joints and the number of frames, got {joints} and "
             f"{frames}"
         )
-    who, rows = list[tuple[int, int]](), list[Array]()
+    ids, rows = list[tuple[int, int]](), list[Array]()
     for frame in range(frames):
         (people,) = take(1, f"the number of people in frame {frame}", int)
         if not 0 <= people <= 1000:
             refuse(f"must be the number of people in frame {frame}, got {people}")
         for _ in range(people):
             (person,) = take(1, f"a person's id in frame {frame}", int)
-            if (frame, person) in who[-people:] or not 0 <= person < 2**62:
+            if (frame, person) in ids[-people:] or not 0 <= person < 2**62:
                 refuse(f"gives the id {person} in frame {frame}; ids must be 0 or more and differ")
-            who.append((frame, person))
+            ids.append((frame, person))
             meanings = (
                 f"{joints} values of {row} in frame {frame}"
                 for row in ("x", "y", "z", "confidence")
@@ -129,6 +129,6 @@ def read_shelf_ground_truth(path: Path | str) -> PlainPeople:
     if at < len(lines):
         at += 1
         refuse(f"goes on after the {frames} frames that line 1 promises")
-    frame, person = np.array(who, dtype=np.int64).reshape(-1, 2).T
+    frame, person = np.array(ids, dtype=np.int64).reshape(-1, 2).T
     xyz = np.stack(rows)[..., :3] if rows else np.zeros((0, joints, 3))
     return PlainPeople(frame, xyz, person, SHELF_JOINTS, complete=False)

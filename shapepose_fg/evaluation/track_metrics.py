@@ -122,11 +122,11 @@ def _clear(every: list[tuple[Index, Index, Array]], people: int) -> tuple[int, i
         score[similarity < MATCHED - _EPSILON] = 0
         row, column = linear_sum_assignment(score, maximize=True)
         hit = score[row, column] > 0
-        who, now = true[row[hit]], predicted[column[hit]]
-        switches += int(((last[who] >= 0) & (last[who] != now)).sum())
-        matched += len(who)
+        true_id, predicted_id = true[row[hit]], predicted[column[hit]]
+        switches += int(((last[true_id] >= 0) & (last[true_id] != predicted_id)).sum())
+        matched += len(true_id)
         previous[:] = -1
-        last[who] = previous[who] = now
+        last[true_id] = previous[true_id] = predicted_id
     return matched, switches
 
 

@@ -52,9 +52,9 @@ def score_tracks(
     matches = match_people(people.frame, people.joints, true, frames)
     found, at = people.rows(matches.row), (matches.frame, matches.person)
     identity = found.person if identities else matches.person
-    who, follows = np.full(true.shape[:2], UNMATCHED), np.zeros(true.shape[:2], dtype=bool)
-    who[at] = identity
-    follows[1:] = (who[1:] != UNMATCHED) & (who[1:] == who[:-1])
+    matched, follows = np.full(true.shape[:2], UNMATCHED), np.zeros(true.shape[:2], dtype=bool)
+    matched[at] = identity
+    follows[1:] = (matched[1:] != UNMATCHED) & (matched[1:] == matched[:-1])
     joints = metrics_of(matches, people.joints, true)
     figures = {name: 100 * getattr(joints, name) for name in ("f1", "precision", "recall")}
     figures |= {name: getattr(joints, name) for name in ("false_positives", "people_missed")}

@@ -120,8 +120,8 @@ def _table(place: object, rows: list[tuple[int, int, Array]], names: tuple[str, 
     if len(rows) == 0:
         raise InputError(f"{place}: there is no person in any frame; give a file with people")
     if count.max() > 1:
-        at, who = pairs[count.argmax()]
-        raise InputError(f"{place}: person {who} is twice in frame {at}; remove one of them")
+        at, duplicate = pairs[count.argmax()]
+        raise InputError(f"{place}: person {duplicate} is twice in frame {at}; remove one of them")
     known = np.isfinite(joints)
     box = np.where(known, joints, -np.inf).max(axis=1) + np.where(known, -joints, -np.inf).max(1)
     size = np.linalg.norm(box[np.isfinite(box).all(axis=1) & box.any(axis=1)], axis=1)
@@ -188,8 +188,8 @@ def _arrays(file: Path) -> PlainPeople:
     frames = data.get("frames", np.arange(len(joints)))
     if frames.shape != (len(joints),) or frames.dtype.kind not in "iu":
         raise InputError(f"{file}: frames must be ({len(joints)},) whole numbers; correct them")
-    there = np.argwhere(np.isfinite(joints).all(axis=-1).any(axis=-1)).tolist()
-    rows = [(int(frames[t]), who, joints[t, who].astype(np.float64)) for t, who in there]
+    present = np.argwhere(np.isfinite(joints).all(axis=-1).any(axis=-1)).tolist()
+    rows = [(int(frames[t]), person, joints[t, person].astype(np.float64)) for t, person in present]
     return _table(file, rows, tuple(names), covered=spans_of(frames.tolist()))
 
 
@@ -225,8 +225,8 @@ def _amass(files: list[Path], turn: Array, fps: float | None, body: Path | None)
             )
             joints = model.keypoints(posed) @ turn.T
         called = re.search(r"person_(\d{1,9})", file.stem)
-        who = int(called[1]) if called else place
-        rows += [(int(n), who, xyz) for n, xyz in zip(number, joints, strict=True)]
+        person = int(called[1]) if called else place
+        rows += [(int(n), person, xyz) for n, xyz in zip(number, joints, strict=True)]
     return _table(files[0].parent, rows, model.keypoint_names)
 
 
@@ -249,11 +249,11 @@ def _actors(file: Path) -> PlainPeople:
     if not isinstance(tree, list) or not all(isinstance(actor, list) for actor in tree):
         raise InputError(f"{file}: actor3D must be cells of actors and frames; give actorsGT.mat")
     rows = list[tuple[int, int, Array]]()
-    for who, actor in enumerate(tree):
+    for person, actor in enumerate(tree):
         for frame, xyz in enumerate(actor):
             xyz = xyz[0] if isinstance(xyz, list) and len(xyz) == 1 else xyz
             if not isinstance(xyz, list) and xyz.shape == (14, 3):  # others mark absent actors
-                rows.append((frame, who, np.vstack([xyz, xyz[2:4].mean(axis=0)])))
+                rows.append((frame, person, np.vstack([xyz, xyz[2:4].mean(axis=0)])))
     return _table(file, rows, SHELF_JOINTS, complete=False)
 
 

@@ -33,9 +33,9 @@ def match_names(cameras: Sequence[str], names: Sequence[str]) -> list[int] | Non
     if all(len(each) == 1 for each in found) and len({each[0] for each in found}) == len(found):
         return [each[0] for each in found]
     for part in (_one_number_each, _own_words):
-        wanted, there = part(cameras), part(names)
-        if wanted is not None and there is not None and set(wanted) <= set(there):
-            return [there.index(each) for each in wanted]
+        wanted, offered = part(cameras), part(names)
+        if wanted is not None and offered is not None and set(wanted) <= set(offered):
+            return [offered.index(each) for each in wanted]
     return None
 
 
@@ -64,7 +64,7 @@ def _one_number_each(names: Sequence[str]) -> list[tuple[str | int, ...]] | None
     return numbers if len(set(numbers)) == len(numbers) else None
 
 
-def told_by_parts(
+def match_by_parts(
     folder: Path, cameras: Sequence[str], paths: Sequence[Path], names: Sequence[str]
 ) -> tuple[list[Path], list[str]] | None:
     """Identify each camera's path among `paths` by its name among `names` (`match_names`); returns

@@ -67,8 +67,8 @@ class Pose2SimProject:
         """File name of a person, without extension, in Pose2Sim's style; `person` None for the only
         one.
         """
-        who = "" if person is None else f"_P{person}"
-        return f"{self.name}{who}_{first}-{last}"
+        suffix = "" if person is None else f"_P{person}"
+        return f"{self.name}{suffix}_{first}-{last}"
 
     def span(self, count: int) -> range:
         """Wanted frames of a recording of `count` frames, counted from 0; InputError if there are
@@ -104,17 +104,17 @@ def read_pose2sim_project(folder: Path) -> Pose2SimProject:
     detections = _detections(folder, len(videos) > 0)
     times = detections / "times.csv"
     if rate == "auto" and times.is_file():
-        fps, said = None, f"times from {times}"
+        fps, source = None, f"times from {times}"
     else:
-        told = ((glance(video)[1], f" (from {video.name})") for video in videos)
+        rates = ((glance(video)[1], f" (from {video.name})") for video in videos)
         # Default frame rate, Hz, as in Pose2Sim, if neither Config.toml nor a video
         # defines it.
         assumed = 30.0, " are assumed, because project.frame_rate is 'auto' and there is no video"
         given = rate != "auto"
         fps, origin = (
-            (rate, f" (from {CONFIG})") if given else next((e for e in told if e[0] > 0), assumed)
+            (rate, f" (from {CONFIG})") if given else next((e for e in rates if e[0] > 0), assumed)
         )
-        said = f"{fps:g} Hz{origin}"
+        source = f"{fps:g} Hz{origin}"
     # Results have the numbers in the file names (or counted from 0), from the first frame that all
     # cameras have.
     folders = [numbered(each, FRAME_FILE) for each in detections.iterdir() if each.is_dir()]
@@ -130,7 +130,7 @@ def read_pose2sim_project(folder: Path) -> Pose2SimProject:
         _joints(config, folder / CONFIG),
         (
             f"{folder}: cameras from {calibration}, detections from {detections}",
-            f"{folder}: {said}",
+            f"{folder}: {source}",
         ),
     )
 
@@ -244,10 +244,10 @@ def _calibration(session: Path, folder: Path) -> Path:
     files.sort(key=lambda file: file.suffix != ".toml")  # the newest stays first within each kind
     found = next((each for each in (*files, rooms[0]) if is_calibration(each)), None)
     if found is None:
-        there = listing(sorted(each.name for each in rooms[0].iterdir()))
+        names = listing(sorted(each.name for each in rooms[0].iterdir()))
         cure = "run Pose2Sim's calibration, or put a format of docs/calibration_files.md there"
         raise InputError(
-            f"{rooms[0]}: there is no calibration in a known format; it contains {there}; {cure}"
+            f"{rooms[0]}: there is no calibration in a known format; it contains {names}; {cure}"
         )
     return found
 

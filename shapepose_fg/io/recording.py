@@ -61,8 +61,8 @@ def read_recording(
     if file is None:
         return recording, None if fps is None else FrameTimes.from_fps(fps, count)
     if own_frames:
-        times, there = read_own_times(file, rig, count)
-        return recording if there.all() else replace(recording, picture=_own(there)), times
+        times, exists = read_own_times(file, rig, count)
+        return recording if exists.all() else replace(recording, picture=_own(exists)), times
     times, moments = read_timestamps(file, rig, count)
     if moments is None:
         return recording, times

@@ -70,15 +70,15 @@ def read_own_times(path: Path, rig: Rig, frames: int) -> tuple[FrameTimes, Mask]
         raise InputError(
             f"{path}: {what}, but synchronisation needs a common rate; give detections of one rate"
         )
-    there = np.isfinite(time_s)
+    known = np.isfinite(time_s)
     filled = time_s.copy()
-    for own, has, clock in zip(filled.T, there.T, clocks, strict=True):
+    for own, has, clock in zip(filled.T, known.T, clocks, strict=True):
         frame, step = np.arange(frames), clock.period
         own[~has] = np.interp(frame[~has], frame[has], own[has])
         last, first = int(frame[has][-1]), int(frame[has][0])
         own[last + 1 :] = own[last] + step * (frame[last + 1 :] - last)
         own[:first] = own[first] + step * (frame[:first] - first)
-    every = np.broadcast_to(there, (frames, len(rig))) if there.shape[1] == 1 else there
+    every = np.broadcast_to(known, (frames, len(rig))) if known.shape[1] == 1 else known
     return FrameTimes(filled[:, 0] if filled.shape[1] == 1 else filled, source=str(path)), every
 
 
@@ -149,15 +149,15 @@ def _clock(path: Path, name: str, time_s: Array, lines: Index) -> CameraClock:
     """The clock of one camera, or of all, from the times of its frames `time_s` (T,), NaN for
     missing ones.
     """
-    there = np.isfinite(time_s)
-    time_s, lines = time_s[there], lines[there]
+    known = np.isfinite(time_s)
+    time_s, lines = time_s[known], lines[known]
     steps, late = np.diff(time_s), " must be later than the frame before"
     refuse_first(path, lines[1:], steps <= 0, late, "sort frames by time")
     step = float(np.median(steps)) if len(steps) > 0 else np.inf
     # Maximum time between frames, s; a longer one means that the file has another unit.
     if len(steps) > 0 and not 1 / MOST_FPS <= step <= 10.0:
         raise InputError(f"{path}: frames are {step:.3g} s apart; write seconds")
-    if len(there) > 0 and len(time_s) == 0:
+    if len(known) > 0 and len(time_s) == 0:
         raise InputError(f"{path}: camera {name} has no times; leave it out with --without")
     return CameraClock(name, time_s, step)
 

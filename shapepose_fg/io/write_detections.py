@@ -165,8 +165,8 @@ def association_lines(
     limb = kind.limb_of[joint[first], joint[second]]
     for index, (a, b) in enumerate(kind.limbs):
         scores = np.zeros((counts[a], counts[b]))
-        mine = limb == index
-        scores[place[first[mine]], place[second[mine]]] = affinity[mine]
+        on_limb = limb == index
+        scores[place[first[on_limb]], place[second[on_limb]]] = affinity[on_limb]
         if scores.size > 0:
             yield from (_numbers(row, 6) for row in scores)
 

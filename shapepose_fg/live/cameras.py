@@ -76,13 +76,15 @@ class CameraWatch:
         it.
         """
         views = len(rig)
-        there = np.bincount(given.view, minlength=views) > 0
+        has_detections = np.bincount(given.view, minlength=views) > 0
         frozen = (
             repeated_views(before, given, views)
             if before is not None
             else np.zeros(views, dtype=bool)
         )
-        heard_s = np.where(there, time_s, np.where(np.isinf(self.heard_s), time_s, self.heard_s))
+        heard_s = np.where(
+            has_detections, time_s, np.where(np.isinf(self.heard_s), time_s, self.heard_s)
+        )
         silent = time_s - heard_s > SILENT_S
         state = self._judged()
         state = np.where(silent, CameraState.SILENT, state)
@@ -92,8 +94,8 @@ class CameraWatch:
 
     def believed(self, given: Detections, rig: Rig) -> Rig:
         """The rig for a frame with these detections, without excluded cameras."""
-        there = np.bincount(given.view, minlength=len(rig)) > 0
-        out = ~there | np.isin(self.state, (CameraState.FROZEN, CameraState.CONTRADICTS))
+        has_detections = np.bincount(given.view, minlength=len(rig)) > 0
+        out = ~has_detections | np.isin(self.state, (CameraState.FROZEN, CameraState.CONTRADICTS))
         doubted = np.flatnonzero(self.state == CameraState.DOUBTED).tolist()
         return replace(rig, dark=tuple(np.flatnonzero(out).tolist()), doubted=tuple(doubted))
 

@@ -111,10 +111,10 @@ class Filter:
             self._trace(np.zeros((0, len(self.tracker.skeleton), 3))).bones.shape[1],
         )
         whole, real = np.zeros(0, np.int64), np.zeros(0)
-        gone = EndedTracks(whole, real, np.zeros((0, 3)), np.zeros((0, B)))
+        ended = EndedTracks(whole, real, np.zeros((0, 3)), np.zeros((0, B)))
         per_bone = np.zeros((0, B)), np.zeros((0, B))
         own = np.zeros((0, J), np.int64), whole, real, real, real, np.zeros((0, 3)), *per_bone
-        return FilterState(self.tracker.nobody(), *own, gone)
+        return FilterState(self.tracker.nobody(), *own, ended)
 
     def step(self, before: FilterState, given: Input) -> tuple[FilterState, Index, Input]:
         """Process the next frame; returns the state, the detections (A, J, V) of its tracks, -1 for
@@ -153,7 +153,9 @@ class Filter:
             return now, candidate
         places, tracker = self.placed(now), self.tracker
         arrays = FrameArrays.of(given.detections, given.rig, tracker.skeleton)
-        weight, price = weighed(candidate, places, arrays, tracker.skeleton, now.tracks.world)
+        weight, price = weighed(
+            candidate, places, arrays, tracker.skeleton, now.tracks.global_hypothesis
+        )
         running_s = now.running_s + lasts_s * own_evidence(candidate, weight, price)
         views = (candidate >= 0).sum(axis=2)
         seen = np.where((views >= 2)[..., None], places, np.nan)
@@ -180,11 +182,11 @@ class Filter:
         bones = np.where(known, left.length_m / np.maximum(left.count, 1), np.nan)
         centre = self._trace(self.placed(left)).centre
         recent = now.gone.rows(now.tracks.time_s - now.gone.time_s <= self.stitching.longest_gap_s)
-        gone = EndedTracks.concatenate(
+        ended = EndedTracks.concatenate(
             [recent, EndedTracks(left.identity, left.tracks.evident_s, centre, bones)]
         )
         # Maximum number of ended tracks that are remembered.
-        return replace(now.rows(stays), gone=gone.rows(slice(-256, None))), candidate[stays]
+        return replace(now.rows(stays), gone=ended.rows(slice(-256, None))), candidate[stays]
 
     def _with_newcomers(
         self, now: FilterState, candidate: Index, given: Input
@@ -202,11 +204,11 @@ class Filter:
         trace = self._trace(places)
         blank = np.zeros((count, trace.bones.shape[1]))
         # A person whom one frame makes certain has sufficient evidence at once.
-        arrays, world = (
+        arrays, hypothesis = (
             FrameArrays.of(given.detections, given.rig, tracker.skeleton),
             np.zeros(count, dtype=np.intp),
         )
-        evidence = own_evidence(own, *weighed(own, places, arrays, tracker.skeleton, world))
+        evidence = own_evidence(own, *weighed(own, places, arrays, tracker.skeleton, hypothesis))
         running_s = np.where(evidence >= _SURE, LEAST_S, 0.0)
         columns: dict[str, Any] = {
             "views": (own >= 0).sum(axis=2),
@@ -233,8 +235,8 @@ class Filter:
         ready = np.flatnonzero(~now.named & (now.running_s >= LEAST_S))
         if len(ready) == 0:
             return now
-        identity, next_identity, gone = now.identity.copy(), now.next_identity, now.gone
-        back = self._returned(now, ready) if len(gone.identity) > 0 else {}
+        identity, next_identity, ended = now.identity.copy(), now.next_identity, now.gone
+        back = self._returned(now, ready) if len(ended.identity) > 0 else {}
         for row in ready.tolist():
             name = back.get(row, ON_TRIAL)
             if name == ON_TRIAL and self._may_be_back(now, row):
@@ -242,8 +244,8 @@ class Filter:
             if name == ON_TRIAL:
                 name, next_identity = next_identity, next_identity + 1
             identity[row] = name
-        gone = gone.rows(~np.isin(gone.identity, identity))
-        return replace(now, identity=identity, next_identity=next_identity, gone=gone)
+        ended = ended.rows(~np.isin(ended.identity, identity))
+        return replace(now, identity=identity, next_identity=next_identity, gone=ended)
 
     def _may_be_back(self, now: FilterState, row: int) -> bool:
         """Whether too few bones are measured to distinguish the track from ended tracks nearby."""
@@ -263,7 +265,7 @@ class Filter:
         """Identities of the rows among `ready` that continue an ended track, found by
         `tracking.stitching`.
         """
-        gone, G, R = now.gone, len(now.gone.identity), len(ready)
+        ended, G, R = now.gone, len(now.gone.identity), len(ready)
         bones = np.where(
             now.count[ready] >= LEAST_ROWS,
             now.length_m[ready] / np.maximum(now.count[ready], 1),
@@ -272,14 +274,14 @@ class Filter:
         begin = np.column_stack([now.born_s[ready], np.full(R, now.tracks.time_s)])
         ends = Ends(
             np.arange(G + R),
-            np.concatenate([np.column_stack([gone.time_s, gone.time_s]), begin]),
-            np.concatenate([gone.place, now.place[ready]])[:, None].repeat(2, axis=1),
-            np.concatenate([gone.bones, bones]),
+            np.concatenate([np.column_stack([ended.time_s, ended.time_s]), begin]),
+            np.concatenate([ended.place, now.place[ready]])[:, None].repeat(2, axis=1),
+            np.concatenate([ended.bones, bones]),
             np.zeros((G + R, 3)),  # a track has been extrapolated when it ends
         )
         names = stitch(ends, self.stitching)
         return {
-            int(row): int(gone.identity[names[G + n]])
+            int(row): int(ended.identity[names[G + n]])
             for n, row in enumerate(ready)
             if names[G + n] < G
         }

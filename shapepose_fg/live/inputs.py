@@ -213,11 +213,11 @@ def _from_socket(where: str, given: _Given) -> None:
             # another.
             if first.sender.good > 0 and now_s - first.heard_s < 60.0:
                 connection.close()
-                told = f"because {MOST_CLIENTS} clients are connected already"
-                given.note(f"{where}: {name} is rejected, {told}")
+                reason = f"because {MOST_CLIENTS} clients are connected already"
+                given.note(f"{where}: {name} is rejected, {reason}")
                 return
-            told = "and this one was silent for the longest time"
-            cut_off(first, f"at most {MOST_CLIENTS} clients are served, {told}")
+            reason = "and this one was silent for the longest time"
+            cut_off(first, f"at most {MOST_CLIENTS} clients are served, {reason}")
         clients.append(client)
         connection.setblocking(True)
         Thread(target=serve, args=(client,), daemon=True).start()

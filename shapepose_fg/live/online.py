@@ -95,8 +95,9 @@ class LiveReport:
 class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
     """Tracks people from frame to frame as they come, and refines them within a fixed lag.
 
-    A context manager; on exit the worker processes end. `push`, `push_view`, `settled`, `save` and
-    `close` exclude each other; `people` and `report` never wait and may be called from any thread.
+    A context manager; on exit the worker processes end. `push`, `push_view`, `settled`, `catch_up`,
+    `save` and `close` exclude each other; `people` and `report` never wait and may be called from
+    any thread.
     """
 
     def __init__(
@@ -395,6 +396,17 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
             self._refine(last=True)
             return self.settled(wait=True)
 
+    def catch_up(self) -> None:
+        """Wait until a further window can be submitted.
+
+        After each `push` of frames that come from a file, which is read faster than windows are
+        solved: without it, the oldest frames are settled without refinement
+        (`report().unrefined`).
+        """
+        with self._lock:
+            if self._windows.waiting >= self._most_waiting:
+                self._collect(wait=True)
+
     def save(self, path: Path | str) -> None:
         """Write the state for `load`, after waiting for windows in progress. The same state gives
         the same bytes. Changes of cameras' statuses (`camera_changes`) are left out.
@@ -596,6 +608,6 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
 
 def _without(detections: Detections, rig: Rig) -> Detections:
     """Detections without those of dark cameras."""
-    gone = np.zeros(len(rig), dtype=bool)
-    gone[list(rig.dark)] = True
-    return detections.only(~gone[detections.view]) if gone[detections.view].any() else detections
+    dark = np.zeros(len(rig), dtype=bool)
+    dark[list(rig.dark)] = True
+    return detections.only(~dark[detections.view]) if dark[detections.view].any() else detections

@@ -116,8 +116,10 @@ class WindowQueue:
         """Submit a window that settles `own` slots from `start` on, with the cameras of `rig`."""
         names = dict[int, int]()
         for slot in window:
-            ids, who = slot.state.tracks.ids.tolist(), slot.state.identity.tolist()
-            names |= {track: name for track, name in zip(ids, who, strict=True) if name != ON_TRIAL}
+            ids, identities = slot.state.tracks.ids.tolist(), slot.state.identity.tolist()
+            names |= {
+                track: name for track, name in zip(ids, identities, strict=True) if name != ON_TRIAL
+            }
         decided, tracks = [], np.array(sorted(names), dtype=np.int64)
         for n, slot in enumerate(window):
             # Frames are numbered by time, not by arrival.

@@ -52,16 +52,18 @@ def setup_id(rig: Rig, skeleton: Skeleton, config: PipelineConfig, lag_s: float)
     lag, and the fields of the saved classes.
     """
     kept = [each.__dataclass_fields__.keys() for each in _CLASSES.values() if is_dataclass(each)]
-    told = repr((asdict(config), rig.names, skeleton.joints, skeleton.limbs, lag_s, kept)).encode()
-    return hashlib.sha256(told + rig.K.tobytes() + rig.cTw.tobytes()).hexdigest()
+    description = repr(
+        (asdict(config), rig.names, skeleton.joints, skeleton.limbs, lag_s, kept)
+    ).encode()
+    return hashlib.sha256(description + rig.K.tobytes() + rig.cTw.tobytes()).hexdigest()
 
 
 def write_state(path: Path, state: LiveState, setup: str) -> None:
     """Write the whole state of an online reconstruction of this setup."""
     arrays: dict[str, NDArray[Any]] = {}
-    told = json.dumps([setup, _plain(state, arrays)], default=lambda number: number.item())
+    structure = json.dumps([setup, _plain(state, arrays)], default=lambda number: number.item())
     content = io.BytesIO()
-    write_npz(content, {"state": np.array(told), **arrays})
+    write_npz(content, {"state": np.array(structure), **arrays})
     digest = hashlib.sha256(content.getvalue()).digest()
     write_content(path, digest + content.getvalue())
 

@@ -169,13 +169,13 @@ def refuse_other_programs(client: Any, address: str) -> None:
     """Raise InputError if a process has another version of this program, or of a package that
     affects results.
     """
-    for process, theirs in client.run(this_program, on_error="return").items():
-        if not isinstance(theirs, dict):
+    for process, found in client.run(this_program, on_error="return").items():
+        if not isinstance(found, dict):
             raise InputError(
                 f"--cluster {address}: its process {process} cannot run this program"
-                f' ({" ".join(str(theirs).split())[:200]}); install "shapepose-fg[cluster]" there'
+                f' ({" ".join(str(found).split())[:200]}); install "shapepose-fg[cluster]" there'
             )
-        _refuse_other(f"--cluster {address}: its process {process}", this_program(), theirs)
+        _refuse_other(f"--cluster {address}: its process {process}", this_program(), found)
 
 
 def _refuse_other(process: str, own: dict[str, str], theirs: dict[str, str]) -> None:

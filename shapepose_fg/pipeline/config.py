@@ -51,7 +51,7 @@ class PeopleConfig(Settings):
     it."""
     min_probability: Share = 0.3
     """Minimum probability of a new person. A lower value finds people who are hardly visible, a
-    higher one leaves out more false positives; over time, 0.5 and 0.3 gave F1 95.2 and 95.7 before
+    higher one leaves out more false positives; over time, 0.5 and 0.3 gave F1 95.2 and 95.7 with
     three and four cameras."""
     min_new_joints: Count = 4
     """Minimum number of core joints (trunk, arms, legs) that two views must see for a new person
@@ -77,7 +77,7 @@ class WindowConfig(Settings):
     little is lost. New people are searched for in keyframes that are 0.3 s or more apart."""
     again_over_time: RepeatsOrNone = 8
     """Rounds of reassociation around the initial estimate of a window, at most; they end when
-    hardly any detection changes. Fewer rounds are faster; with 3, crowds before three cameras lose
+    hardly any detection changes. Fewer rounds are faster; with 3, crowds with three cameras lose
     one to two points of F1."""
     again_alone: RepeatsOrNone = 5
     """Rounds of reassociation of a single frame, at most; 0 for none, as in the paper. Each round

@@ -33,11 +33,11 @@ class Execution:
     progress: Progress | None = None
     """Called while frames are solved."""
 
-    def tell(self, frames: int) -> Callable[[int], object]:
+    def progress_over(self, frames: int) -> Callable[[int], object]:
         """A function to be called with the number of frames that are done, out of `frames`."""
         return lambda done: None if self.progress is None else self.progress(done, frames)
 
-    def worth(self, frames: int) -> "Execution":
+    def with_workers(self, frames: int) -> "Execution":
         """Return a copy with a suitable number of workers for this many frames, if none
         is given.
         """
@@ -48,7 +48,7 @@ class Execution:
 
     def pool(self, shared: Shared, frames: int) -> AbstractContextManager[Pool[Shared]]:
         """The processes for solving this many frames, each with `shared`."""
-        count = self.worth(frames).workers or 0
+        count = self.with_workers(frames).workers or 0
         if self.cluster is None:
             return workers(count, shared)
         return cluster(

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from shapepose_fg.core.arrays import Array, Index, Mask, Whole
+from shapepose_fg.core.arrays import Array, Index, Mask, Whole, pair_keys
 from shapepose_fg.core.frame_times import segments
 from shapepose_fg.core.observation_table import Gate
 from shapepose_fg.core.reconstruction import BODY, Known, Reconstruction, Status
@@ -62,7 +62,7 @@ def with_rows_between(
     count = np.diff(keys)[number[after]] - 1
     pair = np.repeat(after, count)
     at = keys[number[pair]] + 1 + np.arange(len(pair)) - np.repeat(np.cumsum(count) - count, count)
-    return _with_carried(rows, order[pair], order[pair + 1], frame[at], time_s[at], motion)
+    return _with_interpolated(rows, order[pair], order[pair + 1], frame[at], time_s[at], motion)
 
 
 def strays_m(joints: Array, velocity: Array, times_s: Array) -> Array:
@@ -83,7 +83,7 @@ def strays_m(joints: Array, velocity: Array, times_s: Array) -> Array:
     return np.sqrt(np.nan_to_num(variance).max(axis=1, initial=0.0))
 
 
-def looked_at(rows: Reconstruction) -> Mask:
+def tracked_rows(rows: Reconstruction) -> Mask:
     """(N,) mask of rows in which people were tracked: those with a detection in any view, and those
     before the first or after the last such row of their person.
     """
@@ -95,8 +95,10 @@ def looked_at(rows: Reconstruction) -> Mask:
     )
     order = np.lexsort((rows.frame, rows.person))
     inside = np.zeros(len(rows), dtype=bool)
-    for mine in np.split(order, np.flatnonzero(np.diff(rows.person[order])) + 1):
-        inside[mine] = (np.cumsum(seen[mine]) > 0) & (np.cumsum(seen[mine][::-1])[::-1] > 0)
+    for rows_of_person in np.split(order, np.flatnonzero(np.diff(rows.person[order])) + 1):
+        inside[rows_of_person] = (np.cumsum(seen[rows_of_person]) > 0) & (
+            np.cumsum(seen[rows_of_person][::-1])[::-1] > 0
+        )
     return seen | ~inside
 
 
@@ -106,18 +108,20 @@ def with_rows_like(
     """Add to the `solved` rows those of `rows` that lie between them, for the same people; joints
     and bodies of the added rows are interpolated.
     """
-    width = int(rows.frame.max(initial=0)) + 1
     order = np.lexsort((solved.frame, solved.person))
-    known, asked = (each.person * width + each.frame for each in (solved.rows(order), rows))
+    tables = (solved.rows(order), rows)
+    known, asked = pair_keys(*((each.person, each.frame) for each in tables))
     new = np.flatnonzero(~np.isin(asked, known))
     after = np.searchsorted(known, asked[new])
     first, second = (order[np.clip(each, 0, len(order) - 1)] for each in (after - 1, after))
-    ours = (solved.person[first] == rows.person[new]) & (solved.person[second] == rows.person[new])
-    first, second, new = first[ours], second[ours], new[ours]
-    return _with_carried(solved, first, second, rows.frame[new], rows.time_s[new], motion)
+    same_person = (solved.person[first] == rows.person[new]) & (
+        solved.person[second] == rows.person[new]
+    )
+    first, second, new = first[same_person], second[same_person], new[same_person]
+    return _with_interpolated(solved, first, second, rows.frame[new], rows.time_s[new], motion)
 
 
-def _with_carried(
+def _with_interpolated(
     rows: Reconstruction,
     before: Index,
     after: Index,
@@ -130,12 +134,12 @@ def _with_carried(
     """
     if len(frame) == 0:
         return rows
-    between = _carried(rows.rows(before), rows.rows(after), frame, time_s, motion)
+    between = _interpolated(rows.rows(before), rows.rows(after), frame, time_s, motion)
     every = with_bodies_between(Reconstruction.concatenate([rows, between]))
     return every.rows(np.lexsort((every.person, every.frame)))
 
 
-def _carried(
+def _interpolated(
     before: Reconstruction, after: Reconstruction, frame: Whole, time_s: Array, motion: MotionModel
 ) -> Reconstruction:
     """N rows at `time_s` (N,), interpolated between the rows `before` and `after` in adjacent
@@ -206,17 +210,17 @@ def with_bodies_between(rows: Reconstruction) -> Reconstruction:
     """
     columns = {name: getattr(rows, name).copy() for name in BODY}
     status, order = rows.status.copy(), np.lexsort((rows.time_s, rows.person))
-    for mine in np.split(order, np.flatnonzero(np.diff(rows.person[order])) + 1):
-        ok = np.isfinite(rows.betas[mine]).all(axis=1)
-        known_s = rows.time_s[mine[ok]]
-        after = np.searchsorted(known_s, rows.time_s[mine])
+    for rows_of_person in np.split(order, np.flatnonzero(np.diff(rows.person[order])) + 1):
+        ok = np.isfinite(rows.betas[rows_of_person]).all(axis=1)
+        known_s = rows.time_s[rows_of_person[ok]]
+        after = np.searchsorted(known_s, rows.time_s[rows_of_person])
         inside = ~ok & (after > 0) & (after < len(known_s))
         if not inside.any():
             continue
-        first, second, new = after[inside] - 1, after[inside], mine[inside]
+        first, second, new = after[inside] - 1, after[inside], rows_of_person[inside]
         lasts_s = known_s[second] - known_s[first]
         share = (rows.time_s[new] - known_s[first]) / lasts_s
-        betas, orient, pose, transl = (columns[name][mine[ok]] for name in BODY)
+        betas, orient, pose, transl = (columns[name][rows_of_person[ok]] for name in BODY)
         turns = _quaternions(np.concatenate([orient[:, None], pose], axis=1)).reshape(
             len(betas), -1
         )

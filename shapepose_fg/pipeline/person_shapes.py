@@ -104,17 +104,17 @@ class ShapeEvidence:
 def _evidence(model: BodyModel, sigma_m: float, rows: WindowBodies) -> dict[int, ShapeEvidence]:
     """Information of the rows on the shape of each person, by person number."""
     found, energy = dict[int, ShapeEvidence](), BodyEnergy(model, PosePrior.default())
-    for some, mine, free in _batches(rows, energy):
-        count, known = len(some), JointTargets.solved(mine.joints, mine.covariance)
+    for index, selected, free in _batches(rows, energy):
+        count, known = len(index), JointTargets.solved(selected.joints, selected.covariance)
         xyz = energy.model.keypoints(energy.complete(free))
         targets = EnergyTargets(xyz, weigh(known, sigma_m).information)
         held = Held(np.zeros((count, 10)), np.ones(count), free[:, 13:-3])
         body = energy.evaluate(free, targets, _NOT_ROBUST, held, nothing(count))
-        said = np.linalg.inv(body.covariances()[1]) - np.eye(10)
-        pull = (said @ free[:, :10, None])[..., 0]
-        looks = (mine.time_s // LOOK_S).astype(np.int64).tolist()
-        for n, number in enumerate(mine.person.tolist()):
-            each = ShapeEvidence(said[n], pull[n], 1, {looks[n]})
+        information = np.linalg.inv(body.covariances()[1]) - np.eye(10)
+        pull = (information @ free[:, :10, None])[..., 0]
+        looks = (selected.time_s // LOOK_S).astype(np.int64).tolist()
+        for n, number in enumerate(selected.person.tolist()):
+            each = ShapeEvidence(information[n], pull[n], 1, {looks[n]})
             found.setdefault(number, ShapeEvidence()).add(each)
     return found
 
@@ -134,15 +134,15 @@ def combined(
     information = seen + np.eye(10)
     betas = np.asarray(np.linalg.solve(information, pull[..., None])[..., 0], dtype=np.float64)
     numbers = np.array([str(number) for number in found], dtype=str)
-    whose = recognise(SubjectShapes(numbers, betas, information, fingerprint(model)), known)
-    for n, subject in enumerate(whose.tolist()):
+    matches = recognise(SubjectShapes(numbers, betas, information, fingerprint(model)), known)
+    for n, subject in enumerate(matches.tolist()):
         if subject >= 0:
             prior = known.information[subject]
             information[n] = seen[n] + prior
             betas[n] = np.linalg.solve(information[n], pull[n] + prior @ known.betas[subject])
         elif sizes.far(betas[[n]])[0]:
             betas[n] = sizes.measured(model, betas[n], seen[n], pull[n])
-    names = _names(list(found), known, whose.tolist())
+    names = _names(list(found), known, matches.tolist())
     return SubjectShapes(np.array(names, dtype=str), betas, information, known.body)
 
 
@@ -158,22 +158,22 @@ def _with_shape(
     betas = np.array([known[number] for number in rows.person.tolist()]).reshape(-1, 10)
     found = {name: getattr(rows, name).copy() for name in BODY}
     energy = BodyEnergy(model, PosePrior.default())
-    for some, _, free in _batches(rows, energy):
+    for index, _, free in _batches(rows, energy):
         # All joints alike, or poses would tremble with the views that see them.
         xyz = energy.model.keypoints(energy.complete(free))
-        alike = np.broadcast_to(np.eye(3) / sigma_m**2, (*xyz.shape, 3))
-        targets = EnergyTargets(xyz, alike)
-        held = Held(betas[some], np.full(len(some), SETTLED), free[:, 13:-3])
-        free[:, :10] = betas[some]
+        information = np.broadcast_to(np.eye(3) / sigma_m**2, (*xyz.shape, 3))
+        targets = EnergyTargets(xyz, information)
+        held = Held(betas[index], np.full(len(index), SETTLED), free[:, 13:-3])
+        free[:, :10] = betas[index]
         for _ in range(_STEPS):
-            body = energy.evaluate(free, targets, _NOT_ROBUST, held, nothing(len(some)))
+            body = energy.evaluate(free, targets, _NOT_ROBUST, held, nothing(len(index)))
             free = energy.retract(free, body.step)
-        made = replace(energy.complete(free), betas=betas[some])
-        bodies = made.betas, made.global_orient, made.body_pose, made.transl + rows.transl[some]
+        made = replace(energy.complete(free), betas=betas[index])
+        bodies = made.betas, made.global_orient, made.body_pose, made.transl + rows.transl[index]
         if floor is not None:
             bodies = above_floor(model, bodies, floor.normal, floor.height_m)
         for name, values in zip(BODY, bodies, strict=True):
-            found[name][some] = values
+            found[name][index] = values
     return found
 
 
@@ -183,8 +183,8 @@ def _batches(rows: WindowBodies, energy: BodyEnergy) -> Iterator[tuple[Index, Wi
     """
     ok = np.flatnonzero(np.isfinite(rows.betas).all(axis=1))
     for at in range(0, len(ok), BATCH):
-        mine = rows.rows(some := ok[at : at + BATCH])
-        yield some, mine, energy.parameters(mine.body, mine.transl)
+        selected = rows.rows(index := ok[at : at + BATCH])
+        yield index, selected, energy.parameters(selected.body, selected.transl)
 
 
 Mapped = Callable[[Callable[[BodyModel, float, Any], Any], Iterable[Any]], Iterator[Any]]
@@ -234,12 +234,12 @@ def with_person_shapes(
     return replace(people, shapes=shapes, **bodies)
 
 
-def _names(numbers: Sequence[int], known: SubjectShapes, whose: Sequence[int]) -> list[str]:
+def _names(numbers: Sequence[int], known: SubjectShapes, matches: Sequence[int]) -> list[str]:
     """Names of people in the file of shapes: known names; new people get their number, or the next
     free one.
     """
     names, taken = [], set(known.names.tolist())
-    for number, subject in zip(numbers, whose, strict=True):
+    for number, subject in zip(numbers, matches, strict=True):
         name = str(number) if subject < 0 else str(known.names[subject])
         if subject < 0 and name in taken:
             name = str(1 + max(int(each) for each in taken if each.isdecimal()))

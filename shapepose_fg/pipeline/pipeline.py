@@ -82,11 +82,11 @@ def reconstruct(
     task = Task(detections, rig, config, frames, times, cuts, shapes, fitter, extra_factors)
     kept = InMemory()
     people = reconstruct_parts(kept, task, execution).reconstruction(consume=True)
-    for name, told in people.run.get("extra_factors", {}).items():
-        if told["made"] == told["inactive"]:
+    for name, counts in people.run.get("extra_factors", {}).items():
+        if counts["made"] == counts["inactive"]:
             what = (
                 "is active, because joints that they need have no position"
-                if told["made"] > 0
+                if counts["made"] > 0
                 else "was made"
             )
             warnings.warn(f"extra_factors: {name}: none of its factors {what}", stacklevel=2)
@@ -185,9 +185,9 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
         if fitter is None:
             fitter = make_fitter(config.body, BodyModel.default().with_keypoints(skeleton.joints))
         check_fitter(fitter)
-    tell, passes = execution.tell(len(frames)), 1 + (unrefined(rig) and config.temporal)
+    report, passes = execution.progress_over(len(frames)), 1 + (unrefined(rig) and config.temporal)
     setup = Setup(rig, skeleton, config, fitter, task.extra_factors)
-    setup = _with_refined(kept, task, setup, book, lambda done: tell(done // passes))
+    setup = _with_refined(kept, task, setup, book, lambda done: report(done // passes))
     sample = Sample(setup, detections, times)
     offsets = kept_offsets(kept, sample, book)
     if offsets is not None:
@@ -206,7 +206,7 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
         for part in windows.after(begin, pool, chunk):
             parts.append(part)
             done += part.notes.frames
-            tell((done + (passes - 1) * len(frames)) // passes)
+            report((done + (passes - 1) * len(frames)) // passes)
         result = Assembly(parts, skeleton.joints, rig.names)
         if config.temporal and len(parts) > 0:
             with book.stage("follow"):
@@ -224,24 +224,24 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
     notes = beginning
     for each in (parts.notes(), book.flush()):
         notes.add(each)
-    more = {"time": times.as_dict(), "cuts": cuts}
-    more |= {
+    entries = {"time": times.as_dict(), "cuts": cuts}
+    entries |= {
         "floor": floor.as_dict() if isinstance(floor, Floor) else {"found": False, "why": floor}
     }
     if rig.moves:
-        more |= {"trajectories": about(rig, setup.rig)}
+        entries |= {"trajectories": about(rig, setup.rig)}
     if functions := functions_of(task.extra_factors):
         made = {
             name_of(function): notes.factors.get(name_of(function), (0, 0))
             for function in functions
         }
         counts = {name: {"made": count, "inactive": idle} for name, (count, idle) in made.items()}
-        more |= {"extra_factors": counts}
-    more |= {
+        entries |= {"extra_factors": counts}
+    entries |= {
         "keypoint_offsets": None if offsets is None else offsets.as_dict(),
         "noise_law": setup.noise.as_dict(),
     }
-    return result.with_run(**_summary(notes, config, frames, result), **more)
+    return result.with_run(**_summary(notes, config, frames, result), **entries)
 
 
 def _with_refined(
@@ -249,10 +249,10 @@ def _with_refined(
     task: Task,
     setup: Setup,
     book: Notebook,
-    tell: Callable[[int], object] = lambda done: None,
+    report: Callable[[int], object] = lambda done: None,
 ) -> Setup:
-    """The set-up with refined trajectories for moving cameras; the run stores them. `tell` gets the
-    number of frames that are done.
+    """The set-up with refined trajectories for moving cameras; the run stores them. `report` gets
+    the number of frames that are done.
     """
     rig, config = setup.rig, setup.config
     if not unrefined(rig) or not config.temporal:
@@ -265,7 +265,7 @@ def _with_refined(
         every = np.arange(frames.start, frames.stop)
         windows = SolvedWindows(setup, thinned, pictures, times, frames, cuts, every, Notebook())
         with book.stage("trajectories"):
-            known = refine(windows, task.camera_factors, tell)
+            known = refine(windows, task.camera_factors, report)
         keep(kept, known)
     return replace(setup, rig=known)
 

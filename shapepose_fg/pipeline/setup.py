@@ -71,13 +71,13 @@ class Setup:
         given = [frame for frame, _ in span.decided if frame.key]
         rows = Observations.concatenate([part for _, part in span.decided])
         windows, rig = self.config.windows, self.rig if span.rig is None else span.rig
-        rounds = windows.again_alone if span.alone else windows.again_over_time
+        rounds = windows.again_alone if span.isolated else windows.again_over_time
         whole = solve_window(
             rows,
             Views.of(rig, rows.time_s),
             self.fitter,
             self.estimator,
-            assigning=Assigning(given, self.skeleton, rounds, over_time=not span.alone),
+            assigning=Assigning(given, self.skeleton, rounds, over_time=not span.isolated),
             extra_factors=self.extra_factors,
         )
         doubted = {frame.frame: frame.rig.doubted for frame in given if len(frame.rig.doubted) > 0}
@@ -103,16 +103,16 @@ class Setup:
         time_s = np.array([each.time_s.mean() for each in every])
         # The cubic between keyframes is that of white noise on acceleration, for any `law`.
         motion = MotionModel.load(self.skeleton.joints, self.config.motion)
-        carried = with_rows_between(solved, frame, time_s, key, motion)
-        for part in map(self.solve, halved(span, whole, carried, self.config)):
-            anew = np.unique(part.rows.frame)
-            others = carried.rows(~np.isin(carried.frame, anew))
-            carried = Reconstruction.concatenate([others, part.rows])
-            problems = [each for each in notes.problems if each.frame not in anew]
+        interpolated = with_rows_between(solved, frame, time_s, key, motion)
+        for part in map(self.solve, halved(span, whole, interpolated, self.config)):
+            solved_again = np.unique(part.rows.frame)
+            others = interpolated.rows(~np.isin(interpolated.frame, solved_again))
+            interpolated = Reconstruction.concatenate([others, part.rows])
+            problems = [each for each in notes.problems if each.frame not in solved_again]
             notes.problems = problems + part.notes.problems
             notes.add(Notes(seconds=part.notes.seconds))
-        carried = carried.rows(np.lexsort((carried.person, carried.frame)))
-        return Part(carried.rows(np.isin(carried.frame, list(span.own))), notes)
+        interpolated = interpolated.rows(np.lexsort((interpolated.person, interpolated.frame)))
+        return Part(interpolated.rows(np.isin(interpolated.frame, list(span.own))), notes)
 
     def _result(self, solution: WindowSolution, given: Sequence[Input], rig: Rig) -> Reconstruction:
         """The rows of a solution, with the indices of their detections in `given`."""
@@ -127,23 +127,29 @@ class Setup:
     def engine(self, book: Notebook) -> Engine:
         """The tracker with its windows; notes are written to `book`."""
         config, skeleton, tracking = self.config, self.skeleton, self.config.tracking
-        sure = StageOne(skeleton, config.candidates, config.proposals, book)
+        by_evidence = StageOne(skeleton, config.candidates, config.proposals, book)
         # Unexplained detections may be people with hips seen by two views; later frames decide.
-        hips = sure.of_the_rest()
-        if sure.proposals.evidence and not config.temporal:
+        from_hips = by_evidence.of_the_rest()
+        if by_evidence.proposals.evidence and not config.temporal:
             # In single frames evidence decides during reassociation.
             likely = replace(
-                sure.proposals, min_probability=_ON_TRIAL * sure.proposals.min_probability
+                by_evidence.proposals,
+                min_probability=_ON_TRIAL * by_evidence.proposals.min_probability,
             )
-            sure, tracking = replace(sure, proposals=likely), replace(tracking, min_new_joints=3)
+            by_evidence, tracking = (
+                replace(by_evidence, proposals=likely),
+                replace(tracking, min_new_joints=3),
+            )
         law = self.estimator.law
         motion = MotionModel.load(skeleton.joints, config.motion, law)
         scale = BodyScale(
             longest_bones(skeleton), motion.density(np.full(len(skeleton), FAST_M_S), UNSEEN_S), law
         )
-        find = (sure, hips) if config.temporal else (sure,)
-        told = {"fitter": self.fitter, "drop": book.drop_in, "search": book.search}
-        return Engine(Tracker(skeleton, scale, find, tracking, config.observations, **told), config)
+        find = (by_evidence, from_hips) if config.temporal else (by_evidence,)
+        options = {"fitter": self.fitter, "drop": book.drop_in, "search": book.search}
+        return Engine(
+            Tracker(skeleton, scale, find, tracking, config.observations, **options), config
+        )
 
 
 def _doubted(solution: WindowSolution, doubted: Mapping[int, tuple[int, ...]]) -> NDArray[np.str_]:
@@ -154,9 +160,9 @@ def _doubted(solution: WindowSolution, doubted: Mapping[int, tuple[int, ...]]) -
     for row, frame in enumerate(solution.observations.frame.tolist()):
         used[row][:, list(doubted.get(frame, ()))] = False
     of_two = (used.sum(axis=-1) >= 2).sum(axis=1) >= LEAST_JOINTS
-    there = np.isin(solution.observations.frame, list(doubted)) & ~of_two
-    there &= np.isin(solution.status, (Status.OK, Status.BODY_UNDETERMINED))
-    return np.where(there, Status.CONTRADICTED, solution.status)
+    contradicted = np.isin(solution.observations.frame, list(doubted)) & ~of_two
+    contradicted &= np.isin(solution.status, (Status.OK, Status.BODY_UNDETERMINED))
+    return np.where(contradicted, Status.CONTRADICTED, solution.status)
 
 
 def _of_frames(whole: WindowSolution, frames: set[int], *, numbered: bool) -> WindowSolution:
@@ -176,16 +182,16 @@ def _of_frames(whole: WindowSolution, frames: set[int], *, numbered: bool) -> Wi
 
 def _notes(solution: WindowSolution, frames: int, over_time: bool) -> Notes:
     """Notes about a window with this number of own `frames`."""
-    told = {"problems": list(solution.problems), "factors": solution.factors}
-    notes = Notes(frames, dict(solution.seconds), **told)
+    content = {"problems": list(solution.problems), "factors": solution.factors}
+    notes = Notes(frames, dict(solution.seconds), **content)
     rows = solution.observations
-    said = np.isfinite(rows.evidence)
+    known = np.isfinite(rows.evidence)
     if over_time:
-        for track in np.unique(rows.track[said]).tolist():
-            evidence = rows.evidence[said & (rows.track == track)]
+        for track in np.unique(rows.track[known]).tolist():
+            evidence = rows.evidence[known & (rows.track == track)]
             notes.evidence[track] = float(evidence.sum()), len(evidence)
     else:
-        tenths = (f"{tenth / 10:.1f}" for tenth in np.floor(10 * rows.evidence[said]))
+        tenths = (f"{tenth / 10:.1f}" for tenth in np.floor(10 * rows.evidence[known]))
         notes.probable = dict(Counter(tenths))
     return notes
 

@@ -120,8 +120,8 @@ def _assigned(
     asked = np.ones(len(frames), dtype=bool)
     for n in range(assigning.rounds):
         around = near_in_time(asked[:, None], frame_s, _SMOOTHED_S)[:, 0]
-        here = [each.frame for each in compress(frames, around)]
-        near = np.flatnonzero(np.isin(observations.frame, here))
+        changed_frames = [each.frame for each in compress(frames, around)]
+        near = np.flatnonzero(np.isin(observations.frame, changed_frames))
         before, seen_by = observations.rows(near), views.rows(near)
         found = draft(before, seen_by, fitter, config, drafted)
         drafted = found if drafted is None else drafted.updated(found)

@@ -63,13 +63,15 @@ class SolvedWindows:
             found = self.detections[frame] if key else self.pictures[frame]
             # With more detections than people could explain, associations are chance.
             doubted = tuple(range(len(self.setup.rig))) if thinned else trust.in_doubt(frame)
-            said = tuple(sorted({*repeated, *trust.dark(frame)})), doubted
+            views = tuple(sorted({*repeated, *trust.dark(frame)})), doubted
             if self.setup.rig.moves:
-                rig = replace(self.setup.rig.at(self._time_s[frame]), dark=said[0], doubted=said[1])
+                rig = replace(
+                    self.setup.rig.at(self._time_s[frame]), dark=views[0], doubted=views[1]
+                )
                 return Input(frame, self._time_s[frame], found, rig, key)
-            if said not in self._rigs:
-                self._rigs[said] = replace(self.setup.rig, dark=said[0], doubted=said[1])
-            return Input(frame, self._time_s[frame], found, self._rigs[said], key)
+            if views not in self._rigs:
+                self._rigs[views] = replace(self.setup.rig, dark=views[0], doubted=views[1])
+            return Input(frame, self._time_s[frame], found, self._rigs[views], key)
 
     def after(
         self, begin: Checkpoint | None, pool: Pool[Setup], chunk_frames: int | None
@@ -108,7 +110,7 @@ class SolvedWindows:
                         spans, state = engine.follow(state, given, last=last)
                         next_id = state.follow.next_id
                     else:
-                        spans = [engine.alone(self.book.watched(given))]
+                        spans = [engine.isolated_frames(self.book.watched(given))]
                 behind = Checkpoint(
                     batch.stop, next_id, state if config.temporal and not last else None
                 )
@@ -132,7 +134,7 @@ class SolvedWindows:
         name = identities.name
         for found in pool.map(solve_chunk, jobs()):
             chunk, read = waiting.popleft()
-            names = identities.names(found.begins, alone=chunk.first == chunk.own.start)
+            names = identities.names(found.begins, isolated=chunk.first == chunk.own.start)
             identities.remember(found.ends, names)
             for part in found.parts:
                 notes, rows, behind = part.notes, part.rows, None

@@ -67,10 +67,10 @@ def keep(kept: KeptArrays, rig: Rig) -> None:
 def refine(
     windows: SolvedWindows,
     camera_factors: CameraFactors | None = None,
-    tell: Callable[[int], object] = lambda done: None,
+    report: Callable[[int], object] = lambda done: None,
 ) -> Rig:
     """The rig of `windows` with trajectories refined by the people of the recording, and their
-    covariances. `tell` gets the number of frames that are done.
+    covariances. `report` gets the number of frames that are done.
     """
     rig, time_s = windows.setup.rig, windows.times.of_views(len(windows.setup.rig))
     frames = np.arange(windows.frames.start, windows.frames.stop)
@@ -88,7 +88,7 @@ def refine(
             poses[own[0] :] = passing.corrected(whole.odometry[own[0] :])
             poses[own] = graph.poses
             of_people += graph.of_poses()
-            tell(int(own[-1]) + 1)
+            report(int(own[-1]) + 1)
     poses, covariance = _smoothed(whole, poses, of_people)
     refined = [
         _refined(trajectory, whole.time_s, poses[:, n], whole.odometry[:, n], covariance[:, n])
@@ -101,7 +101,7 @@ def about(given: Rig, refined: Rig) -> list[dict[str, Any]]:
     """The entry of run.json about trajectories: cameras, length, corrections, standard
     deviations.
     """
-    told = []
+    entries = []
     for number, (old, new) in enumerate(zip(given.trajectories, refined.trajectories, strict=True)):
         cameras = [
             name for name, on in zip(given.names, given.carrier, strict=True) if on == number
@@ -110,7 +110,7 @@ def about(given: Rig, refined: Rig) -> list[dict[str, Any]]:
         moved = np.linalg.norm(new.wTb[:, :3, 3] - was[:, :3, 3], axis=1)
         turned = rotation_angle(new.wTb[:, :3, :3] @ was[:, :3, :3].mT)
         variance = np.einsum("tii->ti", covariance)
-        told.append(
+        entries.append(
             {
                 "carrier": new.name,
                 "cameras": cameras,
@@ -126,7 +126,7 @@ def about(given: Rig, refined: Rig) -> list[dict[str, Any]]:
                 ),
             }
         )
-    return told
+    return entries
 
 
 @dataclass

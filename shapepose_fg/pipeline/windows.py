@@ -20,7 +20,7 @@ from shapepose_fg.pipeline.config import PipelineConfig
 from shapepose_fg.pipeline.config import WindowConfig as WindowConfig
 from shapepose_fg.pipeline.keyframes import STRAY_M, strays_m
 from shapepose_fg.proposal.thinning import thinned
-from shapepose_fg.tracking.identities import Decided, FollowState, alone, finish, follow
+from shapepose_fg.tracking.identities import Decided, FollowState, finish, follow, isolated_frame
 from shapepose_fg.tracking.tracker import Tracker
 
 
@@ -52,7 +52,7 @@ class Span:
     """Index of the first of `decided` with rows to return."""
     stop: int
     """Index after the last of `decided` with rows to return."""
-    alone: bool = False
+    isolated: bool = False
     """Whether every frame is solved separately."""
     rig: Rig | None = None
     """The cameras, if they move and their poses arrive with the frames; None if they are known
@@ -97,12 +97,12 @@ class Engine:
 
         With `last`, the recording ends, or is cut, after them.
         """
-        following, decided = state.follow, list(state.decided)
+        tracking, decided = state.follow, list(state.decided)
         for frame in frames:
-            following, more = follow(self.tracker, following, frame, self.config.following)
+            tracking, more = follow(self.tracker, tracking, frame, self.config.following)
             decided += more
         if last:
-            following, more = finish(self.tracker, following)
+            tracking, more = finish(self.tracker, tracking)
             decided += more
         before, spans = state.before, list[Span]()
         while (cut := self._next(decided, before, last)) is not None:
@@ -110,15 +110,15 @@ class Engine:
             spans.append(Span(tuple(decided[:end]), before, stop))
             keep = self._overlap(decided, stop, -1)
             decided, before = decided[keep:], stop - keep
-        return spans, StreamState(following, tuple(decided), before)
+        return spans, StreamState(tracking, tuple(decided), before)
 
-    def alone(self, frames: Iterable[Input]) -> Span:
+    def isolated_frames(self, frames: Iterable[Input]) -> Span:
         """Independent frames in one window, because bodies are fitted fastest in batches."""
         decided, people = list[Decided](), 0
         for frame in frames:
-            decided.append(alone(self.tracker, frame, people))
+            decided.append(isolated_frame(self.tracker, frame, people))
             people += len(decided[-1][1])
-        return Span(tuple(decided), 0, len(decided), alone=True)
+        return Span(tuple(decided), 0, len(decided), isolated=True)
 
     def _next(self, decided: Sequence[Decided], before: int, last: bool) -> tuple[int, int] | None:
         """End of the next window's own frames, and of the window; None with too few frames."""
@@ -144,31 +144,36 @@ def halved(
 
     `solved` are the rows of the span's keyframes, `between` includes the interpolated ones.
     """
-    given, rows = [each for each, _ in span.decided], solved.observations
+    frames, rows = [each for each, _ in span.decided], solved.observations
     number, time_s = (
-        np.array([each.frame for each in given]),
-        np.array([each.time_s.mean() for each in given]),
+        np.array([each.frame for each in frames]),
+        np.array([each.time_s.mean() for each in frames]),
     )
-    key, new = np.array([each.key for each in given]), np.zeros(len(given), dtype=bool)
-    for mine in window_rows(rows):
-        at = np.searchsorted(number, rows.frame[mine])
-        far = strays_m(solved.joints[mine], solved.velocity[mine], time_s[at]) > STRAY_M
+    key, new = np.array([each.key for each in frames]), np.zeros(len(frames), dtype=bool)
+    for rows_of_person in window_rows(rows):
+        at = np.searchsorted(number, rows.frame[rows_of_person])
+        far = (
+            strays_m(solved.joints[rows_of_person], solved.velocity[rows_of_person], time_s[at])
+            > STRAY_M
+        )
         far &= (np.diff(np.cumsum(key)[at]) == 1) & (np.diff(at) > 1)
         new[(at[1:] + at[:-1])[far] // 2] = True
     new[: span.start] = new[span.stop :] = False
     decided = list[Decided]()
-    for n, each in enumerate(given):
+    for n, each in enumerate(frames):
         if new[n]:
-            carried = between.rows(between.frame == each.frame)
-            unseen = np.full((*carried.joints.shape[:2], len(each.rig)), -1)
-            when = {
-                "frame": carried.frame,
-                "time_s": np.repeat(each.time_s[None], len(carried), axis=0),
+            interpolated = between.rows(between.frame == each.frame)
+            unseen = np.full((*interpolated.joints.shape[:2], len(each.rig)), -1)
+            times = {
+                "frame": interpolated.frame,
+                "time_s": np.repeat(each.time_s[None], len(interpolated), axis=0),
             }
             found = thinned(each.detections, each.rig, config.candidates)[0]
             decided.append((
                 replace(each, detections=found, key=True),
-                Observations.of(unseen, found, carried.joints, track=carried.person, **when),
+                Observations.of(
+                    unseen, found, interpolated.joints, track=interpolated.person, **times
+                ),
             ))  # fmt: skip
         else:
             decided.append((each, rows.rows(rows.frame == each.frame)))

@@ -82,7 +82,7 @@ def workers(count: int, shared: Shared, ahead: int = 2) -> Iterator[Pool[Shared]
     if count == 1:
         yield Pool(Here(), (_call, shared), lambda: 1)
         return
-    with Processes(count, _keep, packed(shared)) as executor:
+    with Processes(count, _unpack_shared, packed(shared)) as executor:
         yield Pool(executor, (_with_shared,), lambda: ahead * count)
 
 
@@ -147,11 +147,11 @@ def packed(shared: object) -> bytes:
         ) from error
 
 
-def suitable_workers(items: int, worth: int) -> int:
-    """Number of workers for this many items: at most one per usable core, and one per `worth`
+def suitable_workers(items: int, per_worker: int) -> int:
+    """Number of workers for this many items: at most one per usable core, and one per `per_worker`
     items.
     """
-    return max(1, min(cores(), items // worth))
+    return max(1, min(cores(), items // per_worker))
 
 
 @contextmanager
@@ -181,7 +181,7 @@ def _begin(parent: int, initializer: Callable[..., object], *arguments: Any) -> 
     initializer(*arguments)
 
 
-def _keep(content: bytes) -> None:
+def _unpack_shared(content: bytes) -> None:
     """Unpack the shared data, which this program packed."""
     global _shared
     try:

@@ -60,9 +60,9 @@ def _claimed(
     """Detections (P, J, V) assigned to people at `places` (P, J, 3), whose present ones are `own`
     (P, J, V).
     """
-    world, unplaced = np.zeros(len(own), dtype=np.intp), np.isnan(places[..., 0])
+    hypothesis, unplaced = np.zeros(len(own), dtype=np.intp), np.isnan(places[..., 0])
     arrays = FrameArrays.of(detections, rig, skeleton)
-    near = nearby(places, np.full(unplaced.shape, _FAR_M), world, arrays)
+    near = nearby(places, np.full(unplaced.shape, _FAR_M), hypothesis, arrays)
     if unplaced.any():
         near = near.with_tied(own, unplaced, arrays)
     lost, reachable = np.isinf(near.distance_m), np.ones(len(near.person), dtype=bool)
@@ -77,7 +77,7 @@ def _claimed(
     reachable[lost] = ((beside >= 0) & (away_m < _REACH_M)).any(axis=1)
     nearness = np.where(reachable, np.exp(-0.5 * near.distance_m**2 / _NEAR_M**2), -np.inf)
     rule = nearness, lost & reachable, LEAST_AFFINITY
-    chosen, claims = near.claimed(*rule, own, world, arrays)
+    chosen, claims = near.claimed(*rule, own, hypothesis, arrays)
     near.share(claims.tied, chosen)
     return chosen
 
@@ -97,7 +97,7 @@ def by_support(
         of[chosen] = person
     of[-1] = -1  # restore the spare entry
     candidate, detection = candidates.support.T
-    whose = of[candidate]
-    has, detection = whose >= 0, detection[whose >= 0]
-    own[whose[has], detections.joint[detection], detections.view[detection]] = detection
+    views_of = of[candidate]
+    has, detection = views_of >= 0, detection[views_of >= 0]
+    own[views_of[has], detections.joint[detection], detections.view[detection]] = detection
     return own

@@ -50,10 +50,10 @@ class CandidateConfig(Settings):
     """Maximum number of pairs of detections per joint and frame; each view keeps its most confident
     detections."""
     most_points: Annotated[int, Interval(ge=100, le=100_000)] = 8000
-    """Maximum number of points per joint; the most confident are kept. Twelve people before 30
+    """Maximum number of points per joint; the most confident are kept. Twelve people with 30
     cameras have 5000."""
     most_candidates: Annotated[int, Interval(ge=10, le=10_000)] = 250
-    """Maximum number of candidates per joint; those with most votes are kept. Twelve people before
+    """Maximum number of candidates per joint; those with most votes are kept. Twelve people with
     30 cameras have 220, half of them chance crossings of rays."""
 
     @classmethod

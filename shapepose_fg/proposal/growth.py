@@ -100,8 +100,8 @@ def grow(
     for level, members in enumerate(skeleton.tree_levels):
         depth[members] = level
     for level in range(1, len(skeleton.tree_levels)):
-        here = depth[candidates.joint[down[:, 1]]] == level
-        support = _support(chosen, down[here], down_score[here], len(candidates))
+        at_level = depth[candidates.joint[down[:, 1]]] == level
+        support = _support(chosen, down[at_level], down_score[at_level], len(candidates))
         _choose(chosen, support, evidence, candidates, np.flatnonzero(depth == level))
     others = np.setdiff1d(np.arange(joints), [skeleton.root])
     for _ in range(config.sweeps):

@@ -88,7 +88,7 @@ class Claims(NamedTuple):
 
 @dataclass(frozen=True)
 class Nearby:
-    """N possible pairs of person and detection, sorted by joint and view, then world,
+    """N possible pairs of person and detection, sorted by joint and view, then hypothesis,
     then person.
     """
 
@@ -107,11 +107,12 @@ class Nearby:
         lost: Mask,
         sure: float,
         own: Index,
-        world: Index,
+        hypothesis: Index,
         arrays: FrameArrays,
     ) -> tuple[Index, Claims]:
         """Assign detections (A, J, V) to people, -1 for none, given their present ones `own` (A, J,
-        V): greedy by score, each detection once in a `world` (A,), one per person, joint and view.
+        V): greedy by score, each detection once in a `hypothesis` (A,), one per person, joint and
+        view.
 
         The score is `nearness` (N,), 1 on the joint and 0 far from it, plus mean affinity to the
         person's own detections. For `lost` (N,) joints only the affinity is used, which must be at
@@ -121,7 +122,7 @@ class Nearby:
         claims = Claims(np.empty(N), np.empty(N), np.empty(N, dtype=bool))
         room = np.empty(N), np.empty(N, dtype=np.intp), np.empty(len(arrays.of_view), dtype=np.intp)
         near = self.first, self.person, self.detection
-        claim(*near, nearness, lost, sure, own, world, arrays, *claims, *room, chosen)
+        claim(*near, nearness, lost, sure, own, hypothesis, arrays, *claims, *room, chosen)
         return chosen, claims
 
     def with_tied(self, own: Index, unplaced: Mask, arrays: FrameArrays) -> "Nearby":
@@ -131,16 +132,19 @@ class Nearby:
         Their distance is infinite.
         """
         person, joint, view = np.nonzero(own >= 0)
-        mine, views = own[person, joint, view], len(arrays.cameras)
-        start, count = arrays.begin[mine], arrays.begin[mine + 1] - arrays.begin[mine]
-        whose = np.repeat(person, count)
+        own_detection, views = own[person, joint, view], len(arrays.cameras)
+        start, count = (
+            arrays.begin[own_detection],
+            arrays.begin[own_detection + 1] - arrays.begin[own_detection],
+        )
+        pair_person = np.repeat(person, count)
         tied = arrays.other[
-            np.arange(len(whose)) + np.repeat(start - np.cumsum(count) + count, count)
+            np.arange(len(pair_person)) + np.repeat(start - np.cumsum(count) + count, count)
         ]
-        lacks = unplaced[whose, arrays.of_joint[tied]]
-        key = np.unique(whose[lacks] * len(arrays.of_view) + tied[lacks])
-        whose, tied = np.divmod(key, max(len(arrays.of_view), 1))
-        person, detection = np.append(self.person, whose), np.append(self.detection, tied)
+        lacks = unplaced[pair_person, arrays.of_joint[tied]]
+        key = np.unique(pair_person[lacks] * len(arrays.of_view) + tied[lacks])
+        pair_person, tied = np.divmod(key, max(len(arrays.of_view), 1))
+        person, detection = np.append(self.person, pair_person), np.append(self.detection, tied)
         slot = arrays.of_joint[detection] * views + arrays.of_view[detection]
         order = np.lexsort((person, slot))
         first = np.searchsorted(slot[order], np.arange(len(self.first)))
@@ -154,11 +158,11 @@ class Nearby:
         share(self.first, self.person, self.detection, self.distance_m, tied, chosen)
 
 
-def nearby(places: Array, reach_m: Array, world: Index, arrays: FrameArrays) -> Nearby:
+def nearby(places: Array, reach_m: Array, hypothesis: Index, arrays: FrameArrays) -> Nearby:
     """Detections within `reach_m` (A, J) of joints at `places` (A, J, 3), metres; people have a
-    `world` (A,).
+    `hypothesis` (A,).
     """
-    people, places = np.argsort(world, kind="stable"), np.ascontiguousarray(places)
+    people, places = np.argsort(hypothesis, kind="stable"), np.ascontiguousarray(places)
     slots = places.shape[1] * len(arrays.cameras) + 1
     first, begins = np.zeros((2, slots), dtype=np.intp)
     room, count = 0, 4 * reach_m.size * len(arrays.cameras)
@@ -268,22 +272,22 @@ def tie(person, detection, own, arrays, mean, neighbours):
     limb, limb_ends = arrays.limb, arrays.limb_ends
     for e in range(len(person)):
         a, d = person[e], detection[e]
-        j, v, total, there = of_joint[d], of_view[d], 0.0, 0
+        j, v, total, count = of_joint[d], of_view[d], 0.0, 0
         for n in range(limb[j], limb[j + 1]):
             if own[a, limb_ends[n], v] >= 0:
-                there += 1
-        if there > 0:
+                count += 1
+        if count > 0:
             for n in range(begin[d], begin[d + 1]):
                 if own[a, of_joint[other[n]], v] == other[n]:
                     total += value[n]
-            total /= there
-        mean[e], neighbours[e] = total, there
+            total /= count
+        mean[e], neighbours[e] = total, count
 
 
 @kernel("i1 i1 i1 f1 b1 f0 i3 i1", FrameArrays, "f1 f1 b1 f1 i1 i1 i3")
 def claim(
-    first, person, detection, nearness, lost, sure, own, world, arrays, tied, score, likely, key,
-    queue, taken, chosen,
+    first, person, detection, nearness, lost, sure, own, hypothesis, arrays, tied, score, likely,
+    key, queue, taken, chosen,
 ):  # fmt: skip
     """Fill in the results of `Nearby.claimed`; `key` and `queue` (N,) and `taken` (D,) are
     workspace.
@@ -307,9 +311,9 @@ def claim(
                 chosen[a, j, v] = -1
     for slot in range(len(first) - 1):
         j, v, end = slot // views, slot % views, first[slot]
-        while end < first[slot + 1]:  # worlds do not compete
-            of, length = world[person[end]], 0
-            while end < first[slot + 1] and world[person[end]] == of:
+        while end < first[slot + 1]:  # hypotheses do not compete
+            of, length = hypothesis[person[end]], 0
+            while end < first[slot + 1] and hypothesis[person[end]] == of:
                 if likely[end]:
                     queue[length] = end
                     length += 1

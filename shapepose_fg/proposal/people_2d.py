@@ -76,8 +76,8 @@ def whole_people(chosen: Index, found: Detections) -> Index:
             rows = groups[number[count.argmax()]]
             whole[row, found.joint[rows], view] = rows
     taken = np.bincount(chosen[chosen >= 0], minlength=len(found) + 1)
-    theirs = np.where(chosen == whole, taken[whole] > 1, (taken[whole] > 0) | (chosen >= 0))
-    return np.where(theirs, -1, whole)
+    excluded = np.where(chosen == whole, taken[whole] > 1, (taken[whole] > 0) | (chosen >= 0))
+    return np.where(excluded, -1, whole)
 
 
 @kernel("i2 i1 i1 i1 i1 b2 i1 i1")

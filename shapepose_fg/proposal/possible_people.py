@@ -132,14 +132,14 @@ def _claimed(places: Array, own: Index, frame: Frame, *, exclusive: bool) -> Ind
     own ones.
     """
     H, J, _ = own.shape
-    world = np.zeros(H, dtype=np.intp) if exclusive else np.arange(H)
-    near = nearby(places, np.full((H, J), _FAR_M), world, frame.arrays)
+    hypothesis = np.zeros(H, dtype=np.intp) if exclusive else np.arange(H)
+    near = nearby(places, np.full((H, J), _FAR_M), hypothesis, frame.arrays)
     unplaced = np.isnan(places[..., 0])
     if unplaced.any():
         near = near.with_tied(own, unplaced, frame.arrays)
     nearness = np.exp(-0.5 * near.distance_m**2 / NEAR_M**2)
     lost = np.isinf(near.distance_m)
-    chosen, claims = near.claimed(nearness, lost, _SURE_AFFINITY, own, world, frame.arrays)
+    chosen, claims = near.claimed(nearness, lost, _SURE_AFFINITY, own, hypothesis, frame.arrays)
     if exclusive:
         near.share(claims.tied, chosen)
     return chosen

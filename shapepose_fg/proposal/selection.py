@@ -40,9 +40,9 @@ _SPREAD, _PHANTOMS_SPREAD = 0.08, 0.35
 """Standard deviation of the logarithm of a bone's length, for people and for false positives."""
 _ASTRAY = 0.1
 """Share of people's bones distributed like those of false positives, because a joint is wrong. All
-these are from 5779 hypotheses of simulated crowds before two to six cameras."""
+these are from 5779 hypotheses of simulated crowds with two to six cameras."""
 _BONE = 0.15
-"""Weight of a bone's log-likelihood ratio; bones are not independent. In crowds before three to six
+"""Weight of a bone's log-likelihood ratio; bones are not independent. In crowds with three to six
 cameras it finds 1 to 4 points more people with fewer false positives, while 0.3 and 0.6 give more
 of these."""
 
@@ -53,7 +53,7 @@ class Evidence:
 
     chosen: Index
     """(H, J, V) the detections that each hypothesis explains, -1 for none."""
-    worth: Array
+    weight: Array
     """(H, J, V) weight of each detection: confidence, affinity, and nearness of its ray."""
     expected: Mask
     """(H, J, V) whether the joint is expected in the image."""
@@ -64,25 +64,27 @@ class Evidence:
     def of(cls, people: PossiblePeople, frame: Frame) -> "Evidence":
         """Compute the evidence for hypotheses in a frame."""
         chosen, detections = people.chosen, frame.detections
-        has, worth = chosen >= 0, np.zeros(chosen.shape)
-        whose, which = np.ascontiguousarray(np.nonzero(has)[0]), chosen[has]
-        affinity, neighbours = own_affinity(whose, which, chosen, frame.arrays)
+        has, weight = chosen >= 0, np.zeros(chosen.shape)
+        person, detection = np.ascontiguousarray(np.nonzero(has)[0]), chosen[has]
+        affinity, neighbours = own_affinity(person, detection, chosen, frame.arrays)
         near = np.exp(-0.5 * (np.nan_to_num(people.gap_m[has], posinf=1.0) / DETECTOR_M) ** 2)
-        worth[has] = (
-            detections.confidence[which] * np.where(neighbours > 0, affinity, LEAST_AFFINITY) * near
+        weight[has] = (
+            detections.confidence[detection]
+            * np.where(neighbours > 0, affinity, LEAST_AFFINITY)
+            * near
         )
-        worth[has.sum(axis=2) < 2] *= _SINGLE
+        weight[has.sum(axis=2) < 2] *= _SINGLE
         xy, depth = frame.rig.project(people.places)
         size = frame.rig.image_sizes[:, None, None]
         inside = np.moveaxis((depth > 0) & ((xy >= 0) & (xy < size)).all(axis=-1), 0, 2)
         expected = inside & has.any(axis=2, keepdims=True)
-        return cls(chosen, worth, expected, _bones(people, frame))
+        return cls(chosen, weight, expected, _bones(people, frame))
 
     def score(self, taken: Mask) -> Array:
         """(H,) score of each hypothesis if others explain the detections `taken` (D,)."""
         own = self.chosen >= 0
         own = own & ~taken[self.chosen] if len(taken) > 0 else own
-        evidence = (self.worth * own).sum(axis=(1, 2))
+        evidence = (self.weight * own).sum(axis=(1, 2))
         seen = (own & self.expected).sum(axis=1) / np.maximum(self.expected.sum(axis=1), 1)
         missed = (self.expected & ~own).sum(axis=1)
         price = (missed * (_MISSED * seen + _HIDDEN * (1 - seen))).sum(axis=1)
@@ -102,10 +104,10 @@ def _bones(people: PossiblePeople, frame: Frame) -> Array:
     known = (twice & twice[:, parents])[:, core]
     off = np.log(np.maximum(share[:, core], 1e-3) / _USUAL)
     sigma = np.hypot(_SPREAD, DETECTOR_M / (_USUAL * frame.longest_m[core]))
-    mine = np.exp(-0.5 * (off / sigma) ** 2) / sigma
+    of_people = np.exp(-0.5 * (off / sigma) ** 2) / sigma
     phantoms = np.exp(-0.5 * (off / _PHANTOMS_SPREAD) ** 2) / _PHANTOMS_SPREAD
-    # Far from both distributions `mine` vanishes, and `_ASTRAY` bounds the ratio.
-    ratio = (1 - _ASTRAY) * mine / np.maximum(phantoms, 1e-300) + _ASTRAY
+    # Far from both distributions `of_people` vanishes, and `_ASTRAY` bounds the ratio.
+    ratio = (1 - _ASTRAY) * of_people / np.maximum(phantoms, 1e-300) + _ASTRAY
     return np.asarray(
         _BONE * np.log(ratio).sum(axis=1, where=known) - _BROKEN * broken, dtype=np.float64
     )
@@ -129,7 +131,7 @@ def choose(points: PairPoints, frame: Frame, least: float) -> tuple[PossiblePeop
         more = _greedy(pool, people, taken, frame, least)
         if more is None:
             break
-        people, sure = _given_out(more, frame, least)
+        people, sure = _assigned_once(more, frame, least)
     return people, sure
 
 
@@ -160,7 +162,9 @@ def _greedy(
     return None if people is before else people
 
 
-def _given_out(people: PossiblePeople, frame: Frame, least: float) -> tuple[PossiblePeople, Array]:
+def _assigned_once(
+    people: PossiblePeople, frame: Frame, least: float
+) -> tuple[PossiblePeople, Array]:
     """Assign each detection to one of the people; drops people with too little evidence, the least
     probable first.
     """

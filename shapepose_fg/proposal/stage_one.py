@@ -39,8 +39,8 @@ class StageOne:
         """Return a variant for what evidence leaves unexplained: it grows people from hips that two
         views saw, as in the paper, and expects few, so that fewer points and candidates are kept.
         """
-        few = {"most_points": _POINTS_OF_FEW, "most_candidates": _CANDIDATES_OF_FEW}
-        candidates = replace(self.candidates, min_votes=1, **few)
+        limits = {"most_points": _POINTS_OF_FEW, "most_candidates": _CANDIDATES_OF_FEW}
+        candidates = replace(self.candidates, min_votes=1, **limits)
         proposals = replace(self.proposals, evidence=False)
         return replace(self, candidates=candidates, proposals=proposals)
 

@@ -2,7 +2,7 @@
 
 Every detection is paired with those of the same joint in all other views, and every candidate
 compared with every person: cost grows with the square of both. Ordinary crowds (a dozen people
-before thirty cameras) stay below all limits.
+with thirty cameras) stay below all limits.
 """
 
 from dataclasses import dataclass, replace
@@ -97,7 +97,7 @@ def thinned_candidates(
 
 
 _MOST_LINKS = 2_000_000
-"""Maximum number of pairs of candidates with affinities: 12 people before 30 cameras
+"""Maximum number of pairs of candidates with affinities: 12 people with 30 cameras
 have 50,000."""
 
 

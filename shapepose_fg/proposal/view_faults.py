@@ -40,8 +40,8 @@ def clipped(found: Detections, rig: Rig) -> Mask:
     measured = found.xy.copy()
     for view, camera in enumerate(rig.cameras):
         if np.any(camera.distortion):
-            here = found.view == view
-            measured[here] = camera.distort(measured[here])
+            in_view = found.view == view
+            measured[in_view] = camera.distort(measured[in_view])
     edge = np.array([camera.image_size for camera in rig.cameras]) - 1 - _BORDER_PX
     wrong = np.asarray(((measured <= _BORDER_PX) | (measured >= edge[found.view])).any(axis=1))
     for along in (*measured.T, *-measured.T):
@@ -83,9 +83,9 @@ def doubled(found: Detections, rig: Rig) -> Mask:
     same = enough & (
         median < np.maximum(_SAME * np.minimum(size[one], size[other]), least[view[one]])
     )
-    gone = np.zeros(len(groups), dtype=bool)
+    removed = np.zeros(len(groups), dtype=bool)
     for kept, twin in zip(one[same].tolist(), other[same].tolist(), strict=True):
-        gone[twin] |= not gone[kept]
-    for number in np.flatnonzero(gone).tolist():
+        removed[twin] |= not removed[kept]
+    for number in np.flatnonzero(removed).tolist():
         again[groups[number]] = True
     return again

@@ -3,6 +3,7 @@ result.
 """
 
 import json
+import shlex
 import shutil
 from collections.abc import Sequence
 from dataclasses import replace
@@ -106,9 +107,8 @@ def take_back(folder: str | Path, solve: Solve | None = None) -> tuple[Edit, Rec
     folder = Path(folder)
     edits = _kept_edits(folder)
     if len(edits) == 0:
-        raise InputError(
-            f"{folder}: there is no correction to undo; see shapepose-fg tracks {folder}"
-        )
+        see = shlex.join(["shapepose-fg", "tracks", str(folder)])
+        raise InputError(f"{folder}: there is no correction to undo; see {see}")
     if len(edits) == 1:
         _restore(folder)
         return edits[-1], Reconstruction.load(folder)
@@ -124,11 +124,11 @@ def refuse_corrected(folder: Path) -> None:
     """Raise InputError if `folder` has a result that was corrected by hand, which a new result
     would overwrite.
     """
-    there = [name for name in (CORRECTIONS, UNCORRECTED) if (folder / name).exists()]
-    if len(there) > 0:
+    present = [name for name in (CORRECTIONS, UNCORRECTED) if (folder / name).exists()]
+    if len(present) > 0:
         cure = f"give another folder, or delete {CORRECTIONS} and {UNCORRECTED} first"
         raise InputError(
-            f"{folder}: this result was corrected by hand ({' and '.join(there)}); {cure}"
+            f"{folder}: this result was corrected by hand ({' and '.join(present)}); {cure}"
         )
 
 

@@ -69,7 +69,7 @@ def explain(
         raise InputError(
             "the cameras are not those of observations.npz; give the cameras of the reconstruction"
         )
-    told = entries_of(people.run)
+    entries = entries_of(people.run)
     row = _row_of(people, person, frame, time_s)
     names, frame = people.joint_names.tolist(), int(people.frame[row])
     if joint not in names:
@@ -79,15 +79,18 @@ def explain(
     number = names.index(joint)
     solver = Solver.of(people, rig)
     graph = solved_around(people, solver, person, frame, extra_factors)
-    here = people.frame == frame
-    around, at = _Detections.of(people.rows(here), rig, solver.config), int(here[:row].sum())
+    in_frame = people.frame == frame
+    around, at = (
+        _Detections.of(people.rows(in_frame), rig, solver.config),
+        int(in_frame[:row].sum()),
+    )
     views, factors, shares = _view_reasons(around, graph, at, number, solver.config)
     place, known = people.joints[row, number], np.isfinite(people.joints[row, number]).all()
     sigma, when = float(sigma_m(people.covariance[row, number])), float(people.time_s[row])
     refused = _refused(around, at, number, detections)
-    findings = _findings(people, told, row, number, views, factors, shares, refused)
+    findings = _findings(people, entries, row, number, views, factors, shares, refused)
     given = {name_of(function) for function in functions_of(extra_factors)}
-    missing = tuple(name for name in told.extra_factors if name not in given)
+    missing = tuple(name for name in entries.extra_factors if name not in given)
     return Explanation(
         person, joint, frame, round(when, 6) if np.isfinite(when) else None,
         tuple(place.tolist()) if known else None, sigma if known and np.isfinite(sigma) else None,
@@ -100,20 +103,20 @@ def _row_of(people: Reconstruction, person: int, frame: int | None, time_s: floa
     """Index of the row of a person in a frame, or nearest to a time; raises InputError if there is
     none.
     """
-    mine = np.flatnonzero(people.person == person)
-    if len(mine) == 0:
-        there = " ".join(map(str, np.unique(people.person).tolist()[:20]))
-        raise InputError(f"person {person}: not in the result; there are {there or 'none'}")
+    rows = np.flatnonzero(people.person == person)
+    if len(rows) == 0:
+        known = " ".join(map(str, np.unique(people.person).tolist()[:20]))
+        raise InputError(f"person {person}: not in the result; there are {known or 'none'}")
     if (frame is None) == (time_s is None):
         raise InputError("give either a frame or a time")
     if time_s is not None:
-        away = np.abs(people.time_s[mine] - time_s)
+        away = np.abs(people.time_s[rows] - time_s)
         if not np.isfinite(away).any():
             raise InputError("the result has no times; give a frame")
-        return int(mine[np.nanargmin(away)])
-    row = mine[people.frame[mine] == frame]
+        return int(rows[np.nanargmin(away)])
+    row = rows[people.frame[rows] == frame]
     if len(row) == 0:
-        first, last = people.frame[mine].min(), people.frame[mine].max()
+        first, last = people.frame[rows].min(), people.frame[rows].max()
         raise InputError(
             f"person {person} is not in frame {frame}, only in some frames from {first} to {last}"
         )
@@ -206,7 +209,7 @@ def _view_reasons(
     reasons = []
     for v, name in enumerate(table.view_names.tolist()):
         off_px = off_sigma = None
-        like = ""
+        words = ""
         if seen[v] and np.isfinite(residual[v]).all() and sigma[v] > 0:
             least = np.eye(3)  # weak prior of 1 m
             without = inverses(raise_eigenvalues(whole - information[v], 0.0) + least)
@@ -215,7 +218,7 @@ def _view_reasons(
             off_px = float(np.linalg.norm(away))
             off_sigma = float(np.sqrt(away @ np.linalg.solve(spread, away)))
             if off_sigma > OFF_SIGMA:
-                like = _looks_like(
+                words = _looks_like(
                     all_of_it, row, joint, v, table.xy[row, joint, v], float(sigma[v]), off_px
                 )
         reason = ViewReason(
@@ -229,20 +232,23 @@ def _view_reasons(
             off_px=off_px,
             off_sigma=off_sigma,
             share=shares[v],
-            looks_like=like,
+            looks_like=words,
         )
         reasons.append(reason)
-    told = dict[tuple[str, tuple[str, ...]], float]()
+    factor_shares = dict[tuple[str, tuple[str, ...]], float]()
     for each, share in zip(evidence, shares[len(gates) :], strict=False):
-        tied = ((who, people.joint_names[number]) for who, number, _ in each.others)
-        mine = int(people.person[row])
+        tied = (
+            (joint_person, people.joint_names[number]) for joint_person, number, _ in each.others
+        )
+        own_person = int(people.person[row])
         others = tuple(
             dict.fromkeys(
-                str(name) if who == mine else f"person {who}'s {name}" for who, name in tied
+                str(name) if joint_person == own_person else f"person {joint_person}'s {name}"
+                for joint_person, name in tied
             )
         )
-        told[each.name, others] = told.get((each.name, others), 0.0) + share
-    factors = tuple(FactorReason(*which, share) for which, share in told.items())
+        factor_shares[each.name, others] = factor_shares.get((each.name, others), 0.0) + share
+    factors = tuple(FactorReason(*which, share) for which, share in factor_shares.items())
     return tuple(reasons), factors, (shares[-2], shares[-1])
 
 
@@ -254,21 +260,21 @@ def _looks_like(
     `sigma` and distance `off` from its joint, pixels.
     """
     people, names = all_of_it.people, all_of_it.people.joint_names.tolist()
-    here = np.flatnonzero(people.frame == people.frame[row])
+    rows = np.flatnonzero(people.frame == people.frame[row])
     alike = np.array(
         [j for j, name in enumerate(names) if name in (names[joint], mirrored(names[joint]))]
     )
-    points, covariance = people.joints[here][:, alike], people.covariance[here][:, alike]
-    xy, _, slope = (each[:, :, view] for each in all_of_it.views.rows(here).project(points))
+    points, covariance = people.joints[rows][:, alike], people.covariance[rows][:, alike]
+    xy, _, slope = (each[:, :, view] for each in all_of_it.views.rows(rows).project(points))
     away, spread = (xy - at)[..., None], sigma**2 * np.eye(2) + slope @ covariance @ slope.mT
     known = np.isfinite(away).all(axis=(-1, -2)) & np.isfinite(spread).all(axis=(-1, -2))
-    known &= ~((here == row)[:, None] & (alike == joint))
+    known &= ~((rows == row)[:, None] & (alike == joint))
     squared = np.full(known.shape, np.inf)
     squared[known] = (away[known].mT @ np.linalg.solve(spread[known], away[known]))[..., 0, 0]
     squared[np.linalg.norm(away[..., 0], axis=-1) >= _APART * off] = np.inf
     n, j = np.unravel_index(squared.argmin(), squared.shape)
     return (
-        f"person {people.person[here[n]]}'s {names[alike[j]]}"
+        f"person {people.person[rows[n]]}'s {names[alike[j]]}"
         if squared[n, j] < OFF_SIGMA**2
         else ""
     )
@@ -284,8 +290,8 @@ def _refused(
     frame = int(people.frame[row])
     if detections is None or not 0 <= frame < len(detections):
         return []
-    seen, here = detections[frame], np.flatnonzero(people.frame == frame)
-    owner, me = _owner(seen, table, here), int((here < row).sum())
+    seen, rows = detections[frame], np.flatnonzero(people.frame == frame)
+    owner, me = _owner(seen, table, rows), int((rows < row).sum())
     views = all_of_it.views.rows(np.array([row]))
     xy, depth = (each[0, 0] for each in views.pixels(people.joints[row, joint][None, None]))
     begin, other, affinity = seen.ties
@@ -294,20 +300,22 @@ def _refused(
     for k in np.flatnonzero((seen.joint == joint) & (owner != me) & missed).tolist():
         view, ends = int(seen.view[k]), slice(begin[k], begin[k + 1])
         name, off = str(table.view_names[view]), float(np.linalg.norm(seen.xy[k] - xy[view]))
-        theirs, others = (affinity[ends][owner[other[ends]] == n].sum() for n in (me, owner[k]))
-        whose = f"person {people.person[here[owner[k]]]}'s"
+        own_affinity, others = (
+            affinity[ends][owner[other[ends]] == n].sum() for n in (me, owner[k])
+        )
+        owner_words = f"person {people.person[rows[owner[k]]]}'s"
         if owner[k] < 0:
             sigmas, others = all_of_it.sigmas_px[:, joint, view], 0.0
             usual = sigmas.sum() / max((sigmas > 0).sum(), 1)
-            whose = _looks_like(all_of_it, row, joint, view, seen.xy[k], usual, off)
-        cause = Cause.FOREIGN if whose else Cause.GATED
-        if theirs > others:
+            owner_words = _looks_like(all_of_it, row, joint, view, seen.xy[k], usual, off)
+        cause = Cause.FOREIGN if owner_words else Cause.GATED
+        if own_affinity > others:
             words = (
-                f"connects a detection with this person's that is {whose or 'unassigned'}, "
+                f"connects a detection with this person's that is {owner_words or 'unassigned'}, "
                 f"{off:.0f} px off. It was not used."
             )
             joined.append(Finding(cause, (name,), f"Camera {name} {words}"))
-        elif not whose and off * depth[view] < FARTHEST_M * views.focal[0, view]:
+        elif not owner_words and off * depth[view] < FARTHEST_M * views.focal[0, view]:
             words = f"Camera {name} has an unassigned detection {off:.0f} px off."
             beside.append((off, Finding(cause, (name,), words)))
     return joined + [each for _, each in sorted(beside, key=lambda one: one[0])]
@@ -328,8 +336,8 @@ def _findings(
     problem = _problem(people, run, row, joint)
     if problem:
         found.append(Finding(Cause.NOT_SOLVED, (), f"It was not solved: {problem}."))
-    told = _checked(people, run, row)
-    found += [each for each in told if each.cause == Cause.WRONG_CAMERA]
+    checked = _checked(people, run, row)
+    found += [each for each in checked if each.cause == Cause.WRONG_CAMERA]
     left = [view for view in views if view.gate not in (GATES[Gate.USED], GATES[Gate.NOT_SEEN])]
     suspects = [
         view
@@ -345,16 +353,16 @@ def _findings(
             found.append(Finding(Cause.FOREIGN, (view.camera,), words))
     named = {name for each in found for name in each.cameras}
     suspects = [view for view in suspects if view.camera not in named]
-    found += [each for each in told if each.cause == Cause.CONTRADICTION]
+    found += [each for each in checked if each.cause == Cause.CONTRADICTION]
     against = [view for view in suspects if view.gate == GATES[Gate.CONTRADICTS_BODY]]
     doubted = [view for view in suspects if view in used and (view.off_sigma or 0.0) > OFF_SIGMA]
     agree = [view for view in used if view not in doubted]
     if (
         len(against) + len(doubted) == 1 and len(agree) > 0
     ):  # a single one against all others is wrong
-        alone = [*against, *doubted]
+        single = [*against, *doubted]
     else:
-        alone = []
+        single = []
         for several, fate in ((against, "left out"), (doubted, "used, with less weight")):
             cameras = tuple(view.camera for view in several)
             words = (
@@ -363,8 +371,8 @@ def _findings(
             )
             if several:
                 found.append(Finding(Cause.CONTRADICTION, cameras, words))
-    alone += [view for view in suspects if view.gate == GATES[Gate.TOO_FAR]]
-    for view in sorted(alone, key=lambda view: -(view.off_sigma or 0.0)):
+    single += [view for view in suspects if view.gate == GATES[Gate.TOO_FAR]]
+    for view in sorted(single, key=lambda view: -(view.off_sigma or 0.0)):
         words = (
             f"Camera {view.camera}'s detection is {_off(view)} and matches no known person. "
             f"{_taken(view)}"
@@ -384,35 +392,35 @@ def _findings(
     return tuple(found)
 
 
-def _problem(people: Reconstruction, told: RunEntries, row: int, joint: int) -> str:
+def _problem(people: Reconstruction, entries: RunEntries, row: int, joint: int) -> str:
     """The problem with a joint as run.json states it; empty if there was none."""
-    here = int(people.person[row]), int(people.frame[row]), str(people.joint_names[joint])
-    problems = told.people.problems
+    key = int(people.person[row]), int(people.frame[row]), str(people.joint_names[joint])
+    problems = entries.people.problems
     return next(
-        (each.reason for each in problems if (each.person, each.frame, each.joint) == here), ""
+        (each.reason for each in problems if (each.person, each.frame, each.joint) == key), ""
     )
 
 
-def _checked(people: Reconstruction, told: RunEntries, row: int) -> list[Finding]:
+def _checked(people: Reconstruction, entries: RunEntries, row: int) -> list[Finding]:
     """Cameras in which the set-up check found an error, according to run.json: excluded from a
     row's frame, doubted in it, or used nevertheless; in words.
     """
     found, frame = list[Finding](), people.frame[row]
     for spells, cause, fate in (
-        (told.setup.left_out, Cause.WRONG_CAMERA, "left out"),
-        (told.setup.doubted, Cause.CONTRADICTION, "doubted"),
+        (entries.setup.left_out, Cause.WRONG_CAMERA, "left out"),
+        (entries.setup.doubted, Cause.CONTRADICTION, "doubted"),
     ):
         those = tuple(each.camera for each in spells if each.frames[0] <= frame < each.frames[1])
-        says = "; ".join(each.says for each in told.setup.findings if {*each.cameras} & {*those})
+        says = "; ".join(each.says for each in entries.setup.findings if {*each.cameras} & {*those})
         if those:
             words = (
                 f"In the set-up check, {_cameras(those)} "
                 f"{'were' if len(those) > 1 else 'was'} {fate}: {says}."
             )
             found.append(Finding(cause, those, words))
-    judged = {each.camera for each in (*told.setup.left_out, *told.setup.doubted)}
+    judged = {each.camera for each in (*entries.setup.left_out, *entries.setup.doubted)}
     assert people.observations is not None
-    for each in told.setup.findings:
+    for each in entries.setup.findings:
         some = 0 < len(each.cameras) < len(people.observations.view_names)
         if some and not judged & {*each.cameras}:
             words = f"The set-up check says: {each.says}."

@@ -137,10 +137,9 @@ class Explanation:
                 "(one sigma)."
             )
         used = [view for view in self.views if view.gate == GATES[Gate.USED]]
-        told = [f"{view.camera} {view.share:.0%}" for view in used]
-        told += [f"{each.name}{_with(each.others)} {each.share:.0%}" for each in self.factors]
         parts = [
-            *told,
+            *(f"{view.camera} {view.share:.0%}" for view in used),
+            *(f"{each.name}{_with(each.others)} {each.share:.0%}" for each in self.factors),
             f"the body {self.body_share:.0%}",
             f"motion from other frames {self.motion_share:.0%}",
         ]

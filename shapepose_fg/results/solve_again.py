@@ -27,7 +27,7 @@ from shapepose_fg.estimation.window_solution import PersonGraph, WindowSolution
 from shapepose_fg.io.calibration.reading import cameras_of
 from shapepose_fg.io.config import ANOTHER_VERSION, config_from
 from shapepose_fg.pipeline.config import PipelineConfig
-from shapepose_fg.pipeline.keyframes import looked_at, with_rows_like
+from shapepose_fg.pipeline.keyframes import tracked_rows, with_rows_like
 from shapepose_fg.pipeline.person_shapes import with_person_shapes
 from shapepose_fg.pipeline.solve_window import solve_window
 from shapepose_fg.pipeline.windows import near_border, window_stop
@@ -169,7 +169,7 @@ def _solved(
             continue
         part = rows.rows(_rows_of(rows, own, segment, config.windows.shared_s))
         if config.windows.keyframe_s > 0:
-            part = part.rows(looked_at(part))
+            part = part.rows(tracked_rows(part))
         assert part.observations is not None
         # Initialised from the views, as the current joints may be another person's, unless they are
         # to be found again.

@@ -94,7 +94,7 @@ def _summary(
     """Summary of the identity in `rows`, sorted by frame."""
     frame, known = people.frame[rows], people.known[rows]
     placed = np.isfinite(people.joints[rows]).all(axis=-1)
-    told = placed & (known != Known.UNKNOWN)
+    recorded = placed & (known != Known.UNKNOWN)
     return TrackSummary(
         person=person,
         first=int(frame[0]),
@@ -103,7 +103,7 @@ def _summary(
         gaps=int((np.diff(frame) > every).sum()),
         stature_m=stature_m,
         confidence=float(people.confidence[rows].mean()),
-        seen=float(Known.observed(known[told]).mean()) if told.any() else float("nan"),
+        seen=float(Known.observed(known[recorded]).mean()) if recorded.any() else float("nan"),
         walked_m=_walked_m(people, rows),
     )
 

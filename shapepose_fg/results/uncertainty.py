@@ -352,9 +352,9 @@ def distance(
         across = both.block(0, 1)
         covariance = both.block(0, 0) + both.block(1, 1) - across - across.T
         return Distance(both.mean[1] - both.mean[0], covariance, error_tails())
-    alone, points = marginal(people, one), np.asarray(other, dtype=np.float64)
-    apart = points - alone.mean[0]
-    covariance = np.broadcast_to(alone.covariance, (*apart.shape, 3))
+    joint_marginal, points = marginal(people, one), np.asarray(other, dtype=np.float64)
+    apart = points - joint_marginal.mean[0]
+    covariance = np.broadcast_to(joint_marginal.covariance, (*apart.shape, 3))
     return Distance(apart, covariance, error_tails())
 
 
@@ -439,16 +439,16 @@ def _paces(people: Reconstruction, rows: Index, joints: Index) -> Array:
     """
     lasts = np.full(len(people.person), np.nan)
     for person in np.unique(people.person[rows]).tolist():
-        mine = np.flatnonzero(people.person == person)
-        mine = mine[np.argsort(people.time_s[mine], kind="stable")]
-        if len(mine) > 1 and (np.diff(people.time_s[mine]) > 0).all():
-            lasts[mine] = moments(people.time_s[mine])[2]
+        of_person = np.flatnonzero(people.person == person)
+        of_person = of_person[np.argsort(people.time_s[of_person], kind="stable")]
+        if len(of_person) > 1 and (np.diff(people.time_s[of_person]) > 0).all():
+            lasts[of_person] = moments(people.time_s[of_person])[2]
     own = np.trace(people.covariance[rows, joints], axis1=-2, axis2=-1)
     speed = np.trace(people.velocity_covariance[rows, joints], axis1=-2, axis2=-1)
-    said = 1 - speed * lasts[rows] ** 2 / (2 * own)
+    correlated = 1 - speed * lasts[rows] ** 2 / (2 * own)
     usual_s = np.geomspace(1e-4, 10.0, 200)
-    at_s = np.interp(-said, -_over_time(usual_s), usual_s)
-    return np.where(np.isfinite(said), np.maximum(at_s / lasts[rows], 1.0), 1.0)
+    at_s = np.interp(-correlated, -_over_time(usual_s), usual_s)
+    return np.where(np.isfinite(correlated), np.maximum(at_s / lasts[rows], 1.0), 1.0)
 
 
 def _together(one: str, other: str) -> float:

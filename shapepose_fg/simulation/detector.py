@@ -340,7 +340,7 @@ class Detector:
         xy = false.offset * (size - 1)
         at = false.view[near], false.person[near], false.anchor[near]
         xy[near] = true_xy[at] + false.offset[near] * (focal_px[at[0]] / depth[at])[:, None]
-        there = np.all((xy >= 0) & (xy <= size - 1), axis=1)  # false for NaN behind a camera
+        inside = np.all((xy >= 0) & (xy <= size - 1), axis=1)  # false for NaN behind a camera
         # Static ones are in the background: people in front of them occlude them.
         gap_px = np.linalg.norm(true_xy[false.view] - xy[:, None, None], axis=-1)
         gap_m = (gap_px * depth[false.view]).min(
@@ -348,7 +348,7 @@ class Detector:
         )
         # Distance from a person's joint within which false candidates were counted as
         # that person's, m.
-        there &= near | (gap_m > 0.5 * focal_px[false.view])
+        inside &= near | (gap_m > 0.5 * focal_px[false.view])
         quantiles = np.where(near[:, None], table.false_near_confidence, table.false_far_confidence)
         found = Candidates(
             view=false.view,
@@ -358,7 +358,7 @@ class Detector:
             owner=np.zeros((len(xy), true_xy.shape[1]), dtype=bool),
             reach_px=self._reach_px(false.rank, size[:, 1]),
         )
-        return found.rows(there)
+        return found.rows(inside)
 
     def _reach_px(self, probability: Array, height_px: Array) -> Array:
         """Distance (D,), px, to a better candidate within which one is suppressed: logistic,

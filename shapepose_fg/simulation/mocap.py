@@ -137,10 +137,10 @@ class Mocap:
         rotations, pelvis = _bridged(
             rotations, self.arrays["trans"][frames].astype(np.float64), fps
         )
-        who = (self.names[index], self.subjects[index], self.actions[index])
+        labels = (self.names[index], self.subjects[index], self.actions[index])
         valid = (bool(own[name]) for name in ("wrist_valid", "toe_valid"))
         return Clip(
-            *who, rotations, pelvis, fps, float(own["leg_m"]), float(own["floor_y"]), *valid
+            *labels, rotations, pelvis, fps, float(own["leg_m"]), float(own["floor_y"]), *valid
         )
 
 

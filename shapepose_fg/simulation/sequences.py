@@ -117,10 +117,10 @@ class Room:
         middle = (steps.min(axis=0) + steps.max(axis=0)) / 2
         two = [one.moved(-middle) for one in two]
         turns, shifts = self._pair_options(_long_axis(steps - middle))
-        worth = [self._worth(two, turn, shift) for turn, shift in zip(turns, shifts, strict=True)]
+        scores = [self._worth(two, turn, shift) for turn, shift in zip(turns, shifts, strict=True)]
         placed = (
             [one.moved(shifts[index], float(turns[index])) for one in two]
-            for index in np.argsort(comparable(-np.array(worth)), kind="stable")[:_TRIED]
+            for index in np.argsort(comparable(-np.array(scores)), kind="stable")[:_TRIED]
         )
         for one, clip in zip(self._roomiest(placed), pair, strict=True):
             self._add(one, clip.name)

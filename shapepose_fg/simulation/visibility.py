@@ -205,11 +205,11 @@ def seen_from_the_front(seen: Array, joints: Array, centres: Array, ramp: Array)
     return result
 
 
-def _commonest(who: Index, counts: Mask) -> Index:
-    """Mode (...,) of the values `who` (..., R) where `counts` is true; the first on a tie."""
-    votes = ((who[..., :, None] == who[..., None, :]) & counts[..., None, :]).sum(axis=-1)
+def _commonest(values: Index, counts: Mask) -> Index:
+    """Mode (...,) of `values` (..., R) where `counts` is true; the first on a tie."""
+    votes = ((values[..., :, None] == values[..., None, :]) & counts[..., None, :]).sum(axis=-1)
     best = np.where(counts, votes, 0).argmax(axis=-1)
-    return np.take_along_axis(who, best[..., None], axis=-1)[..., 0]
+    return np.take_along_axis(values, best[..., None], axis=-1)[..., 0]
 
 
 def _bones_near(parents: tuple[int, ...]) -> Array:

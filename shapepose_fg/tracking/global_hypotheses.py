@@ -1,7 +1,7 @@
 """Multiple-hypothesis tracking through a block of frames: global hypotheses, each tracked from one
 frame to both ends.
 
-A global hypothesis (`world` in the code) is a set of tracks that share no detection. People are
+A global hypothesis is a set of tracks that share no detection. People are
 searched for in several frames, tracked from there forwards and backwards, and the tracks that
 explain most are selected (`track_selection.py`). The selected people are then joined in one global
 hypothesis in the frames that show them best, and tracked again from there, so that they no longer
@@ -26,7 +26,7 @@ from shapepose_fg.tracking.tracker import SEARCH_S, Tracker, Tracks
 
 Array = NDArray[np.float64]
 
-_TWINS_S = 0.1
+_DUPLICATES_S = 0.1
 """Interval between checks for duplicate global hypotheses, s."""
 _RESTART_S = 1.3
 """Interval between the frames from which the selected people are tracked again, s."""
@@ -34,7 +34,7 @@ _ROUNDS = 2
 """Maximum number of rounds of tracking again."""
 _ALIKE = 0.95
 """Agreement of detections above which two selections count as one. The best selection is tracked
-again, and the best different one: on ten simulated recordings, most before three cameras, IDF1 is
+again, and the best different one: on ten simulated recordings, most with three cameras, IDF1 is
 95.0 (92.8 without; 95.2 with two others, at twice the time)."""
 _PLAIN = 0.25
 """Minimum evidence per second, over any window of `SEARCH_S`, of a person for whom no alternatives
@@ -50,7 +50,7 @@ class Hypotheses:
 
     carried: NDArray[np.intp]
     """(H,) index of the person of the previous frame that each track continues; -1 for none."""
-    world: NDArray[np.intp]
+    global_hypothesis: NDArray[np.intp]
     """(H,) global hypothesis to which each track belongs."""
     there: NDArray[np.bool_]
     """(H, T) frames in which each track hypothesis is tracked."""
@@ -84,9 +84,9 @@ class Hypotheses:
         """Concatenate hypotheses; their global hypotheses are renumbered and stay separate."""
         names = ("carried", "there", "candidate", "places", "weight", "price")
         columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
-        first = np.cumsum([0, *(int(part.world.max(initial=-1)) + 1 for part in parts)])
-        columns["world"] = np.concatenate(
-            [part.world + n for part, n in zip(parts, first, strict=False)]
+        first = np.cumsum([0, *(int(part.global_hypothesis.max(initial=-1)) + 1 for part in parts)])
+        columns["global_hypothesis"] = np.concatenate(
+            [part.global_hypothesis + n for part, n in zip(parts, first, strict=False)]
         )
         return replace(
             parts[0], **columns, joints=JointStates.concatenate([part.joints for part in parts])
@@ -124,25 +124,25 @@ def explained(
         np.full((len(carried), len(tracker.skeleton), len(frames[0].rig)), -1),
     )
     on, everything = Seed(-1, carried, unseen, backwards=False), Rest.of(frames)
-    found = follow_worlds(tracker, everything, [on], keep)
+    found = follow_hypotheses(tracker, everything, [on], keep)
     plain = _plain(found, times)
     if plain.all():
-        return found, found.account.choose(found.world)
+        return found, found.account.choose(found.global_hypothesis)
     rest = Rest.of(frames, found.candidate[plain], found.places[plain])
     found = Hypotheses.concatenate(
-        [found, follow_worlds(tracker, rest, _seeds(tracker, rest.frames), keep)]
+        [found, follow_hypotheses(tracker, rest, _seeds(tracker, rest.frames), keep)]
     )
     before = 0.0
     for _ in range(_ROUNDS):
-        best, *others = found.account.ways(found.world, on_trial=True)
+        best, *others = found.account.ways(found.global_hypothesis, on_trial=True)
         if best.evidence_s.sum() <= before:
             break
         before = float(best.evidence_s.sum())
         unlike = (way for way in others if found.account.agreement(best, way) < _ALIKE)
         ways = (best, *islice(unlike, 1))
         again = [seed for way in ways for seed in _restarts(tracker, frames, times, found, way)]
-        found = Hypotheses.concatenate([found, follow_worlds(tracker, everything, again, keep)])
-    return found, found.account.choose(found.world)
+        found = Hypotheses.concatenate([found, follow_hypotheses(tracker, everything, again, keep)])
+    return found, found.account.choose(found.global_hypothesis)
 
 
 def _plain(found: Hypotheses, times: Array) -> NDArray[np.bool_]:
@@ -254,17 +254,17 @@ def _restarts(
     """
     T = len(frames)
     placed = np.isfinite(found.places[chosen.hypothesis]).all(axis=-1).any(axis=-1)
-    there = np.array([chosen.during(t) for t in range(T)]).T & placed
+    present = np.array([chosen.during(t) for t in range(T)]).T & placed
     share = found.weight[chosen.hypothesis].sum(axis=(2, 3))
-    worth = np.where(there, share, -0.5).sum(axis=0)
+    visibility = np.where(present, share, -0.5).sum(axis=0)
     parts = np.array_split(np.arange(T), min(T, max(1, round((times[-1] - times[0]) / _RESTART_S))))
     seeds = []
     for part in parts:
-        key = int(part[worth[part].argmax()])
-        who = chosen.hypothesis[there[:, key]]
-        if len(who) > 0:
-            own = found.candidate[who, key].astype(np.intp)
-            seeds.append(_seed(tracker, frames, key, found.places[who, key], own))
+        key = int(part[visibility[part].argmax()])
+        hypotheses = chosen.hypothesis[present[:, key]]
+        if len(hypotheses) > 0:
+            own = found.candidate[hypotheses, key].astype(np.intp)
+            seeds.append(_seed(tracker, frames, key, found.places[hypotheses, key], own))
     return seeds
 
 
@@ -272,16 +272,16 @@ Followed = tuple[int, Seed, NDArray[np.intp]]
 """A global hypothesis's number, its seed, and the numbers of the people in it."""
 
 
-def follow_worlds(tracker: Tracker, rest: Rest, seeds: Sequence[Seed], keep: int) -> Hypotheses:
+def follow_hypotheses(tracker: Tracker, rest: Rest, seeds: Sequence[Seed], keep: int) -> Hypotheses:
     """Track all `seeds` forwards and backwards through T frames, in parallel.
 
     People found on the forward pass are also tracked backwards.
     """
     log, frames = _Log(tracker, rest, keep), rest.frames
     given, born = list[Followed](), list[Followed]()
-    for world, seed in enumerate(seeds):
+    for hypothesis, seed in enumerate(seeds):
         carried = seed.tracks.ids if seed.frame < 0 else None
-        given.append((world, seed, log.more(len(seed.tracks), world, carried)))
+        given.append((hypothesis, seed, log.more(len(seed.tracks), hypothesis, carried)))
     for forwards in (True, False):
         part = [each for each in given if (each[1].forwards if forwards else each[1].backwards)]
         born = _follow(tracker, frames, part + born, log, forwards=forwards)
@@ -302,11 +302,11 @@ def _follow(
     tracks, births = tracker.nobody(), dict[int, int]()
     born = list[Followed]()
     begins = dict[int, list[tuple[Tracks, NDArray[np.intp]]]]()
-    for world, seed, numbers in seeds:
-        place = np.full(len(numbers), world, dtype=np.intp)
+    for hypothesis, seed, numbers in seeds:
+        place = np.full(len(numbers), hypothesis, dtype=np.intp)
         own = Tracks(seed.tracks.time_s, numbers, place, seed.tracks.joints, seed.tracks.evident_s)
         if seed.births:
-            births[world] = seed.frame
+            births[hypothesis] = seed.frame
         if seed.frame >= 0:
             begins.setdefault(seed.frame, []).append((own, seed.candidate))
         elif len(own) > 0:
@@ -321,54 +321,60 @@ def _follow(
             tracks, candidate = tracks.rows(alive), candidate[alive]
             log.add(t, tracks, candidate)
         tracks = replace(tracks, time_s=time_s)
-        for own, theirs in begins.get(t, []):
-            log.add(t, own, theirs)
+        for own, detections in begins.get(t, []):
+            log.add(t, own, detections)
             tracks, candidate = (
                 Tracks.concatenate([tracks, own]),
-                np.concatenate([candidate, theirs]),
+                np.concatenate([candidate, detections]),
             )
-        if abs(time_s - looked_s) < _TWINS_S:
+        if abs(time_s - looked_s) < _DUPLICATES_S:
             continue
         looked_s = time_s
-        gone, same = _twins(tracks, candidate)
-        if len(gone) > 0:
-            log.twins.append(
+        duplicates, same = _duplicates(tracks, candidate)
+        if len(duplicates) > 0:
+            log.duplicates.append(
                 (
                     slice(t + 1, None) if forwards else slice(0, t),
-                    tracks.ids[gone],
+                    tracks.ids[duplicates],
                     tracks.ids[same],
                 )
             )
             births = {
-                world: since for world, since in births.items() if world not in tracks.world[gone]
+                hypothesis: since
+                for hypothesis, since in births.items()
+                if hypothesis not in tracks.global_hypothesis[duplicates]
             }
-            rest = np.setdiff1d(np.arange(len(tracks)), gone)
+            rest = np.setdiff1d(np.arange(len(tracks)), duplicates)
             tracks, candidate = tracks.rows(rest), candidate[rest]
         if abs(time_s - sought_s) < SEARCH_S:
             continue
         sought_s = time_s
-        for world in [
-            world for world, since in births.items() if (since <= t if forwards else since >= t)
+        for hypothesis in [
+            hypothesis
+            for hypothesis, since in births.items()
+            if (since <= t if forwards else since >= t)
         ]:
-            here = tracks.world == world
-            places, theirs = _newcomers(tracker, tracks.rows(here), candidate[here], frame)
+            of_hypothesis = tracks.global_hypothesis == hypothesis
+            places, detections = _newcomers(
+                tracker, tracks.rows(of_hypothesis), candidate[of_hypothesis], frame
+            )
             if len(places) > 0:
                 new = tracker.at(
                     places,
-                    log.more(len(places), world),
-                    np.full(len(places), world, dtype=np.intp),
+                    log.more(len(places), hypothesis),
+                    np.full(len(places), hypothesis, dtype=np.intp),
                     time_s,
                 )
-                log.add(t, new, theirs)
-                born.append((world, Seed(t, new, theirs, births=False), new.ids))
+                log.add(t, new, detections)
+                born.append((hypothesis, Seed(t, new, detections, births=False), new.ids))
                 tracks, candidate = (
                     Tracks.concatenate([tracks, new]),
-                    np.concatenate([candidate, theirs]),
+                    np.concatenate([candidate, detections]),
                 )
     return born
 
 
-def _twins(
+def _duplicates(
     tracks: Tracks, candidate: NDArray[np.intp]
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Rows of `tracks` (A) of duplicate global hypotheses, and the rows of the same people in the
@@ -377,17 +383,19 @@ def _twins(
     Duplicate global hypotheses have the same detections (A, J, V) and the same positions of placed
     joints.
     """
-    gone, same = np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp)
+    duplicates, same = np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp)
     known, kept = tracks.joints.sigma_m < LOST_M, dict[tuple[bytes, ...], NDArray[np.intp]]()
-    for world in np.unique(tracks.world).tolist():
-        who = np.flatnonzero(tracks.world == world)
-        names = [candidate[row].tobytes() for row in who.tolist()]
-        who = who[sorted(range(len(names)), key=names.__getitem__)]
-        other = kept.setdefault(tuple(sorted(names)), who)
-        apart = np.linalg.norm(tracks.joints.position[who] - tracks.joints.position[other], axis=-1)
-        if other is not who and (apart[known[who] & known[other]] < _SAME_M).all():
-            gone, same = np.append(gone, who), np.append(same, other)
-    return gone, same
+    for hypothesis in np.unique(tracks.global_hypothesis).tolist():
+        rows = np.flatnonzero(tracks.global_hypothesis == hypothesis)
+        names = [candidate[row].tobytes() for row in rows.tolist()]
+        rows = rows[sorted(range(len(names)), key=names.__getitem__)]
+        other = kept.setdefault(tuple(sorted(names)), rows)
+        apart = np.linalg.norm(
+            tracks.joints.position[rows] - tracks.joints.position[other], axis=-1
+        )
+        if other is not rows and (apart[known[rows] & known[other]] < _SAME_M).all():
+            duplicates, same = np.append(duplicates, rows), np.append(same, other)
+    return duplicates, same
 
 
 class _Log:
@@ -396,19 +404,19 @@ class _Log:
     def __init__(self, tracker: Tracker, rest: Rest, keep: int) -> None:
         self.tracker, self.rest, self.frames, self.keep = tracker, rest, rest.whole, keep
         self.shape = (len(tracker.skeleton), len(rest.whole[0].rig))
-        self.carried, self.world = list[int](), list[int]()
+        self.carried, self.global_hypothesis = list[int](), list[int]()
         self.parts = list[tuple[int, NDArray[np.intp], NDArray[np.intp], Array, Array, Array]]()
         self.kept = list[tuple[NDArray[np.intp], JointStates]]()
-        self.twins = list[
+        self.duplicates = list[
             tuple[slice, NDArray[np.intp], NDArray[np.intp]]
         ]()  # frames, duplicates, kept
 
     def more(
-        self, count: int, world: int, carried: NDArray[np.intp] | None = None
+        self, count: int, hypothesis: int, carried: NDArray[np.intp] | None = None
     ) -> NDArray[np.intp]:
         """Numbers for `count` new people of a global hypothesis."""
         first = len(self.carried)
-        self.world += [world] * count
+        self.global_hypothesis += [hypothesis] * count
         self.carried += [-1] * count if carried is None else carried.tolist()
         return np.arange(first, first + count)
 
@@ -420,15 +428,17 @@ class _Log:
         candidate = self.rest.index[t][candidate]
         places = np.where((joints.sigma_m < LOST_M)[..., None], joints.position, np.nan)
         arrays = FrameArrays.of(frame.detections, frame.rig, self.tracker.skeleton)
-        # The people who are tracked already occlude those of every world.
+        # The people who are tracked already occlude those of every hypothesis.
         others = self.rest.places[:, t]
-        worlds = np.unique(tracks.world) if len(others) > 0 else tracks.world[:0]
+        hypotheses = (
+            np.unique(tracks.global_hypothesis) if len(others) > 0 else tracks.global_hypothesis[:0]
+        )
         weight, price = weighed(
-            np.concatenate([candidate, np.full((len(worlds) * len(others), *self.shape), -1)]),
-            np.concatenate([places, *[others] * len(worlds)]),
+            np.concatenate([candidate, np.full((len(hypotheses) * len(others), *self.shape), -1)]),
+            np.concatenate([places, *[others] * len(hypotheses)]),
             arrays,
             self.tracker.skeleton,
-            np.concatenate([tracks.world, worlds.repeat(len(others))]),
+            np.concatenate([tracks.global_hypothesis, hypotheses.repeat(len(others))]),
         )
         self.parts.append((t, tracks.ids, candidate, places, weight[:A], price[:A]))
         if t == self.keep:
@@ -437,28 +447,39 @@ class _Log:
     def hypotheses(self) -> Hypotheses:
         """All recorded tracks, as hypotheses."""
         H, T, (J, V) = len(self.carried), len(self.frames), self.shape
-        there = np.zeros((H, T), dtype=bool)
+        present = np.zeros((H, T), dtype=bool)
         candidate, price = (
             np.full((H, T, J, V), -1, dtype=np.int32),
             np.zeros((H, T), dtype=np.float32),
         )
         places, weight = np.full((H, T, J, 3), np.nan), np.zeros((H, T, J, V), dtype=np.float32)
         for t, ids, own, at, counts, costs in self.parts:
-            there[ids, t], candidate[ids, t], places[ids, t] = True, own, at
+            present[ids, t], candidate[ids, t], places[ids, t] = True, own, at
             weight[ids, t], price[ids, t] = counts, costs
         size = 3 * self.tracker.scale.motion.order
         mean, covariance = np.zeros((H, J, size)), np.zeros((H, J, size, size))
         for ids, joints in self.kept:
             mean[ids], covariance[ids] = joints.mean, joints.covariance
-        for span, ids, others in reversed(self.twins):
-            for each in (there, candidate, price, places, weight):
+        for span, ids, others in reversed(self.duplicates):
+            for each in (present, candidate, price, places, weight):
                 each[ids, span] = each[others, span]
             if self.keep in range(T)[span]:
                 mean[ids], covariance[ids] = mean[others], covariance[others]
-        carried, world = (np.array(each, dtype=np.intp) for each in (self.carried, self.world))
+        carried, global_hypothesis = (
+            np.array(each, dtype=np.intp) for each in (self.carried, self.global_hypothesis)
+        )
         joints = JointStates(mean, covariance)
         counts = np.array([len(frame.detections) for frame in self.frames], dtype=np.intp)
         lasts_s = lasting(times_of(self.frames))
         return Hypotheses(
-            carried, world, there, candidate, places, weight, price, joints, counts, lasts_s
+            carried,
+            global_hypothesis,
+            present,
+            candidate,
+            places,
+            weight,
+            price,
+            joints,
+            counts,
+            lasts_s,
         )

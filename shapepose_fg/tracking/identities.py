@@ -51,12 +51,12 @@ Decided = tuple[Input, Observations]
 
 @dataclass(frozen=True)
 class FollowState:
-    """State carried from frame to frame: people of the last decided frame, and the undecided
+    """State carried from frame to frame: people of the last decided keyframe, and the undecided
     frames.
     """
 
     people: Tracks
-    """People of the last decided frame; their numbers are identities."""
+    """People of the last decided keyframe; their numbers are identities."""
     next_id: int = 0
     """The identity of the next new person."""
     pending: tuple[Input, ...] = field(default=())
@@ -113,13 +113,16 @@ def _decide(tracker: Tracker, state: FollowState, own: int) -> tuple[FollowState
     ]
     last = chosen.during(own - 1) & (identity >= 0)
     who = chosen.hypothesis[last]
-    people = people_at(frames[own - 1], identity[last], found.joints.rows(who))
+    time_s = float(frames[own - 1].time_s.mean())
+    people = people_at(time_s, identity[last], found.joints.rows(who))
     return FollowState(people, next_id, state.pending[until:]), decided
 
 
-def people_at(frame: Input, ids: Index, joints: JointStates) -> Tracks:
-    """Tracks of the people `ids` (A,) of a decided frame, with the states of their joints."""
-    time_s, zero = float(frame.time_s.mean()), np.zeros(len(ids), dtype=np.intp)
+def people_at(time_s: float, ids: Index, joints: JointStates) -> Tracks:
+    """Tracks of the people `ids` (A,) of the last decided keyframe, at `time_s`, with the states of
+    their joints.
+    """
+    zero = np.zeros(len(ids), dtype=np.intp)
     return Tracks(time_s, ids, zero, joints, np.full(len(ids), time_s))
 
 
@@ -138,7 +141,7 @@ def _with_detections(
     return replace(chosen, start=start, stop=stop)
 
 
-def alone(tracker: Tracker, given: Input, next_id: int) -> Decided:
+def isolated_frame(tracker: Tracker, given: Input, next_id: int) -> Decided:
     """Process an isolated frame: people found by stage I, numbered from `next_id` on."""
     nobody, none = (
         tracker.nobody(),
@@ -146,8 +149,8 @@ def alone(tracker: Tracker, given: Input, next_id: int) -> Decided:
     )
     for _ in range(_ROUNDS):
         places, candidate = tracker.newcomers(nobody, none, given.detections, given.rig)
-        there = np.arange(len(places))
-        found = tracker.at(places, there, 0 * there, float(given.time_s.mean()))
+        index = np.arange(len(places))
+        found = tracker.at(places, index, 0 * index, float(given.time_s.mean()))
         before, given = given, correct_swaps_now(tracker, found, given, followed=False)[1]
         if given is before:
             break
@@ -158,11 +161,11 @@ def _rows(
     given: Input, t: int, found: Hypotheses, chosen: SelectedTracks, identity: Index
 ) -> Observations:
     """The people of a frame as observations; uncertain joints are NaN."""
-    here = np.flatnonzero(chosen.during(t) & (identity >= 0))
-    who = chosen.hypothesis[here]
-    own = found.candidate[who, t].astype(np.intp)
-    evidence = own_evidence(own, found.weight[who, t], found.price[who, t])
-    return observed(given, own, found.places[who, t], identity[here], evidence)
+    index = np.flatnonzero(chosen.during(t) & (identity >= 0))
+    hypothesis = chosen.hypothesis[index]
+    own = found.candidate[hypothesis, t].astype(np.intp)
+    evidence = own_evidence(own, found.weight[hypothesis, t], found.price[hypothesis, t])
+    return observed(given, own, found.places[hypothesis, t], identity[index], evidence)
 
 
 def observed(
@@ -175,8 +178,8 @@ def observed(
         np.full(len(track), given.frame),
         np.repeat(given.time_s[None], len(track), axis=0),
     )
-    told = {"track": track, "frame": frame, "time_s": time_s, "evidence": evidence}
-    return Observations.of(candidate, given.detections, places, **told)
+    columns = {"track": track, "frame": frame, "time_s": time_s, "evidence": evidence}
+    return Observations.of(candidate, given.detections, places, **columns)
 
 
 def _identities(

@@ -16,7 +16,7 @@ from shapepose_fg.estimation.in_time import KNOWN_M
 from shapepose_fg.estimation.kernels import add_detection
 from shapepose_fg.proposal.nearby import FrameArrays
 from shapepose_fg.tracking.motion_filter import Bones, JointStates, sigma
-from shapepose_fg.tracking.plausibility import tear
+from shapepose_fg.tracking.plausibility import find_implausible
 from shapepose_fg.tracking.view_assignment import FARTHEST_M
 
 _ITERATIONS = 3
@@ -91,7 +91,7 @@ def _measure(mean, covariance, lost, candidate, confident, arrays, trust, bones,
     )
     at, uv, inlier = np.empty(3), np.empty((views, 2)), np.empty((joints, views), dtype=np.bool_)
     L, g, M, gain = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), np.empty((3, mean.shape[2], 3))
-    trusted, torn = np.empty(joints, dtype=np.bool_), np.empty(joints, dtype=np.bool_)
+    trusted, implausible = np.empty(joints, dtype=np.bool_), np.empty(joints, dtype=np.bool_)
     seen_by, above = np.empty(joints, dtype=np.intp), np.empty(joints, dtype=np.intp)
     way_m, count, too_long = np.empty(joints), np.empty(joints), np.empty(joints)
     cameras, focal, xy, core, scatter = (
@@ -144,7 +144,7 @@ def _measure(mean, covariance, lost, candidate, confident, arrays, trust, bones,
                     _move(mean[a, j], covariance[a, j], at, L, g, M, gain)
                 _update(mean[a, j], covariance[a, j], L, M, gain)
             trusted[j], seen_by[j] = sigma(covariance[a, j]) < KNOWN_M, inlier[j].sum()
-        tear(
+        find_implausible(
             mean[a],
             trusted,
             seen_by,
@@ -155,14 +155,14 @@ def _measure(mean, covariance, lost, candidate, confident, arrays, trust, bones,
             way_m,
             count,
             too_long,
-            torn,
+            implausible,
         )
         twice, most = 0, 0
         for j in range(joints):
             for v in range(views):
-                if torn[j] or not inlier[j, v]:
+                if implausible[j] or not inlier[j, v]:
                     candidate[a, j, v] = -1
-            if torn[j]:
+            if implausible[j]:
                 for x in range(3):
                     covariance[a, j, x, x] += FARTHEST_M**2
             elif core[j] and seen_by[j] >= 2:

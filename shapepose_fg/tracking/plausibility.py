@@ -8,8 +8,11 @@ from shapepose_fg.core.compiled import part
 
 
 @part
-def tear(places, trusted, views, longest_m, parents, reach_m, above, way_m, count, too_long, torn):
-    """Fill in `torn` (J,): joints to remove so that no bone of the person exceeds `longest_m` (J,).
+def find_implausible(
+    places, trusted, views, longest_m, parents, reach_m, above, way_m, count, too_long, implausible
+):
+    """Fill in `implausible` (J,): joints to remove so that no bone of the person is longer than
+    `longest_m` (J,).
 
     `places` (J, S) begin with positions; only `trusted` (J,) joints are checked. Of a bone that is
     too long, the end with the larger share of too long bones is removed; on a tie, the one seen by
@@ -22,12 +25,12 @@ def tear(places, trusted, views, longest_m, parents, reach_m, above, way_m, coun
     farther than the bones allow; a smaller excess is left to the body fit.
     """
     joints, worst = len(trusted), 0
-    torn[:] = False
+    implausible[:] = False
     while worst >= 0:
-        _judged_above(trusted, torn, longest_m, parents, above, way_m, count, too_long)
+        _judged_above(trusted, implausible, longest_m, parents, above, way_m, count, too_long)
         for j in range(joints):
             i = above[j]
-            if i == j or not trusted[j] or torn[j]:
+            if i == j or not trusted[j] or implausible[j]:
                 continue
             bone, squared = i == parents[j], 0.0
             for x in range(3):
@@ -46,11 +49,11 @@ def tear(places, trusted, views, longest_m, parents, reach_m, above, way_m, coun
             if too_long[j] > 0 and share > most:
                 worst, most = j, share
         if worst >= 0:
-            torn[worst] = True
+            implausible[worst] = True
 
 
 @part
-def _judged_above(trusted, torn, longest_m, parents, above, way_m, count, too_long):
+def _judged_above(trusted, implausible, longest_m, parents, above, way_m, count, too_long):
     """For each joint, the nearest checked joint `above` it (J,), and the longest possible distance
     to it, m (J,).
 
@@ -59,11 +62,11 @@ def _judged_above(trusted, torn, longest_m, parents, above, way_m, count, too_lo
     first, top_m = -1, 0.0
     for j in range(len(parents)):
         above[j], way_m[j], count[j], too_long[j] = j, 0.0, 0.0, 0.0
-        while above[j] >= 0 and (above[j] == j or not trusted[above[j]] or torn[above[j]]):
+        while above[j] >= 0 and (above[j] == j or not trusted[above[j]] or implausible[above[j]]):
             if parents[above[j]] >= 0:
                 way_m[j] += longest_m[above[j]]
             above[j] = parents[above[j]]
-        if above[j] < 0 and first < 0 and trusted[j] and not torn[j]:
+        if above[j] < 0 and first < 0 and trusted[j] and not implausible[j]:
             first, top_m = j, way_m[j]
     for j in range(len(parents)):
         if above[j] < 0:

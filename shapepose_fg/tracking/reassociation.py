@@ -43,18 +43,18 @@ def reassociate(
         index = np.flatnonzero(rows.frame == frame.frame)
         if least is not None:
             index = index[np.isfinite(sigma_m[index]).any(axis=1)]
-        candidate, probability = _given_out(frame, joints[index], sigma_m[index], skeleton)
+        candidate, probability = _reassigned(frame, joints[index], sigma_m[index], skeleton)
         evidence = rows.evidence[index]
         while least is not None and len(index) > 0:
             evidence = probabilities_of(frame, candidate, joints[index], skeleton)
-            gone = who_goes(evidence, joints[index], skeleton, least)
-            if not gone.any():
+            removed = people_to_remove(evidence, joints[index], skeleton, least)
+            if not removed.any():
                 break
-            index, evidence = index[~gone], evidence[~gone]
-            candidate, probability = _given_out(frame, joints[index], sigma_m[index], skeleton)
-        who = {name: getattr(rows, name)[index] for name in ("track", "frame", "time_s")}
+            index, evidence = index[~removed], evidence[~removed]
+            candidate, probability = _reassigned(frame, joints[index], sigma_m[index], skeleton)
+        columns = {name: getattr(rows, name)[index] for name in ("track", "frame", "time_s")}
         sure = {"probability": probability, "evidence": evidence}
-        parts.append(Observations.of(candidate, frame.detections, joints[index], **who, **sure))
+        parts.append(Observations.of(candidate, frame.detections, joints[index], **columns, **sure))
     return Observations.concatenate(parts)
 
 
@@ -65,7 +65,7 @@ def changed(before: Observations, now: Observations) -> Mask:
     return np.asarray((before.candidate != now.candidate) & (before.seen | now.seen))
 
 
-def _given_out(
+def _reassigned(
     frame: Input, joints: Array, sigma_m: Array, skeleton: Skeleton
 ) -> tuple[Index, Array]:
     """(P, J, V) detections assigned to the people of one frame, and their probabilities."""
@@ -75,13 +75,15 @@ def _given_out(
 
 def probabilities_of(frame: Input, candidate: Index, joints: Array, skeleton: Skeleton) -> Array:
     """(P,) existence probability of each person of a frame."""
-    there = Frame(frame.detections, frame.rig, skeleton, longest_bones(skeleton))
+    of_frame = Frame(frame.detections, frame.rig, skeleton, longest_bones(skeleton))
     return existence(
-        PossiblePeople(joints, candidate, gaps(joints, candidate, there)), there, PRIOR_WITH_BODY
+        PossiblePeople(joints, candidate, gaps(joints, candidate, of_frame)),
+        of_frame,
+        PRIOR_WITH_BODY,
     )
 
 
-def who_goes(
+def people_to_remove(
     sure: Array, joints: Array, skeleton: Skeleton, least: float, double_m: float = SAME_M
 ) -> Mask:
     """(P,) whether to remove: the least probable person below `least`, and the less probable of

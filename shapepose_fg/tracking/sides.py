@@ -36,7 +36,7 @@ _FITS = 3.0
 _EXCHANGED = 0.02
 """Probability that a view swaps the sides of a person or a part; on Shelf, 22 of 1,573 times."""
 _SURE = 6.0
-"""Minimum log-odds for correcting a swap. The mean error of three crowds before three cameras is 43
+"""Minimum log-odds for correcting a swap. The mean error of three crowds with three cameras is 43
 mm with 6, 54 mm with 0, and 40 mm without any swaps in the data. A memory of each view's earlier
 swaps makes it worse."""
 _AGREES = 0.99
@@ -95,8 +95,8 @@ class _Compared:
         fits = apart_of[number, best] < _FITS
         log = _prior(len(states)) + (same - turned)[number, 1:, best] @ states.T / 2
         log -= np.logaddexp.reduce(log, axis=1, keepdims=True)
-        who, log = np.where(fits, ids[best], -1), np.where(fits[:, None], log, 0.0)
-        return cls(groups, who, log)
+        person, log = np.where(fits, ids[best], -1), np.where(fits[:, None], log, 0.0)
+        return cls(groups, person, log)
 
     def exchanged(self, skeleton: Skeleton) -> Mask:
         """(G, K) parts most probably swapped that may be corrected: another view is right, or all
@@ -127,12 +127,12 @@ class _Compared:
             found.mirrored.copy(),
             np.zeros(part.max()),
         )
-        for group, who, exchanged in zip(
+        for group, person, exchanged in zip(
             self.groups, self.who.tolist(), self.exchanged(skeleton), strict=True
         ):
-            if who >= 0 and (who in own or exchanged.any()):
-                of, (turned, doubt) = part[found.joint[group]], own.get(who, (right, right))
-                if who in own:
+            if person >= 0 and (person in own or exchanged.any()):
+                of, (turned, doubt) = part[found.joint[group]], own.get(person, (right, right))
+                if person in own:
                     mirrored[group] = np.append(0.0, doubt)[of]
                 change = exchanged != turned
                 if change.any() and not _doubtful(doubt, skeleton):
@@ -283,7 +283,7 @@ def _doubtful(doubt: Array, skeleton: Skeleton) -> bool:
     wrong.
 
     Joints in the middle count with the last part; counting them as certain is worse in a crowd
-    before three cameras. Such a person may mix views, or people, that contradict each other, and is
+    with three cameras. Such a person may mix views, or people, that contradict each other, and is
     not corrected.
     """
     return bool(np.median(doubt[paired_parts(skeleton) - 1]) > DOUBTED)

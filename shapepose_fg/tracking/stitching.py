@@ -155,9 +155,13 @@ def _pairs(
     before, after, apart_m, reach_m = before[may], after[may], apart_m[may], reach_m[may]
     unlike = _unlike(ends.bones[before], ends.bones[after])
     unlike = np.where(np.isnan(unlike) & (gap_s[may] <= _BRIEF_S), 1.0, unlike)  # the expectation
-    alike = unlike <= _BUILD  # false where unknown
-    unlike = ends.bones.shape[1] * unlike[alike]
-    return before[alike], after[alike], _costs(apart_m[alike], reach_m[alike], unlike)
+    same_build = unlike <= _BUILD  # false where unknown
+    unlike = ends.bones.shape[1] * unlike[same_build]
+    return (
+        before[same_build],
+        after[same_build],
+        _costs(apart_m[same_build], reach_m[same_build], unlike),
+    )
 
 
 def _unlike(bones: Array, others: Array) -> Array:
@@ -196,8 +200,8 @@ def _matched(before: Index, after: Index, cost: Array) -> dict[int, int]:
 
     count, nobody = len(rows), len(columns) + np.arange(len(rows))  # or no successor
     # One more pair outweighs all savings of others. A cost of 0 would mean no edge.
-    alone = 2.0 + count * float(cost.max(initial=0.0))
-    costs = np.concatenate([1.0 + cost, np.full(count, alone)])
+    unjoined = 2.0 + count * float(cost.max(initial=0.0))
+    costs = np.concatenate([1.0 + cost, np.full(count, unjoined)])
     places = np.concatenate([row, np.arange(count)]), np.concatenate([column, nobody])
     matrix = csr_array((costs, places), shape=(count, len(columns) + count))
     first, second = min_weight_full_bipartite_matching(matrix)

@@ -23,7 +23,7 @@ joint."""
 _PRICE_HIDDEN = 0.05
 """Cost where the joint is occluded by another person, or its position unknown. With these costs a
 person is accepted if a quarter of the unoccluded joints have detections of their own. In simulated
-crowds of eight before three cameras (seeds 6101, 6104), 76 % of unoccluded joints have a detection,
+crowds of eight with three cameras (seeds 6101, 6104), 76 % of unoccluded joints have a detection,
 and 20 % of those behind a limb."""
 _LIMB_M = 0.12
 """Distance from a limb or spine of another person, m, within which a joint's ray is occluded."""
@@ -35,7 +35,7 @@ detected neighbours on the skeleton it is `LEAST_AFFINITY`."""
 APPEARS_S = 0.125
 """Cost of a track birth or death within the observed time, s of evidence; as much as 0.3 s of
 missed detections in plain view. People rarely appear or disappear in the middle of the scene."""
-_WORLDS = 8
+_MOST_HYPOTHESES = 8
 """Maximum number of global hypotheses given priority in turn, the most promising ones."""
 LEAST_S = 0.1
 """Minimum evidence of a person, in seconds during which all views see the whole person; less in
@@ -45,7 +45,7 @@ _ON_TRIAL = 0.25
 the others they may gain evidence."""
 _SCALE, _PRIOR = 13.7, -0.6
 """Scale and offset of the log-odds of a person's existence by evidence: logistic fit to 482 people,
-11 of them false positives or duplicates, in simulated crowds, crossings and pairs before two to
+11 of them false positives or duplicates, in simulated crowds, crossings and pairs with two to
 four cameras. A track's duration adds nothing. On 364 others, predicted probabilities 0.74 / 0.87 /
 0.96 / 0.996 were correct for 8 of 11, 19 of 20, 70 of 70 and 263 of 263."""
 _EVEN = -_PRIOR / _SCALE
@@ -75,29 +75,45 @@ class SelectedTracks(Rows):
 
 
 def weighed(
-    candidate: Index, places: Array, arrays: FrameArrays, skeleton: Skeleton, world: Index
+    candidate: Index,
+    places: Array,
+    arrays: FrameArrays,
+    skeleton: Skeleton,
+    hypothesis: Index,
 ) -> tuple[Array, Array]:
     """Weight of each detection of A people (A, J, V), and price of their presence (A,), as shares
     of expected detections.
 
     `candidate` (A, J, V) are detections of one frame, -1 for none, `places` (A, J, 3) the joints,
-    metres, NaN where unknown; people of the same `world` (A,) occlude each other. A detection is
-    weighted by its affinity to the same person's others, and pays the cost of its place. A
-    detection is expected for each joint within a view's image; a joint of unknown position is
-    assumed at the mean of the others.
+    metres, NaN where unknown; people of the same global `hypothesis` (A,) occlude each other. A
+    detection is weighted by its affinity to the same person's others, and pays the cost of its
+    place. A detection is expected for each joint within a view's image; a joint of unknown position
+    is assumed at the mean of the others.
     """
     (A, J), known = candidate.shape[:2], np.asarray(np.isfinite(places).all(axis=-1))
     weight, price, limbs = np.zeros(candidate.shape), np.zeros(A), limbs_of(skeleton)
     lists, tied = np.empty((3, candidate.size), dtype=np.intp), np.empty(candidate.size)
     room = np.empty((A, J, 3)), np.empty((3, A, J)), np.empty((A, 3)), np.zeros(A)
-    _weigh(candidate, places, known, world, arrays, limbs, lists, tied, *room, weight, price)
+    _weigh(
+        candidate,
+        places,
+        known,
+        hypothesis,
+        arrays,
+        limbs,
+        lists,
+        tied,
+        *room,
+        weight,
+        price,
+    )
     return weight, price
 
 
 @kernel("i3 f3 b2 i1", FrameArrays, "i2 i2 f1 f3 f3 f2 f1 f3 f1")
 def _weigh(
-    candidate, places, known, world, arrays, limbs, lists, tied, at, seen, box, expected, weight,
-    price
+    candidate, places, known, hypothesis, arrays, limbs, lists, tied, at, seen, box, expected,
+    weight, price
 ):  # fmt: skip
     """Fill in the results of `weighed`, zero before; `expected` (A,) counts the expected
     detections.
@@ -107,18 +123,18 @@ def _weigh(
     others.
     """
     people, joints, views = weight.shape
-    cameras, count, whose, which, neighbours = arrays.cameras, 0, lists[0], lists[1], lists[2]
+    cameras, count, owners, used, neighbours = arrays.cameras, 0, lists[0], lists[1], lists[2]
     for a in range(people):
         for j in range(joints):
             for v in range(views):
                 if candidate[a, j, v] >= 0:
-                    whose[count], which[count] = a, candidate[a, j, v]
+                    owners[count], used[count] = a, candidate[a, j, v]
                     count += 1
-    tie(whose[:count], which[:count], candidate, arrays, tied, neighbours)
+    tie(owners[:count], used[:count], candidate, arrays, tied, neighbours)
     of_joint, of_view = arrays.of_joint, arrays.of_view
     for n in range(count):
-        affinity, d = tied[n] if neighbours[n] > 0 else LEAST_AFFINITY, which[n]
-        weight[whose[n], of_joint[d], of_view[d]] = min(max(affinity / _SURE_AFFINITY, 0.0), 1.0)
+        affinity, d = tied[n] if neighbours[n] > 0 else LEAST_AFFINITY, used[n]
+        weight[owners[n], of_joint[d], of_view[d]] = min(max(affinity / _SURE_AFFINITY, 0.0), 1.0)
     for a in range(people):
         _fill(places[a], known[a], at[a])
     for v in range(views):
@@ -131,7 +147,9 @@ def _weigh(
                 if not (depth > 0 and 0 <= x < width and 0 <= y < height):
                     continue
                 place = a, x, y, depth - _IN_FRONT_M
-                hidden = not known[a, j] or _behind(place, known, world, limbs, seen, box, focal)
+                hidden = not known[a, j] or _behind(
+                    place, known, hypothesis, limbs, seen, box, focal
+                )
                 cost = _PRICE_HIDDEN if hidden else _PRICE
                 weight[a, j, v] *= 1 + cost
                 price[a] += cost
@@ -174,13 +192,17 @@ def _picture(places, known, camera, focal, a, seen, box):
 
 
 @part
-def _behind(place, known, world, limbs, seen, box, focal):
+def _behind(place, known, hypothesis, limbs, seen, box, focal):
     """Whether the `place` (person, x, y, depth) is occluded by a limb, both ends known, of another
     person of the same global hypothesis.
     """
     a, x, y, depth = place
-    for b in range(len(world)):
-        if a == b or world[a] != world[b] or not (box[b, 0] < x < box[b, 1] and box[b, 2] < depth):
+    for b in range(len(hypothesis)):
+        if (
+            a == b
+            or hypothesis[a] != hypothesis[b]
+            or not (box[b, 0] < x < box[b, 1] and box[b, 2] < depth)
+        ):
             continue
         for n in range(len(limbs)):
             one, two = limbs[n, 0], limbs[n, 1]
@@ -266,29 +288,31 @@ class EvidenceTable:
             least_s,
         )
 
-    def choose(self, world: Index) -> SelectedTracks:
+    def choose(self, hypothesis: Index) -> SelectedTracks:
         """The best selection of `ways`."""
-        return self.ways(world)[0]
+        return self.ways(hypothesis)[0]
 
-    def ways(self, world: Index, *, on_trial: bool = False) -> list[SelectedTracks]:
+    def ways(self, hypothesis: Index, *, on_trial: bool = False) -> list[SelectedTracks]:
         """Selections of hypotheses and their time spans, such that each detection is evidence of
         one person only; best first.
 
-        Hypotheses with the same `world` (H,) were tracked together; `on_trial` also accepts tracks
-        with slightly too little evidence. Selection is greedy: the best segment of the best
+        Tracks with the same global `hypothesis` (H,) were tracked together; `on_trial` also accepts
+        tracks with slightly too little evidence. Selection is greedy: the best segment of the best
         hypothesis comes first, and its detections are evidence of no other. Alternative selections
         give priority to the people of one global hypothesis: a hypothesis that switches from one
         person to another, always to the better visible one, beats either of the two, and leaves too
         little for the others.
         """
-        first, asked = np.zeros(len(world), dtype=bool), _ON_TRIAL if on_trial else 1.0
-        if len(world) == 0:
+        first, asked = np.zeros(len(hypothesis), dtype=bool), _ON_TRIAL if on_trial else 1.0
+        if len(hypothesis) == 0:
             return [self.in_turn(first)]
         segment, costs = np.zeros(3, dtype=np.intp), (asked * APPEARS_S, self.begins, self.ends)
-        best_s = np.array([_best_segment(gains, *costs, 0, segment) for gains in self.alone])
-        bound = np.bincount(world, np.maximum(best_s, 0.0))
-        tried = np.argsort(-bound, kind="stable")[:_WORLDS]
-        found = [self.in_turn(each, asked) for each in (first, *(world == each for each in tried))]
+        best_s = np.array([_best_segment(gains, *costs, 0, segment) for gains in self.unshared_s])
+        bound = np.bincount(hypothesis, np.maximum(best_s, 0.0))
+        tried = np.argsort(-bound, kind="stable")[:_MOST_HYPOTHESES]
+        found = [
+            self.in_turn(each, asked) for each in (first, *(hypothesis == each for each in tried))
+        ]
         return sorted(found, key=lambda each: -float(each.evidence_s.sum()))
 
     def agreement(self, one: SelectedTracks, other: SelectedTracks) -> float:
@@ -312,7 +336,7 @@ class EvidenceTable:
         return self.in_turn(np.zeros(len(self.there), dtype=bool), besides=chosen)
 
     @cached_property
-    def alone(self) -> Array:
+    def unshared_s(self) -> Array:
         """(H, T) evidence of each hypothesis, seconds, as if there were no other."""
         share = self.weight.sum(axis=2, dtype=np.float64)
         return np.where(self.there, (share - self.price) * self.lasts_s, -np.inf)
@@ -324,9 +348,12 @@ class EvidenceTable:
         """
         counts = np.bincount(self.place.ravel(), minlength=self.detections + 1)[:-1]
         begin = np.cumsum(np.concatenate([[0, 0], counts]))
-        who, what = np.empty(begin[-1], dtype=np.int32), np.empty(begin[-1], dtype=np.float32)
-        _holders(self.place, self.weight, begin, who, what)
-        return begin[:-1], who, what
+        hypotheses, weights = (
+            np.empty(begin[-1], dtype=np.int32),
+            np.empty(begin[-1], dtype=np.float32),
+        )
+        _holders(self.place, self.weight, begin, hypotheses, weights)
+        return begin[:-1], hypotheses, weights
 
     def in_turn(
         self, first: Mask, asked: float = 1.0, besides: SelectedTracks | None = None
@@ -341,7 +368,7 @@ class EvidenceTable:
         if besides is not None:
             before = np.column_stack([besides.hypothesis, besides.start, besides.stop])
         appears_s = asked * APPEARS_S if besides is None else 0.0
-        given = self.alone.copy(), self.place, *self.holders, self.lasts_s, first, before
+        given = self.unshared_s.copy(), self.place, *self.holders, self.lasts_s, first, before
         costs, (H, T) = (appears_s, self.begins, self.ends, asked * self.least_s), self.there.shape
         free, changed = np.ones(self.detections, dtype=bool), np.ones(H, dtype=bool)
         room = np.empty((H, 3), dtype=np.intp), np.empty(H)
@@ -352,7 +379,7 @@ class EvidenceTable:
 
 
 @kernel("w3 s3 i1 w1 s1")
-def _holders(place, weight, begin, who, what):
+def _holders(place, weight, begin, hypotheses, weights):
     """Fill in `EvidenceTable.holders` from indices and weights (H, T, K); `begin` (D + 2,) starts
     with two zeros.
     """
@@ -363,21 +390,21 @@ def _holders(place, weight, begin, who, what):
                 d = place[h, t, k]
                 if d + 2 < len(begin):
                     at = begin[d + 1]
-                    who[at], what[at] = h, weight[h, t, k]
+                    hypotheses[at], weights[at] = h, weight[h, t, k]
                     begin[d + 1] += 1
 
 
 @kernel("f2 w3 i1 w1 s1 f1 b1 i2 f0 i0 i0 f0 b1 b1 i2 f1 i2 f1")
 def _in_turn(
-    gains, place, begin, who, what, lasts, first, besides, appears, begins, ends, least, free,
-    changed, segment, value, chosen, evidence,
+    gains, place, begin, hypotheses, weights, lasts, first, besides, appears, begins, ends, least,
+    free, changed, segment, value, chosen, evidence,
 ):  # fmt: skip
     """Fill in hypothesis, start and stop, `chosen` (N, 3), and `evidence` (N,) of the tracks that
     `EvidenceTable.in_turn` selects; returns their number.
     """
     people, count = len(gains), 0
     for n in range(len(besides)):
-        _take(besides[n], gains, place, begin, who, what, lasts, free, changed)
+        _take(besides[n], gains, place, begin, hypotheses, weights, lasts, free, changed)
     while people > 0:
         before_all, best = False, -1
         for h in range(people):
@@ -393,13 +420,13 @@ def _in_turn(
         evidence[count] = value[best]
         for n in range(3):
             chosen[count, n] = segment[best, n]
-        _take(chosen[count], gains, place, begin, who, what, lasts, free, changed)
+        _take(chosen[count], gains, place, begin, hypotheses, weights, lasts, free, changed)
         count += 1
     return count
 
 
 @part
-def _take(chosen, gains, place, begin, who, what, lasts, free, changed):
+def _take(chosen, gains, place, begin, hypotheses, weights, lasts, free, changed):
     """Select a segment: its detections are no longer evidence of any other hypothesis."""
     person = chosen[0]
     changed[person] = True
@@ -410,8 +437,8 @@ def _take(chosen, gains, place, begin, who, what, lasts, free, changed):
             if d < len(free) and free[d]:
                 free[d] = False
                 for n in range(begin[d], begin[d + 1]):
-                    gains[who[n], t] -= what[n] * lasts[t]
-                    changed[who[n]] = True
+                    gains[hypotheses[n], t] -= weights[n] * lasts[t]
+                    changed[hypotheses[n]] = True
 
 
 @kernel("f1 f0 i0 i0 i0 i1")

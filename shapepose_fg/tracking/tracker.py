@@ -3,7 +3,7 @@
 The detections around a track's predicted joints are its observations, whether or not stage I would
 find the person in this frame. Several global hypotheses are tracked at once
 (`global_hypotheses.py`). Each is a set of tracks that share no detection, and is independent of the
-others; its number is `world` in the code.
+others.
 """
 
 from collections.abc import Callable, Sequence
@@ -38,7 +38,7 @@ SEARCH_S = 0.3
 """Interval between searches for new people in each global hypothesis, and between comparisons of a
 track with a body, s; half that between searches among all detections. In a global hypothesis that
 lacks a person, the others take that person's detections, so every global hypothesis is searched: in
-crowds before three cameras this finds two to six more people of a hundred."""
+crowds with three cameras this finds two to six more people of a hundred."""
 _APART_M = 0.25
 """Minimum mean distance of a new person's joints from any track's, m; nearer is the same person."""
 _BIRTH_SIGMA_M = 0.04
@@ -78,7 +78,7 @@ class Tracks(Rows):
     """Time of the last frame, s."""
     ids: Index
     """(A,) number of each track."""
-    world: Index
+    global_hypothesis: Index
     """(A,) global hypothesis of each track."""
     joints: JointStates
     """(A, J) states of the joints in the last frame."""
@@ -133,7 +133,9 @@ class Tracker:
         joints, lost = predicted(
             tracks.joints, step_s, self.scale.motion, self.scale.density, bones
         )
-        candidate = assign(Predicted(joints.position, joints.sigma_m, lost, tracks.world), arrays)
+        candidate = assign(
+            Predicted(joints.position, joints.sigma_m, lost, tracks.global_hypothesis), arrays
+        )
         certain = detections.confidence
         weight = np.where(certain > 0, self.observation.weight(certain), 0.0)
         joints, candidate, evident = measured(
@@ -163,7 +165,7 @@ class Tracker:
         """(A,) tracks with evidence within the last `patience_s`."""
         return np.abs(tracks.time_s - tracks.evident_s) <= self.config.patience_s
 
-    def at(self, places: Array, ids: Index, world: Index, time_s: float) -> Tracks:
+    def at(self, places: Array, ids: Index, global_hypothesis: Index, time_s: float) -> Tracks:
         """Tracks of people at `places` (P, J, 3), metres, at `time_s`; joints that are NaN are
         lost.
         """
@@ -174,7 +176,7 @@ class Tracker:
         joints = JointStates.at(
             np.where(known[..., None], places, centre), sigma, self.scale.motion.start
         )
-        return Tracks(time_s, ids, world, joints, np.full(len(places), time_s))
+        return Tracks(time_s, ids, global_hypothesis, joints, np.full(len(places), time_s))
 
     def newcomers(
         self, tracks: Tracks, candidate: Index, detections: Detections, rig: Rig
@@ -183,7 +185,7 @@ class Tracker:
         positions (P, J, 3), metres, NaN where unknown, and detections (P, J, V).
         """
         core, J = list(self.skeleton.core), len(self.skeleton)
-        there, found, theirs = (
+        places, found, detections_of = (
             tracks.joints.position,
             [np.zeros((0, J, 3))],
             [np.zeros((0, J, len(rig)), np.intp)],
@@ -198,13 +200,13 @@ class Tracker:
             people = find(detections.only(free), rig)
             own = np.where(people.candidate >= 0, np.append(rest, -1)[people.candidate], -1)
             twice = (own >= 0).sum(axis=2)[:, core] >= 2
-            apart = (mean_distance(people.initial, there) > _APART_M).all(axis=1)
+            apart = (mean_distance(people.initial, places) > _APART_M).all(axis=1)
             new = apart & (twice.sum(axis=1) >= self.config.min_new_joints)
             found.append(people.initial[new])
-            theirs.append(own[new])
-            there = np.concatenate([there, people.initial[new]])
+            detections_of.append(own[new])
+            places = np.concatenate([places, people.initial[new]])
             free[own[new][own[new] >= 0]] = False
-        return np.concatenate(found), np.concatenate(theirs)
+        return np.concatenate(found), np.concatenate(detections_of)
 
     def enough(self, detections: Detections, free: Mask) -> bool:
         """Whether the unassigned detections suffice for a person: enough core joints, each in two

@@ -52,7 +52,7 @@ class Predicted:
     lost: Mask
     """(A, J) lost joints, at the position of their neighbour; they are assigned by
     affinity only."""
-    world: Index | None = None
+    global_hypothesis: Index | None = None
     """(A,) global hypothesis of each person; people of different global hypotheses do not compete
     for detections."""
 
@@ -122,8 +122,15 @@ def probabilities(near: Scored, detections: int) -> Array:
 def _assigned(predicted: Predicted, arrays: FrameArrays) -> tuple[Index, Scored]:
     """The detections (A, J, V), and the scores of all near pairs."""
     (A, J), V = predicted.sigma_m.shape, len(arrays.cameras)
-    world = np.zeros(A, dtype=np.intp) if predicted.world is None else predicted.world
-    people, given = np.argsort(world, kind="stable"), np.ascontiguousarray(predicted.places)
+    hypothesis = (
+        np.zeros(A, dtype=np.intp)
+        if predicted.global_hypothesis is None
+        else predicted.global_hypothesis
+    )
+    people, given = (
+        np.argsort(hypothesis, kind="stable"),
+        np.ascontiguousarray(predicted.places),
+    )
     chosen, first = np.empty((2, A, J, V), dtype=np.intp), np.empty((2, J * V + 1), dtype=np.intp)
     count, near = 4 * A * J * V, None
     while near is None or count > len(near.person):
@@ -135,8 +142,8 @@ def _assigned(predicted: Predicted, arrays: FrameArrays) -> tuple[Index, Scored]
         near = Scored(first[0], whole[0], whole[1], real[0], real[1], flag[0])
         gates, taken = np.empty((2, A, J)), np.empty(len(arrays.of_view), np.intp)
         count = _assign(
-            given, predicted.sigma_m, predicted.lost, world, people, arrays, near, gates, first[1],
-            whole[2], taken, real[2:], flag[1], chosen,
+            given, predicted.sigma_m, predicted.lost, hypothesis, people, arrays, near, gates,
+            first[1], whole[2], taken, real[2:], flag[1], chosen,
         )  # fmt: skip
     begins, person, detection, distance_m, score, possible = near
     ends = distance_m[:count], score[:count], possible[:count]
@@ -145,8 +152,8 @@ def _assigned(predicted: Predicted, arrays: FrameArrays) -> tuple[Index, Scored]
 
 @kernel("f3 f2 b2 i1 i1", FrameArrays, Scored, "f3 i1 i1 i1 f2 b1 i4")
 def _assign(
-    places, sigma_m, lost, world, people, arrays, near, gates, first, queue, taken, reals, sought,
-    both
+    places, sigma_m, lost, hypothesis, people, arrays, near, gates, first, queue, taken, reals,
+    sought, both
 ):  # fmt: skip
     """Fill in `near` and the first of `both` (2, A, J, V), as far as the arrays reach; returns the
     number of near pairs.
@@ -182,7 +189,7 @@ def _assign(
                     trunk += before[a, k, v] >= 0 and not arrays.swings[k]
                 nearness[e] = 0.0 if trunk >= _TRUNK_JOINTS else -np.inf
         claim(
-            begins, person, detection, nearness, sought, LEAST_AFFINITY, before, world, arrays,
+            begins, person, detection, nearness, sought, LEAST_AFFINITY, before, hypothesis, arrays,
             tied, score, possible, key, queue, taken, chosen,
         )  # fmt: skip
         changed = False

@@ -10,7 +10,7 @@ import pytest
 
 from shapepose_fg.cameras import refine as refinement
 from shapepose_fg.cameras.bundle import Freedom, adjust, dilution, misfit
-from shapepose_fg.cameras.check.evidence import Look, gather
+from shapepose_fg.cameras.check.evidence import SetupHypothesis, gather
 from shapepose_fg.cameras.check.small_errors import SmallErrors
 from shapepose_fg.cameras.parameters import MOVE, TURN
 from shapepose_fg.cameras.people import Footage
@@ -117,9 +117,11 @@ def test_more_frames_of_the_same_biases_are_no_more_evidence(rig, recording, peo
     usual = np.array([*Freedom(1.0, 0.02).sigmas[:6], 0.0, 0.0, 0.02])
     few, many = (gather(seen, frames, 4) for frames in (range(60), range(250)))
     for evidence in (few, many):
-        assert SmallErrors.of(Look.given(evidence, rig)).off(usual) < 0.5
+        assert SmallErrors.of(SetupHypothesis.given(evidence, rig)).off(usual) < 0.5
     assert (
-        SmallErrors.of(Look.given(many, disturbed(rig, seed, degrees=3, metres=0.1))).off(usual)
+        SmallErrors.of(
+            SetupHypothesis.given(many, disturbed(rig, seed, degrees=3, metres=0.1))
+        ).off(usual)
         > 0.5
     )
 

@@ -54,7 +54,7 @@ class Stage:
 class FakeLeader:
     def __init__(self, stage: Stage, assignment: Assignment) -> None:
         self.stage, self.assignment, self.began = stage, assignment, 0.0
-        self.told, tell = Pipe(duplex=False)
+        self.messages, tell = Pipe(duplex=False)
         if assignment.name in stage.frameless:
             stage.frameless.remove(assignment.name)
         else:
@@ -65,7 +65,7 @@ class FakeLeader:
 
     def next(self):
         try:
-            return self.told.recv()
+            return self.messages.recv()
         except EOFError:
             return None
 

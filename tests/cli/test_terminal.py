@@ -11,7 +11,17 @@ from rich.table import Table
 from shapepose_fg.cameras.check.report import CameraUse, Distances
 from shapepose_fg.cli.main import main
 from shapepose_fg.cli.setup_table import use_table
-from shapepose_fg.cli.terminal import bars, note, progress, show, table, use_any_streams
+from shapepose_fg.cli.terminal import (
+    bars,
+    forget_notes,
+    note,
+    note_of_reading,
+    progress,
+    show,
+    show_written,
+    table,
+    use_any_streams,
+)
 
 
 @pytest.mark.parametrize("name", ["cam[left]", "a[/b]", ":cat:", "[red]"])
@@ -105,3 +115,27 @@ def test_names_and_keys_of_files_reach_no_terminal_as_they_are(tmp_path, capsys)
             main(words)
         said = "".join(capsys.readouterr())
         assert ended.value.code == 2 and "error" in said and not obeyed(said), words
+
+
+def test_output_to_a_file_has_no_blanks_at_the_ends_of_lines(capsys):
+    made = Table(show_header=False, box=None)
+    made.add_row("joints", "a b " * 60)
+    show(made)
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) > 2 and [line for line in lines if line != line.rstrip()] == []
+
+
+@pytest.mark.parametrize("columns", [30, 80])
+def test_a_path_is_never_broken(columns, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", str(columns))
+    paths = ["a folder/with a long name/" * 5 + "people.npz", "b/run.json  open it in a browser"]
+    show_written(paths)
+    assert capsys.readouterr().out == f"written  {paths[0]}\n         {paths[1]}\n"
+
+
+def test_notes_of_an_input_that_is_read_twice_are_printed_once(capsys):
+    for _ in range(2):
+        forget_notes()
+        note_of_reading("a", "b")
+        note_of_reading("b", "c")
+    assert capsys.readouterr().err.split("note: ")[1:] == ["a\n", "b\n", "c\n"] * 2

@@ -150,12 +150,14 @@ def test_runs_do_not_mix(rolled_rig, pictures, tmp_path, painted_network):
         run_detection(run_of(rolled_rig, pictures, tmp_path, painted_network), stop)
     with pytest.raises(
         InputError,
-        match="interrupted run with different detection; start it with the same options",
+        match=r"another detection.long_side \(\d+ then, 320 now\); start it with the same options",
     ):
         run_detection(run_of(rolled_rig, pictures, tmp_path, painted_network, long_side=320))
+    with pytest.raises(InputError, match="`detect` was interrupted and has not finished these"):
+        read_detections(tmp_path, rolled_rig)
     moved = tmp_path / "moved"
     shutil.copytree(pictures, moved)
-    with pytest.raises(InputError, match="there is an interrupted run with different cameras"):
+    with pytest.raises(InputError, match=r"the interrupted run had another cameras\.a\.path"):
         run_detection(run_of(rolled_rig, moved, tmp_path, painted_network))
     run_detection(run_of(rolled_rig, pictures, tmp_path, painted_network))
     with pytest.raises(InputError, match=r"a\.txt: there are detections already; delete them"):

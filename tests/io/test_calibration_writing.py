@@ -2,6 +2,7 @@
 changed.
 """
 
+import json
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -81,6 +82,19 @@ def test_every_format_is_written_as_it_came_in(tmp_path, name):
     form, there = write_like(source, changed(rig), target, how.get("unit"))
     assert there == target and form != "rig file"
     same(read_rig(target, **how), changed(rig))
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_file_named_json_is_json(tmp_path, name):
+    write, how, _ = WRITERS[name]
+    (tmp_path / "given").mkdir()
+    source = write(tmp_path / "given")
+    rig = read_rig(source, **how)
+    form, there = write_like(source, changed(rig), tmp_path / "new.json", how.get("unit"))
+    assert there == tmp_path / "new.json"
+    if source.suffix != ".json":
+        assert form == "rig file"
+    json.loads(there.read_text())
 
 
 def test_a_folder_s_format_goes_into_a_file_as_our_own(tmp_path):

@@ -283,7 +283,7 @@ def test_middles_are_said(tmp_path, rig):
     coco(tmp_path, people_of(COCO_17))
     assert read_detections(tmp_path, rig).notes[1:] == (
         (
-            "COCO_17 has no Neck and no MidHip: they are the midpoints of two joints, if both were "
+            "COCO_17 has no Neck and no MidHip: each is the midpoint of two joints, if both were "
             "detected"
         ),
     )

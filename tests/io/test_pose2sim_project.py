@@ -126,7 +126,7 @@ def test_the_rate_is_the_video_s_where_the_project_says_auto(project):
     (project / "pose" / "times.csv").write_text("time_s\n0\n0.1\n0.2\n0.3\n")
     found = read_pose2sim_project(project)
     assert found.fps is None
-    known = prepare(Request(project=project), None, tell=print)
+    known = prepare(Request(project=project), None, notify=print)
     assert known.request.fps is None and known.request.timestamps == project / "pose" / "times.csv"
 
 

@@ -356,12 +356,12 @@ def test_strangers_on_both_sides_of_a_border_stay_strangers():
 def test_identities_go_on_from_chunk_to_chunk():
     places = [[0, 0, 0], [9, 0, 0.0]]
     identities = Identities(5, border([3, 4], [7, 8], places))
-    names = identities.names(border([0, 1], [8, 6], places[::-1]), alone=False)
+    names = identities.names(border([0, 1], [8, 6], places[::-1]), isolated=False)
     assert [identities.name(track, names) for track in (0, 1)] == [4, 5]  # one goes on, one is new
     identities.remember(border([1, 0], [6, 8], places), names)
-    names = identities.names(border([0, 1], [6, 8], places), alone=False)
+    names = identities.names(border([0, 1], [6, 8], places), isolated=False)
     assert [identities.name(track, names) for track in (0, 1)] == [5, 4]
-    names = identities.names(border([0], [6], [[0, 0, 0.0]]), alone=True)
+    names = identities.names(border([0], [6], [[0, 0, 0.0]]), isolated=True)
     assert identities.name(0, names) == 6
 
 

@@ -4,6 +4,7 @@ fit.
 
 import hashlib
 import json
+import shlex
 import shutil
 from pathlib import Path
 
@@ -176,6 +177,18 @@ def test_a_result_of_other_joints_is_refused_in_a_sentence(folder):
         InputError, match="parts must have the same joint_names; copy the files of uncorrected back"
     ):
         take_back(folder)
+
+
+def test_the_command_to_undo_can_be_pasted(folder, tmp_path, capsys):
+    moved = folder.rename(tmp_path / "trial 3 (Jürgen's)")
+    assert run(moved, "split", 1, 4) == 0
+    (line,) = [each for each in capsys.readouterr().out.splitlines() if each.startswith("to undo")]
+    assert shlex.split(line.removeprefix("to undo it: ")) == [
+        "shapepose-fg",
+        "tracks",
+        str(moved),
+        "undo",
+    ]
 
 
 def test_tracks_on_the_command_line(folder, capsys):

@@ -14,7 +14,7 @@ from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.proposal.nearby import FrameArrays
 from shapepose_fg.tracking import view_assignment
-from shapepose_fg.tracking.plausibility import tear
+from shapepose_fg.tracking.plausibility import find_implausible
 from shapepose_fg.tracking.reassociation import LEAST_PROBABILITY, reassociate
 from shapepose_fg.tracking.view_assignment import Predicted, Scored, assign, assign_with_probability
 
@@ -24,7 +24,7 @@ WRIST, ELBOW = BODY_25.index("RWrist"), BODY_25.index("RElbow")
 @njit
 def _torn(places, trusted, views, longest, parents, reach, above, way, count, too_long, torn):
     for a in range(len(places)):
-        tear(
+        find_implausible(
             places[a],
             trusted[a],
             views[a],
@@ -40,7 +40,7 @@ def _torn(places, trusted, views, longest, parents, reach, above, way, count, to
 
 
 def torn_joints(places, trusted, views, longest_m, reach_m):
-    """(A, J) by `tear`."""
+    """(A, J) by `find_implausible`."""
     torn, parents = np.ones(trusted.shape, dtype=bool), np.array(BODY_25.parents)
     _torn(
         places,

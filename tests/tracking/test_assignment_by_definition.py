@@ -16,9 +16,9 @@ from shapepose_fg.proposal.nearby import FrameArrays
 from shapepose_fg.tracking import view_assignment
 from shapepose_fg.tracking.reassociation import (
     LEAST_PROBABILITY,
+    people_to_remove,
     probabilities_of,
     reassociate,
-    who_goes,
 )
 from shapepose_fg.tracking.view_assignment import Predicted, assign
 
@@ -203,7 +203,7 @@ def test_who_has_too_little_or_is_a_double_goes(three):
     frame, candidate, places = three
 
     def gone(candidate, places, *asked):
-        return who_goes(
+        return people_to_remove(
             probabilities_of(frame, candidate, places, BODY_25), places, BODY_25, *asked
         )
 

@@ -145,7 +145,11 @@ def test_new_joints_are_known_to_4_cm_and_unplaced_ones_are_lost(tracker, two_pe
         np.diagonal(new.joints.covariance[0], axis1=1, axis2=2)[:, 3:], 2.0**2
     )
     assert (new.joints.velocity[0] == 0).all()
-    assert (new.ids.tolist(), new.world.tolist(), new.evident_s.tolist()) == ([7], [3], [10.0])
+    assert (new.ids.tolist(), new.global_hypothesis.tolist(), new.evident_s.tolist()) == (
+        [7],
+        [3],
+        [10.0],
+    )
 
 
 @pytest.mark.parametrize("fps", [10, 30, 60])
@@ -194,7 +198,7 @@ def test_worlds_do_not_compete_for_detections(tracker, five_cameras, two_people,
     detections = seen_exactly(five_cameras, two_people[:1])
     places = np.stack([two_people[0], two_people[0] + [0.08, 0.0, 0.0]])
     _, apart = tracker.step(
-        tracks_at(places, world=np.array([0, 1])), detections, five_cameras, 10.03
+        tracks_at(places, global_hypothesis=np.array([0, 1])), detections, five_cameras, 10.03
     )
     assert (apart >= 0).all() and (apart[0] == apart[1]).all()
     _, together = tracker.step(tracks_at(places), detections, five_cameras, 10.03)

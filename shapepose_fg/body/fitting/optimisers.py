@@ -105,9 +105,9 @@ class NetworkDescent:
         body = energy.evaluate(free, targets, scale, held)
         for _ in range(self._polish_steps):
             before = robust_weight(body.squared, scale)
-            there = energy.retract(body.free, body.step)
-            slope = energy.linearise(there, targets, scale, held, slope_only=True)
-            body.move(slope.energy < body.energy, there, slope)  # false for NaN
+            moved = energy.retract(body.free, body.step)
+            slope = energy.linearise(moved, targets, scale, held, slope_only=True)
+            body.move(slope.energy < body.energy, moved, slope)  # false for NaN
             stale = np.flatnonzero(
                 np.abs(robust_weight(body.squared, scale) - before).max(axis=1) > STALE
             )
@@ -152,22 +152,24 @@ class LevenbergMarquardt:
         energy, rows = self._energy, np.arange(len(free))
         result, free, damping = free.copy(), free.copy(), np.full(len(free), _DAMPING_START)
         widening = np.where(warm, 0, ANNEAL_STEPS)
-        here = energy.linearise(
+        current = energy.linearise(
             free, targets, self._scale * 2.0**widening, held, nothing(len(free))
         )
         for _ in range(MAX_ITERATIONS):
             step, promised = np.empty(free.shape), np.empty(len(free))
-            solved(here.system.copy(), damping, step, promised)
-            promised += damping * (np.diagonal(here.system, axis1=1, axis2=2) * step**2).sum(axis=1)
+            solved(current.system.copy(), damping, step, promised)
+            promised += damping * (np.diagonal(current.system, axis1=1, axis2=2) * step**2).sum(
+                axis=1
+            )
             trial = energy.retract(free, step)
             scale, annealed = self._scale * 2.0**widening, widening == 0
-            there = energy.linearise(trial, targets, scale, held, nothing(len(trial)))
-            gain = here.energy - there.energy
+            tried = energy.linearise(trial, targets, scale, held, nothing(len(trial)))
+            gain = current.energy - tried.energy
             better = gain > 0  # false for NaN
             if not better.all():
-                for old, new in zip((free, *here), (trial, *there), strict=True):
+                for old, new in zip((free, *current), (trial, *tried), strict=True):
                     new[~better] = old[~better]
-            free, here = trial, there
+            free, current = trial, tried
             damping = _next_damping(damping, better, gain / promised)
             settled = np.where(better, gain, promised) < TOLERANCE
             going = ~(annealed & settled) & (damping < _DAMPING_MAX)
@@ -180,7 +182,7 @@ class LevenbergMarquardt:
                     held.rows(narrower),
                 )
                 narrowed = energy.linearise(free[narrower], *some, nothing(len(narrower)))
-                for old, new in zip(here, narrowed, strict=True):
+                for old, new in zip(current, narrowed, strict=True):
                     old[narrower] = new
             if going.all():
                 continue
@@ -191,8 +193,8 @@ class LevenbergMarquardt:
                 damping[going],
                 widening[going],
             )
-            here, targets, held = (
-                type(here)(*(each[going] for each in here)),
+            current, targets, held = (
+                type(current)(*(each[going] for each in current)),
                 targets.rows(going),
                 held.rows(going),
             )

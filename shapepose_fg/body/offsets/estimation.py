@@ -104,13 +104,13 @@ def _solved(
         part = rows[start : start + _CHUNK]
         centred = evidence.xyz[part] - evidence.centre[part, None]
         seen = EnergyTargets(centred, evidence.information[part])
-        here = _eliminate(
+        sums = _eliminate(
             energy, energy.parameters(fit.rows(part), evidence.centre[part]), seen, kernel_scale
         )
         hessian, gradient, prior = (
-            hessian + here[0],
-            gradient + here[1],
-            prior + here[2] / len(rows),
+            hessian + sums[0],
+            gradient + sums[1],
+            prior + sums[2] / len(rows),
         )
     count = (np.abs(evidence.information[rows]).max(axis=(-1, -2)) > 0).sum(axis=0)
     current = energy.model.keypoint_offsets.xyz_m.ravel()
@@ -143,12 +143,12 @@ def _eliminate(
     """
     (R, P), K = free.shape, len(BODY_25)
     linear = energy.linearise(free, targets, kernel_scale, energy.held_by_priors(R))
-    here, jacobian = linear.hessian, linear.jacobian
+    hessians, jacobian = linear.hessian, linear.jacobian
     information = robust_weight(linear.squared, kernel_scale)[..., None, None] * targets.information
     by_offset = energy.model.bone_rotations(energy.complete(free))[:, RIDES_ON]  # (R, 25, 3, 3)
     force = information @ (targets.xyz - linear.xyz)[..., None]
     weighed = information @ jacobian.reshape(R, K, 3, P)
-    prior_hessian = here - jacobian.swapaxes(1, 2) @ weighed.reshape(R, 3 * K, P)
+    prior_hessian = hessians - jacobian.swapaxes(1, 2) @ weighed.reshape(R, 3 * K, P)
     prior_gradient = linear.gradient + (jacobian.swapaxes(1, 2) @ force.reshape(R, -1, 1))[..., 0]
     crossed = (by_offset.swapaxes(-1, -2) @ weighed).reshape(R, 3 * K, P)
     both = np.concatenate(
@@ -156,7 +156,7 @@ def _eliminate(
     )  # (R, 75 + P, P): second derivatives with the body
     by_own = -(by_offset.swapaxes(-1, -2) @ force).reshape(R, -1)
     gradient = np.concatenate([by_own, -prior_gradient], axis=1)
-    system = np.concatenate([here, both, linear.gradient[:, None]], axis=1)
+    system = np.concatenate([hessians, both, linear.gradient[:, None]], axis=1)
     reduce_systems(system)
     half = system[:, P:].swapaxes(0, 1).reshape(76 + P, -1)  # all rows in one matrix
     hessian = -(half[:-1] @ half[:-1].T)

@@ -29,8 +29,8 @@ from shapepose_fg.cameras.calibrate.levelling import (
     CONTRADICTS,
     Measured,
     World,
-    at_once,
     levelled,
+    people_at_once,
     scale_of,
     sigma_of_scale,
 )
@@ -152,20 +152,20 @@ def calibrate(
     """
     measured = measured or Measured()
     views = len(rig)
-    told = Steps(progress, views * (views - 1) // 2 + _ROUGH + _ROUNDS + 2 * _HALF_ROUNDS)
+    steps = Steps(progress, views * (views - 1) // 2 + _ROUGH + _ROUNDS + 2 * _HALF_ROUNDS)
     footage = Footage.of(detections, rig, times, frames)
     lenses = [lens] * views if isinstance(lens, Freedom) else lens
     freedom = tuple(replace(each, turn_deg=20.0, move_m=1.0) for each in lenses)
     taken = np.unique(footage.sightings.frame)
     scale = partial(scale_of, skeleton=detections.skeleton, stature_m=measured.stature_m)
-    fit = partial(settle, given=rig, times=times, freedom=freedom, told=told, scale=scale)
+    fit = partial(settle, given=rig, times=times, freedom=freedom, advance=steps, scale=scale)
     if start is None:
-        pairs = _pairs(detections, rig, times, frames, told)
+        pairs = _pairs(detections, rig, times, frames, steps)
         if len(connected := parts(pairs, views)) > 1:
             raise Undetermined(tuple(_apart(rig, connected)))
         edges = {pair: _edge(each, scale) for pair, each in pairs.items()}
-        few = footage.at(taken[np.unique(np.linspace(0, len(taken) - 1, _FEW).astype(np.intp))])
-        start = fit(few, rig.at_poses(arranged(edges, views)), _ROUGH).rig
+        sample = footage.at(taken[np.unique(np.linspace(0, len(taken) - 1, _FEW).astype(np.intp))])
+        start = fit(sample, rig.at_poses(arranged(edges, views)), _ROUGH).rig
     adjusted = fit(footage, start, _ROUNDS)
     both = halves(footage, partial(fit, now=adjusted.rig, rounds=_HALF_ROUNDS))
     missed = np.concatenate([missed_px(people, rig).reshape(-1, views) for rig, people in both])
@@ -173,7 +173,7 @@ def calibrate(
         factor, sigma = measured.size_of(adjusted)
         adjusted = grown(adjusted, factor)
     else:
-        sigma = sigma_of_scale(at_once(adjusted.people), measured.stature_m is not None)
+        sigma = sigma_of_scale(people_at_once(adjusted.people), measured.stature_m is not None)
     new, world = levelled(adjusted.rig, adjusted.people, detections.skeleton, sigma)
     moved = new.cameras[0].wTc @ np.linalg.inv(adjusted.rig.cameras[0].wTc)
     people = replace(
@@ -196,7 +196,7 @@ def _pairs(
     rig: Rig,
     times: FrameTimes,
     frames: range,
-    told: Callable[[], None],
+    advance: Callable[[], None],
 ) -> dict[tuple[int, int], Relative]:
     """Relative poses of pairs of cameras with sufficient evidence."""
     taken = times.frame_s[frames.start : frames.stop]
@@ -208,7 +208,7 @@ def _pairs(
     found = dict[tuple[int, int], Relative]()
     for a, b in combinations(range(len(rig)), 2):
         each = relative(tracks[a], tracks[b], fps)
-        told()
+        advance()
         if each is not None and each.score >= _LEAST_SCORE and each.seconds >= _LEAST_S:
             found[a, b] = each
     return found
@@ -219,10 +219,10 @@ def own_tracks(sightings: Sightings, rig: Rig, fps: float) -> list[CameraTracks]
     few people.
     """
     seen_s = np.bincount(sightings.view, minlength=len(rig)) / fps
-    if len(few := np.flatnonzero(seen_s < _LEAST_S)) > 0:
-        figures = ", ".join(f"{each:.1f}" for each in seen_s[few])
+    if len(lacking := np.flatnonzero(seen_s < _LEAST_S)) > 0:
+        figures = ", ".join(f"{each:.1f}" for each in seen_s[lacking])
         least = f"at least {_LEAST_S:g} s of a person are needed, but only {figures} s are seen"
-        raise Undetermined((f"{_named(rig, few)}: {least}; {FILM}",))
+        raise Undetermined((f"{_named(rig, lacking)}: {least}; {FILM}",))
     still = Views(rig.K, np.tile(np.eye(3, 4), (len(rig), 1, 1)))
     return [CameraTracks.of(sightings, still, view, fps) for view in range(len(rig))]
 
@@ -261,11 +261,11 @@ def _judged(
         adjusted, world, apart_deg, apart_m, held, counts, counts / np.maximum(seen, 1), missed
     )
     sigma = np.degrees(adjusted.sigma(TURN))
-    few, vague = counts < LEAST_PEOPLE, sigma > _MOST_SIGMA_DEG
-    torn = apart_deg > _MOST_APART_DEG
+    too_few, uncertain = counts < LEAST_PEOPLE, sigma > _MOST_SIGMA_DEG
+    inconsistent = apart_deg > _MOST_APART_DEG
     kinds = (
         (
-            few,
+            too_few,
             counts,
             (
                 f"only {{}} people are seen by another camera, too, but at least {LEAST_PEOPLE} "
@@ -273,12 +273,12 @@ def _judged(
             ),
         ),
         (
-            ~few & vague,
+            ~too_few & uncertain,
             sigma.round(1),
             "the motion of the people determines the rotation to {} degrees only",
         ),
         (
-            ~few & ~vague & torn,
+            ~too_few & ~uncertain & inconsistent,
             apart_deg.round(1),
             "the two halves of the recording are {} degrees apart",
         ),

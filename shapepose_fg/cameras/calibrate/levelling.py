@@ -77,10 +77,10 @@ class Measured:
                 change[view, MOVE] = sign * rig.cameras[view].wTc[:3, :3].T @ away / length[n]
             variance = np.einsum("vq,vqwr,wr->", change, adjusted.covariance, change)
             sigma[n] = np.hypot(np.sqrt(max(variance, 0.0)) / length[n], _TAPE_M / metres[n])
-        weight, said = 1 / sigma**2, np.log(metres / length)
-        log = float(np.average(said, weights=weight))
-        worst = int(np.abs((said - log) / sigma).argmax())
-        if abs(said[worst] - log) > CONTRADICTS * sigma[worst]:
+        weight, logs = 1 / sigma**2, np.log(metres / length)
+        log = float(np.average(logs, weights=weight))
+        worst = int(np.abs((logs - log) / sigma).argmax())
+        if abs(logs[worst] - log) > CONTRADICTS * sigma[worst]:
             a, b, given = self.distances[worst]
             raise InputError(
                 f"distance of {rig.names[a]} and {rig.names[b]}: people and the other distances "
@@ -114,7 +114,7 @@ def scale_of(points: Array, skeleton: Skeleton, stature_m: float | None) -> floa
     return (stature_m or ADULT_M) / build_of(points, skeleton).stature
 
 
-def at_once(people: People) -> int:
+def people_at_once(people: People) -> int:
     """Number of people seen at the same time: the 90 % quantile over the frames."""
     _, counts = np.unique(people.frame, return_counts=True)
     return int(np.percentile(counts, 90)) if len(counts) > 0 else 0
@@ -164,5 +164,5 @@ def levelled(rig: Rig, people: People, skeleton: Skeleton, sigma_scale: float) -
     wTc = rig.wTc
     wTc[:, :3] = R @ wTc[:, :3]
     wTc[:, :3, 3] += move
-    world = World(sigma_scale, build.stature, at_once(people), floor, upright)
+    world = World(sigma_scale, build.stature, people_at_once(people), floor, upright)
     return Rig(rig.at_poses(wTc).cameras, "z"), world

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from shapepose_fg.cameras.check.evidence import Look
+from shapepose_fg.cameras.check.evidence import SetupHypothesis
 from shapepose_fg.cameras.parameters import TURN, Q, by_parameters, placing, seen_by
 from shapepose_fg.cameras.sightings import median_over
 from shapepose_fg.cameras.triangulation import Structure, observed, triangulate
@@ -142,8 +142,8 @@ class BiasedResiduals:
             A = (by_point @ views.cTw[:, :, :3] * root).reshape(N, J, 2 * V, 3)
             inverse = placing(A)
             points = points + (inverse @ r.reshape(N, J, 2 * V, 1))[..., 0]
-        there = self.weight[..., None] > 0
-        middle = np.where(there, self.xy, 0.0).sum(axis=1) / np.maximum(there.sum(axis=1), 1)
+        seen = self.weight[..., None] > 0
+        middle = np.where(seen, self.xy, 0.0).sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
         rows, bias = np.zeros((N, J, V, 2, V * (Q + 3) + 1)), V * Q
         of_cameras = by_parameters(projected, at, by_point, views)
         for v in range(V):
@@ -163,7 +163,7 @@ class BiasedResiduals:
         rows, V, J, K = self._rows(views), len(views), self.weight.shape[1], self.parts
         found = np.zeros((_count(self.person), J, *[V * (Q - 3 + 3 * K) + 3 * V + 1] * 2))
         for person, part in sorted({*zip(self.person.tolist(), self.part.tolist(), strict=True)}):
-            mine = (
+            selected = (
                 rows[(self.person == person) & (self.part == part)]
                 .swapaxes(0, 1)
                 .reshape(J, -1, rows.shape[-1])
@@ -173,7 +173,7 @@ class BiasedResiduals:
                 np.arange(V)[:, None] * (Q - 3 + 3 * K) + np.concatenate([turn, rest])
             ).ravel()
             at = np.concatenate([cameras, V * (Q - 3 + 3 * K) + np.arange(3 * V + 1)])
-            found[person][:, at[:, None], at] += mine.swapaxes(1, 2) @ mine
+            found[person][:, at[:, None], at] += selected.swapaxes(1, 2) @ selected
         return found
 
     def _marginals(
@@ -200,8 +200,8 @@ class BiasedResiduals:
             known = of_own[:, :, own] + np.eye(2 * V) / level**2
             left = information[person] - of_own.mT @ (np.linalg.inv(known) @ of_own)
             log -= 0.5 * float(np.linalg.slogdet(known * level**2)[1].sum())
-            mine = np.arange(C + 3 * V * person, C + 3 * V * (person + 1))
-            at = np.concatenate([np.arange(C), mine, [people.stop]])
+            columns = np.arange(C + 3 * V * person, C + 3 * V * (person + 1))
+            at = np.concatenate([np.arange(C), columns, [people.stop]])
             common += left[:, own, own]
             across[:, :, at] += left[:, own]
             whole[at[:, None], at] += left.sum(axis=0)
@@ -236,24 +236,24 @@ def _with_biases(
         away = (xy - seen_by(structure.points, views)[0]) / scale
         away[~used] = np.nan
         for each in range(_count(person)):
-            mine = person == each
-            lasting[mine] = median_over(away[mine]) * scale[mine]
+            rows = person == each
+            lasting[rows] = median_over(away[rows]) * scale[rows]
     return structure, away
 
 
-def without_biases(look: Look) -> Look:
-    """The look without the lasting bias of each joint in each view that people have in common.
+def without_biases(setup: SetupHypothesis) -> SetupHypothesis:
+    """The set-up without the lasting bias of each joint in each view that people have in common.
 
     Such a bias along the motion of a person looks like an offset in time.
     """
-    groups = look.groups()
+    groups = setup.groups()
     if len(groups) == 0:
-        return look
-    seen = observed(groups, look.sightings)
-    common = median_over(_with_biases(seen, look.views, np.zeros(len(groups), np.intp))[1])
-    every = look.evidence.sightings
+        return setup
+    seen = observed(groups, setup.sightings)
+    common = median_over(_with_biases(seen, setup.views, np.zeros(len(groups), np.intp))[1])
+    every = setup.evidence.sightings
     xy = every.xy - every.size_px[:, None, None] * common.swapaxes(0, 1)[every.view]
-    return replace(look, evidence=replace(look.evidence, sightings=replace(every, xy=xy)))
+    return replace(setup, evidence=replace(setup.evidence, sightings=replace(every, xy=xy)))
 
 
 def _count(number: Index) -> int:

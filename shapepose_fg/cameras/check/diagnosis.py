@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from shapepose_fg.cameras.check.biases import without_biases
-from shapepose_fg.cameras.check.evidence import Evidence, Look, gather
+from shapepose_fg.cameras.check.evidence import Evidence, SetupHypothesis, gather
 from shapepose_fg.cameras.check.exclusion import trust_of
 from shapepose_fg.cameras.check.findings import SURE, Finding, Kind, one_of
 from shapepose_fg.cameras.check.hypotheses import GOOD_PAIR, mistake_of_cameras
@@ -61,11 +61,11 @@ def _same_detections(evidence: Evidence, rig: Rig, first: int, second: int) -> b
     distance = np.linalg.norm(
         raw[0].reshape(one.xy.shape)[i] - raw[1].reshape(other.xy.shape)[j], axis=-1
     )
-    there = ~np.isnan(distance)
+    known = ~np.isnan(distance)
     # Maximum distance, px, between detections of one picture stored with pixel accuracy.
-    alike = (there & (distance < 0.6)).sum(axis=1) >= 0.9 * np.maximum(there.sum(axis=1), 1)
-    alike &= there.sum(axis=1) >= 3
-    return bool(len(np.unique(i[alike])) >= 0.8 * len(one))
+    equal = (known & (distance < 0.6)).sum(axis=1) >= 0.9 * np.maximum(known.sum(axis=1), 1)
+    equal &= known.sum(axis=1) >= 3
+    return bool(len(np.unique(i[equal])) >= 0.8 * len(one))
 
 
 def other_sizes(given: Sequence[str], rig: Rig) -> tuple[Finding, ...]:
@@ -121,9 +121,9 @@ class Diagnosis:
     """All findings of the check, and the data they are based on."""
 
     findings: tuple[Finding, ...]
-    look: Look
+    setup: SetupHypothesis
     """The set-up as given."""
-    corrected: Look
+    corrected: SetupHypothesis
     """The set-up with the findings corrected, except small errors."""
     lags: tuple[Lag, ...] = ()
     """Remaining time offset of each camera; empty with too few people."""
@@ -135,23 +135,25 @@ class Diagnosis:
     """Cameras that a reconstruction should exclude or doubt."""
 
 
-def put_right(evidence: Evidence, rig: Rig) -> tuple[Look, Look, list[Finding]]:
+def correct_gross_mistakes(
+    evidence: Evidence, rig: Rig
+) -> tuple[SetupHypothesis, SetupHypothesis, list[Finding]]:
     """The set-up as given, with gross mistakes of cameras corrected, and these mistakes."""
-    given = Look.given(evidence, rig)
-    findings, evidence = _twice(given, rig)
-    findings += _blind(given) + _stopped(given)
-    look = (
+    given = SetupHypothesis.given(evidence, rig)
+    findings, evidence = _without_duplicates(given, rig)
+    findings += _without_people(given) + _stopped(given)
+    setup = (
         given if evidence is given.evidence else replace(given, evidence=evidence)
     )  # the duplicates found remain in the scores
-    rng, enough = np.random.default_rng(0), len(rig) > 1 and len(look.sightings) >= MIN_SIGHTINGS
+    rng, enough = np.random.default_rng(0), len(rig) > 1 and len(setup.sightings) >= MIN_SIGHTINGS
     while (
         enough
         and len(findings) < _MOST_FINDINGS
-        and (change := mistake_of_cameras(look, rng)) is not None
+        and (change := mistake_of_cameras(setup, rng)) is not None
     ):
         findings.append(change.finding)
-        look = change.look
-    return given, look, findings
+        setup = change.setup
+    return given, setup, findings
 
 
 def diagnose(detections: DetectionSequence, rig: Rig, frames: range | None = None) -> Diagnosis:
@@ -161,29 +163,38 @@ def diagnose(detections: DetectionSequence, rig: Rig, frames: range | None = Non
     """
     frames = range(len(detections)) if frames is None else frames
     evidence = gather(detections, frames, len(rig))
-    look = Look.given(evidence, rig)
-    often = len(look.sightings) / max(len(evidence.anchors), 1)
+    setup = SetupHypothesis.given(evidence, rig)
+    people_per_frame = len(setup.sightings) / max(len(evidence.anchors), 1)
     # Frames, and sightings of people in them, that are enough if nothing in them is odd.
-    few = max(16, round(300 / max(often, 1.0)))
-    sound = _sound(replace(look, evidence=evidence.thinned(few)), detections, rig)
+    frame_count = max(16, round(300 / max(people_per_frame, 1.0)))
+    sound = _without_mistakes(
+        replace(setup, evidence=evidence.thinned(frame_count)), detections, rig
+    )
     return _all_mistakes(evidence, detections, rig, frames) if sound is None else sound
 
 
-def _sound(look: Look, detections: DetectionSequence, rig: Rig) -> Diagnosis | None:
+def _without_mistakes(
+    setup: SetupHypothesis, detections: DetectionSequence, rig: Rig
+) -> Diagnosis | None:
     """The diagnosis of cameras and detections without any sign of a mistake; None if there is one,
     or if too little is seen.
     """
-    partings = [parting_of(look, view) for view in range(len(rig))]
+    partings = [parting_of(setup, view) for view in range(len(rig))]
     if (
-        len(look.sightings) < MIN_SIGHTINGS
-        or len(look.groups()) < MIN_SIGHTINGS
-        or min(look.scores) < (_FITTING if look.cameras_used > 2 else GOOD_PAIR)
-        or [*duplicates(rig, look.evidence), *_blind(look), *_stopped(look), *_unfit(look, set())]
+        len(setup.sightings) < MIN_SIGHTINGS
+        or len(setup.groups()) < MIN_SIGHTINGS
+        or min(setup.scores) < (_FITTING if setup.cameras_used > 2 else GOOD_PAIR)
+        or [
+            *duplicates(rig, setup.evidence),
+            *_without_people(setup),
+            *_stopped(setup),
+            *_unexplained(setup, set()),
+        ]
         or any(each is not None and each.drop > _STEADY for each in partings)
     ):
         return None
-    problem = SmallErrors.of(look)
-    refined = replace(look, views=problem.relaxed())
+    problem = SmallErrors.of(setup)
+    refined = replace(setup, views=problem.relaxed())
     remaining = lags(without_biases(refined))
     build = build_of(refined.structure()[1].points, detections.skeleton)
     unlikely = sum(each.finding.sure for each in problem.causes if each.finding is not None)
@@ -195,26 +206,28 @@ def _sound(look: Look, detections: DetectionSequence, rig: Rig) -> Diagnosis | N
         or order_of_joints(detections, refined)
     ):
         return None
-    return Diagnosis((), look, look, tuple(remaining), build)
+    return Diagnosis((), setup, setup, tuple(remaining), build)
 
 
 def _all_mistakes(
     evidence: Evidence, detections: DetectionSequence, rig: Rig, frames: range
 ) -> Diagnosis:
     """The mistakes in all frames used, one after the other."""
-    given, look, findings = put_right(evidence, rig)
-    if len(rig) < 2 or len(look.sightings) < MIN_SIGHTINGS:
-        return Diagnosis(tuple(findings), given, look)
-    if len(look.groups()) < MIN_SIGHTINGS // 2:
+    given, setup, findings = correct_gross_mistakes(evidence, rig)
+    if len(rig) < 2 or len(setup.sightings) < MIN_SIGHTINGS:
+        return Diagnosis(tuple(findings), given, setup)
+    if len(setup.groups()) < MIN_SIGHTINGS // 2:
         # Minimum people placed per sighting; with fewer, cameras see no people in common.
-        none = look.cameras_used > 1 and len(look.groups()) < 0.05 * len(look.sightings)
+        none = setup.cameras_used > 1 and len(setup.groups()) < 0.05 * len(setup.sightings)
         findings += (
-            _nobody(look) if none else _unfit(look, {view for f in findings for view in f.cameras})
+            _nobody_placed(setup)
+            if none
+            else _unexplained(setup, {view for f in findings for view in f.cameras})
         )
-        trust = trust_of(findings, given, look, frames)
-        return Diagnosis(tuple(findings), given, look, trust=trust)
-    problem = SmallErrors.of(look)
-    refined = replace(look, views=problem.relaxed())
+        trust = trust_of(findings, given, setup, frames)
+        return Diagnosis(tuple(findings), given, setup, trust=trust)
+    problem = SmallErrors.of(setup)
+    refined = replace(setup, views=problem.relaxed())
     remaining = lags(without_biases(refined))
     for _ in range(_MOST_FINDINGS):
         late = [
@@ -223,81 +236,83 @@ def _all_mistakes(
         if len(late) == 0:
             break
         view = max(late, key=lambda view: remaining[view].gain)
-        before, settled = look.lag[view], _settled(look, view, remaining[view].frames)
-        if abs(settled[0].lag[view]) > look.evidence.most_lag:  # a diverging offset is chance
+        before, settled = setup.lag[view], _with_offset(setup, view, remaining[view].frames)
+        if abs(settled[0].lag[view]) > setup.evidence.most_lag:  # a diverging offset is chance
             break
-        look, problem = settled
-        findings = _with_late(findings, view, int(look.lag[view] - before))
-        refined = replace(look, views=problem.relaxed())
+        setup, problem = settled
+        findings = _with_late(findings, view, int(setup.lag[view] - before))
+        refined = replace(setup, views=problem.relaxed())
         remaining = lags(without_biases(refined))
     known = {view for finding in findings for view in finding.cameras}
-    unfit = _unfit(look, known)
+    unfit = _unexplained(setup, known)
     known |= {view for finding in unfit for view in finding.cameras}
     small, biased = _small_findings(problem, known)
-    findings += [*(small if look.cameras_used > 2 else []), *unfit]
+    findings += [*(small if setup.cameras_used > 2 else []), *unfit]
     build = build_of(refined.structure()[1].points, detections.skeleton)
     order = order_of_joints(detections, refined)
     findings += order or _of_people(
         build, rig
     )  # with wrong joints, unit and up axis cannot be tested
     trust = trust_of(findings, given, refined, frames)
-    return Diagnosis(tuple(findings), given, look, tuple(remaining), build, tuple(biased), trust)
+    return Diagnosis(tuple(findings), given, setup, tuple(remaining), build, tuple(biased), trust)
 
 
-def _twice(look: Look, rig: Rig) -> tuple[list[Finding], Evidence]:
+def _without_duplicates(setup: SetupHypothesis, rig: Rig) -> tuple[list[Finding], Evidence]:
     """Duplicated cameras, and the evidence without the one of each pair that fits the
     others less.
     """
-    findings, evidence, gone = list[Finding](), look.evidence, set[int]()
+    findings, evidence, removed = list[Finding](), setup.evidence, set[int]()
     for found in duplicates(rig, evidence):
-        if gone.isdisjoint(found.cameras):
-            gone.add(min(found.cameras[::-1], key=lambda view: look.scores[view] - 1e-6 * view))
+        if removed.isdisjoint(found.cameras):
+            removed.add(min(found.cameras[::-1], key=lambda view: setup.scores[view] - 1e-6 * view))
             findings.append(found)
-    if gone:
+    if removed:
         seen = evidence.sightings
-        evidence = replace(evidence, sightings=seen.rows(~np.isin(seen.view, list(gone))))
+        evidence = replace(evidence, sightings=seen.rows(~np.isin(seen.view, list(removed))))
     return findings, evidence
 
 
-def _blind(look: Look) -> list[Finding]:
+def _without_people(setup: SetupHypothesis) -> list[Finding]:
     """Cameras without any people though others see some; or the finding that no camera sees any."""
-    seen = np.bincount(look.sightings.view, minlength=look.view_count)
+    seen = np.bincount(setup.sightings.view, minlength=setup.view_count)
     if seen.sum() == 0:
-        return _nobody(look)
-    gone = (seen == 0) & (look.evidence.stopped < _STOPPED) & (seen.sum() >= MIN_SIGHTINGS)
-    gone = np.flatnonzero(gone).tolist()
-    return [Finding(Kind.NOBODY, tuple(gone))] if gone else []
+        return _nobody_placed(setup)
+    views = (seen == 0) & (setup.evidence.stopped < _STOPPED) & (seen.sum() >= MIN_SIGHTINGS)
+    views = np.flatnonzero(views).tolist()
+    return [Finding(Kind.NOBODY, tuple(views))] if views else []
 
 
-def _stopped(look: Look) -> list[Finding]:
+def _stopped(setup: SetupHypothesis) -> list[Finding]:
     """Cameras with repeated pictures."""
-    share = look.evidence.stopped
+    share = setup.evidence.stopped
     return [
         Finding(Kind.STOPPED, (v,), float(share[v]))
         for v in np.flatnonzero(share >= _STOPPED).tolist()
     ]
 
 
-def _nobody(look: Look) -> list[Finding]:
+def _nobody_placed(setup: SetupHypothesis) -> list[Finding]:
     """Finding that no person could be placed."""
-    return [Finding(Kind.NOBODY, (), amount=float(len(look.sightings)))]
+    return [Finding(Kind.NOBODY, (), amount=float(len(setup.sightings)))]
 
 
-def _settled(look: Look, view: int, frames: int) -> tuple[Look, SmallErrors]:
-    """The look with a camera late by about `frames`, and its residuals.
+def _with_offset(
+    setup: SetupHypothesis, view: int, frames: int
+) -> tuple[SetupHypothesis, SmallErrors]:
+    """The set-up with a camera late by about `frames`, and its residuals.
 
     People who move mostly in one direction make a time offset look like a rotation, so that the two
     are estimated alternately.
     """
     for _ in range(6):
-        look = look.later(view, frames)
-        problem = SmallErrors.of(look)
-        refined = replace(look, views=problem.relaxed())
+        setup = setup.later(view, frames)
+        problem = SmallErrors.of(setup)
+        refined = replace(setup, views=problem.relaxed())
         more = lag_of(without_biases(refined), view, 8)
         frames = more.frames
         if frames == 0 or more.gain < 0:
             break
-    return look, problem
+    return setup, problem
 
 
 def _with_late(findings: list[Finding], view: int, frames: int) -> list[Finding]:
@@ -314,20 +329,22 @@ def _small_findings(problem: SmallErrors, known: set[int]) -> tuple[list[Finding
     """
     biased = list[Finding]()
     while True:
-        told = [(each.person, each.finding) for each in problem.causes if each.finding is not None]
-        of_cameras = [finding for person, finding in told if person < 0]
-        guilt = sum(each.sure for each in of_cameras)
-        nothing = 1 - sum(finding.sure for _, finding in told)
-        if guilt > SURE * (1 - nothing) or nothing > 1 - SURE or len(biased) == _MOST_BIASED:
+        causes = [
+            (each.person, each.finding) for each in problem.causes if each.finding is not None
+        ]
+        of_cameras = [finding for person, finding in causes if person < 0]
+        p_camera = sum(each.sure for each in of_cameras)
+        p_none = 1 - sum(finding.sure for _, finding in causes)
+        if p_camera > SURE * (1 - p_none) or p_none > 1 - SURE or len(biased) == _MOST_BIASED:
             break
-        (person, bias), camera = next(each for each in told if each[0] >= 0), one_of(of_cameras)
+        (person, bias), camera = next(each for each in causes if each[0] >= 0), one_of(of_cameras)
         instead = tuple(
             each for each in (replace(camera, instead=()), *camera.instead) if each.sure > 1 - SURE
         )
-        biased.append(replace(bias, sure=1 - guilt - nothing, instead=instead))
+        biased.append(replace(bias, sure=1 - p_camera - p_none, instead=instead))
         problem = replace(problem, biased=(*problem.biased, (person, *bias.cameras)))
     of_cameras = [each for each in of_cameras if known.isdisjoint(each.cameras)]
-    if guilt <= max(SURE * (1 - nothing), nothing) or len(of_cameras) == 0:
+    if p_camera <= max(SURE * (1 - p_none), p_none) or len(of_cameras) == 0:
         return [], biased
     found = one_of(of_cameras)
     # Minimum change of the focal length of one camera that is reported.
@@ -337,21 +354,23 @@ def _small_findings(problem: SmallErrors, known: set[int]) -> tuple[list[Finding
     return ([found] if size > least or found.kind == Kind.MOVED else []), biased
 
 
-def _unfit(look: Look, known: set[int]) -> list[Finding]:
+def _unexplained(setup: SetupHypothesis, known: set[int]) -> list[Finding]:
     """Cameras that do not fit, without any explanation."""
-    seen = np.bincount(look.sightings.view, minlength=look.view_count)
+    seen = np.bincount(setup.sightings.view, minlength=setup.view_count)
     everybody = tuple(np.flatnonzero(seen).tolist())
-    crowd = float(seen.sum()) / max(len(everybody) * len(look.evidence.anchors), 1)
-    if crowd > _CROWD and (look.scores[list(everybody)] < _UNFIT).all():
+    crowd = float(seen.sum()) / max(len(everybody) * len(setup.evidence.anchors), 1)
+    if crowd > _CROWD and (setup.scores[list(everybody)] < _UNFIT).all():
         return [Finding(Kind.CROWDED, (), crowd)]
-    if len(known) == 0 and (frames := parted(look)) is not None:
-        return [Finding(Kind.UNFIT, everybody, float(look.scores.min()), frames=frames)]
+    if len(known) == 0 and (frames := parted(setup)) is not None:
+        return [Finding(Kind.UNFIT, everybody, float(setup.scores.min()), frames=frames)]
     if len(everybody) == 2:
-        fits = look.scores[0] >= GOOD_PAIR or not known.isdisjoint(everybody)
-        return [] if fits else [Finding(Kind.UNFIT, everybody, float(look.scores[0]))]
-    bad = np.flatnonzero((look.scores < _UNFIT) & (seen >= MIN_SIGHTINGS)).tolist()
-    bad = tuple(view for view in bad if view not in known and look.beside_biases(view) < _UNFIT)
-    return [Finding(Kind.UNFIT, bad, float(look.scores[list(bad)].min()))] if bad else []
+        fits = setup.scores[0] >= GOOD_PAIR or not known.isdisjoint(everybody)
+        return [] if fits else [Finding(Kind.UNFIT, everybody, float(setup.scores[0]))]
+    bad = np.flatnonzero((setup.scores < _UNFIT) & (seen >= MIN_SIGHTINGS)).tolist()
+    bad = tuple(
+        view for view in bad if view not in known and setup.score_without_biases(view) < _UNFIT
+    )
+    return [Finding(Kind.UNFIT, bad, float(setup.scores[list(bad)].min()))] if bad else []
 
 
 def _of_people(build: Build, rig: Rig) -> list[Finding]:

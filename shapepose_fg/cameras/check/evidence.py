@@ -53,8 +53,10 @@ class Evidence:
 
     def thinned(self, frames: int) -> "Evidence":
         """Return the evidence with about `frames` of the frames used."""
-        few, near = (each[:: max(1, len(each) // frames)] for each in (self.anchors, self.around))
-        return replace(self, anchors=few, around=near)
+        anchors, around = (
+            each[:: max(1, len(each) // frames)] for each in (self.anchors, self.around)
+        )
+        return replace(self, anchors=anchors, around=around)
 
 
 def gather(detections: DetectionSequence, frames: range, views: int) -> Evidence:
@@ -77,10 +79,12 @@ def gather(detections: DetectionSequence, frames: range, views: int) -> Evidence
         if (
             sum(len(detections[t]) > 0 for t in spread.tolist()) < MOST_FRAMES // 4
         ):  # people are present only at times
-            there = np.array(
+            occupied = np.array(
                 [t for t in frames if len(detections[t]) > 0] or [frames.start], dtype=np.intp
             )
-            spread = there[np.unique(np.linspace(0, len(there) - 1, MOST_FRAMES).astype(np.intp))]
+            spread = occupied[
+                np.unique(np.linspace(0, len(occupied) - 1, MOST_FRAMES).astype(np.intp))
+            ]
         # Number of frames of a longer recording with neighbours used.
         every = max(1, MOST_FRAMES // 16)
         near = [np.arange(t - most, t + most + 1) for t in spread[::every]]
@@ -91,8 +95,8 @@ def gather(detections: DetectionSequence, frames: range, views: int) -> Evidence
     sightings = Sightings.of(pictures, wanted.tolist())
     for frame in wanted.tolist():
         stopped[list(pictures.repeated(frame))] += 1 / len(wanted)
-    here = sightings.rows(np.isin(sightings.frame, spread))
-    _, each = np.unique(here.frame, return_counts=True)
+    in_frames = sightings.rows(np.isin(sightings.frame, spread))
+    _, each = np.unique(in_frames.frame, return_counts=True)
     pairs = int((each * (each - 1) // 2).sum())
     if pairs > _MOST_PAIRS:
         spread = spread[:: -(-pairs // _MOST_PAIRS)]
@@ -105,7 +109,7 @@ def _other_side(skeleton: Skeleton) -> Index:
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class SetupHypothesis:
     """A recording under one hypothesis on its cameras, which changes as mistakes are found."""
 
     evidence: Evidence
@@ -117,34 +121,34 @@ class Look:
     _others: dict[tuple[int, ...], Others] = field(init=False, default_factory=dict)
 
     @classmethod
-    def given(cls, evidence: Evidence, rig: Rig) -> "Look":
-        """The look with the cameras as given by the user."""
+    def given(cls, evidence: Evidence, rig: Rig) -> "SetupHypothesis":
+        """The set-up with the cameras as given by the user."""
         return cls(evidence, Views.of(rig), np.zeros(len(rig), dtype=np.intp))
 
     def camera(self, view: int) -> Pinhole:
         """One of the assumed cameras."""
         return Pinhole(self.views.K[view], self.views.cTw[view])
 
-    def with_cameras(self, cameras: Mapping[int, Pinhole]) -> "Look":
-        """Return the look with some cameras replaced."""
+    def with_cameras(self, cameras: Mapping[int, Pinhole]) -> "SetupHypothesis":
+        """Return the set-up with some cameras replaced."""
         K, cTw = self.views.K.copy(), self.views.cTw.copy()
         for view, camera in cameras.items():
             K[view], cTw[view] = camera.K, camera.cTw
         return replace(self, views=replace(self.views, K=K, cTw=cTw))
 
-    def seeing(self, view: int, change: Callable[[Sightings], Sightings]) -> "Look":
-        """Return the look with changed detections of one camera."""
+    def seeing(self, view: int, change: Callable[[Sightings], Sightings]) -> "SetupHypothesis":
+        """Return the set-up with changed detections of one camera."""
         every = self.evidence.sightings
-        mine = np.flatnonzero(every.view == view)
-        xy, confidence, new = every.xy.copy(), every.confidence.copy(), change(every.rows(mine))
-        xy[mine], confidence[mine] = new.xy, new.confidence
+        rows = np.flatnonzero(every.view == view)
+        xy, confidence, new = every.xy.copy(), every.confidence.copy(), change(every.rows(rows))
+        xy[rows], confidence[rows] = new.xy, new.confidence
         return replace(
             self,
             evidence=replace(self.evidence, sightings=replace(every, xy=xy, confidence=confidence)),
         )
 
-    def later(self, view: int, frames: int) -> "Look":
-        """Return the look with one camera assumed late by `frames` more."""
+    def later(self, view: int, frames: int) -> "SetupHypothesis":
+        """Return the set-up with one camera assumed late by `frames` more."""
         lag = self.lag.copy()
         lag[view] += frames
         return replace(self, lag=lag)
@@ -207,7 +211,7 @@ class Look:
             [match(self.others(v), self.seen_by(v), self.camera(v)).score for v in views]
         )
 
-    def beside_biases(self, view: int) -> float:
+    def score_without_biases(self, view: int) -> float:
         """Score of a camera for the others' people, as `Match.score`, corrected for persistent
         errors of the detector.
         """
@@ -218,9 +222,9 @@ class Look:
         person, sighting = person[near], sighting[near]
         away = seen.xy[sighting] - camera.project(others.points[person])[0]
         away /= seen.size_px[sighting][:, None, None]
-        who = followed(others.frame, others.points)[person]
-        for each in np.unique(who).tolist():
-            away[who == each] -= median_over(away[who == each])
+        identity = followed(others.frame, others.points)[person]
+        for each in np.unique(identity).tolist():
+            away[identity == each] -= median_over(away[identity == each])
         miss = np.linalg.norm(away, axis=-1)
         left = np.maximum(1 - median_of(miss) / GATE, 0.0)
         return float(left.sum() / max(possible_matches(others.frame, seen.frame), 1))
@@ -246,5 +250,5 @@ class Look:
         groups, structure = self.structure(steps=3)
         error = np.moveaxis(structure.miss_px / structure.size_px[:, None], 1, 2)
         median = median_of(error)
-        worth = np.maximum(1 - median / GATE, 0.0)
-        return float(worth[groups.member >= 0].sum() / max(len(self.sightings), 1))
+        quality = np.maximum(1 - median / GATE, 0.0)
+        return float(quality[groups.member >= 0].sum() / max(len(self.sightings), 1))

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from shapepose_fg.cameras.check.evidence import Look
+from shapepose_fg.cameras.check.evidence import SetupHypothesis
 from shapepose_fg.cameras.check.findings import Finding, Kind
 from shapepose_fg.cameras.resection import match
 from shapepose_fg.core.trust import Spell, Trust
@@ -19,7 +19,9 @@ _OF_PEOPLE = (Kind.UNIT, Kind.UP, Kind.PICTURE_SIZE, Kind.STOPPED, Kind.CROWDED)
 elsewhere."""
 
 
-def trust_of(findings: Sequence[Finding], given: Look, right: Look, frames: range) -> Trust:
+def trust_of(
+    findings: Sequence[Finding], given: SetupHypothesis, right: SetupHypothesis, frames: range
+) -> Trust:
     """Decide from `findings` which cameras are left out or doubted, in which of the `frames`.
 
     `given` is the recording with the cameras as given, `right` with the found mistakes corrected.
@@ -39,7 +41,7 @@ def trust_of(findings: Sequence[Finding], given: Look, right: Look, frames: rang
         if each.kind == Kind.DUPLICATE:
             views = (min(each.cameras[::-1], key=lambda view: given.scores[view] - 1e-6 * view),)
         first, last = (
-            end if said is None else said for said, end in zip(each.frames, whole, strict=True)
+            end if bound is None else bound for bound, end in zip(each.frames, whole, strict=True)
         )
         if given.cameras_used == 2 or len(views) >= given.cameras_used:  # the culprit is unknown
             return Trust(doubted=tuple((view, first, last) for view in range(given.view_count)))
@@ -54,14 +56,14 @@ def trust_of(findings: Sequence[Finding], given: Look, right: Look, frames: rang
     return Trust(tuple(wrong))
 
 
-def _worse(given: Look, right: Look, view: int, frames: range) -> bool:
+def _worse(given: SetupHypothesis, right: SetupHypothesis, view: int, frames: range) -> bool:
     """Whether the camera's score for the others' people is much lower than with the mistakes
     corrected.
     """
     others = right.others(view)
     others = others.rows((others.frame >= frames.start) & (others.frame < frames.stop))
     was, now = (
-        match(others, look.seen_by(view, every_frame=True), look.camera(view)).score
-        for look in (given, right)
+        match(others, setup.seen_by(view, every_frame=True), setup.camera(view)).score
+        for setup in (given, right)
     )
     return now - was > _WORSE

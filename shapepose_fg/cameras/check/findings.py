@@ -82,19 +82,19 @@ def one_of(found: Sequence[Finding]) -> Finding:
         what = each.kind, each.cameras
         sure[what] = sure.get(what, 0.0) + each.sure
         first.setdefault(what, each)
-    told = sorted(
+    ranked = sorted(
         (replace(first[what], sure=p) for what, p in sure.items()), key=lambda each: -each.sure
     )
-    return replace(told[0], instead=tuple(each for each in told[1:] if each.sure >= 1 - SURE))
+    return replace(ranked[0], instead=tuple(each for each in ranked[1:] if each.sure >= 1 - SURE))
 
 
 def sentence(finding: Finding, rig: Rig) -> str:
     """The finding as a sentence, with its alternatives."""
-    said = _words(finding, rig)
-    said += f" (probability {finding.sure:.2f})" if finding.sure < SURE else ""
+    text = _words(finding, rig)
+    text += f" (probability {finding.sure:.2f})" if finding.sure < SURE else ""
     for each in finding.instead:
-        said += f"; or {_words(each, rig).split(';')[0]} ({each.sure:.2f})"
-    return said if said.startswith(rig.names) else f"{said[0].upper()}{said[1:]}"
+        text += f"; or {_words(each, rig).split(';')[0]} ({each.sure:.2f})"
+    return text if text.startswith(rig.names) else f"{text[0].upper()}{text[1:]}"
 
 
 def _words(finding: Finding, rig: Rig) -> str:
@@ -345,8 +345,8 @@ def _when(first: int | None, last: int | None) -> str:
 def _shift(x: float, y: float) -> str:
     """A shift in a picture in words."""
     parts = [(abs(x), "right" if x > 0 else "left"), (abs(y), "down" if y > 0 else "up")]
-    told = [f"{size:.0f} px {way}" for size, way in parts if size >= 0.5]
-    return " and ".join(told) or "less than a pixel"
+    words = [f"{size:.0f} px {way}" for size, way in parts if size >= 0.5]
+    return " and ".join(words) or "less than a pixel"
 
 
 def _length(metres: float) -> str:

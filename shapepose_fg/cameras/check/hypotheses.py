@@ -8,7 +8,7 @@ from itertools import combinations
 import numpy as np
 
 from shapepose_fg.cameras import resection
-from shapepose_fg.cameras.check.evidence import Look
+from shapepose_fg.cameras.check.evidence import SetupHypothesis
 from shapepose_fg.cameras.check.findings import SURE, Finding, Kind, one_of
 from shapepose_fg.cameras.check.lags import lag_of
 from shapepose_fg.cameras.check.over_time import motions
@@ -64,63 +64,65 @@ class Change:
 
     finding: Finding
     """The mistake that the change corrects."""
-    look: Look
-    """The look after the change."""
+    setup: SetupHypothesis
+    """The set-up after the change."""
     freedom: int = 0
     """Number of fitted parameters."""
     fitted: Kind | None = None
     """Fitted kind of one camera (`small_errors.ONE`), if any."""
 
 
-def mistake_of_cameras(look: Look, rng: np.random.Generator) -> Change | None:
+def mistake_of_cameras(setup: SetupHypothesis, rng: np.random.Generator) -> Change | None:
     """The change that best explains why cameras see different people; None if they agree or nothing
     explains it.
     """
-    fits = look.scores
-    weak = np.flatnonzero(fits < (GOOD if look.view_count > 2 else GOOD_PAIR)).tolist()
+    fits = setup.scores
+    weak = np.flatnonzero(fits < (GOOD if setup.view_count > 2 else GOOD_PAIR)).tolist()
     tried: list[Change] = []
     for view in weak:
-        worth = independent(look.others(view))
-        least = likelihood(fits[view], worth, 0) + _LIKELY
-        options = [(score_of(look, each), each) for each in _of_one(look, view, rng)]
+        count = independent(setup.others(view))
+        least = likelihood(fits[view], count, 0) + _LIKELY
+        options = [(score_of(setup, each), each) for each in _of_one(setup, view, rng)]
         options = [
             (score, each)
             for score, each in options
-            if score - fits[view] > GAIN and likelihood(score, worth, each.freedom) > least
+            if score - fits[view] > GAIN and likelihood(score, count, each.freedom) > least
         ]
         options.sort(key=lambda option: option[0] - _PRICE * option[1].freedom, reverse=True)
         tried += [each for _, each in options if not _slight(each.finding)][:4]
     for first, second in combinations(weak, 2):
-        cameras = {first: look.camera(second), second: look.camera(first)}
-        change = Change(Finding(Kind.EXCHANGED, (first, second)), look.with_cameras(cameras))
-        if look.view_count == 3 or (score_of(look, change) - max(fits[first], fits[second]) > GAIN):
+        cameras = {first: setup.camera(second), second: setup.camera(first)}
+        change = Change(Finding(Kind.EXCHANGED, (first, second)), setup.with_cameras(cameras))
+        if setup.view_count == 3 or (
+            score_of(setup, change) - max(fits[first], fits[second]) > GAIN
+        ):
             tried.append(change)
-    if look.view_count == 2 and len(weak) > 0:
-        tried += [_misread(look, kind, (view,)) for view in (0, 1) for kind in _MISREAD]
-        tried += [change for view in (0, 1) for change in _in_mirror(look, view)]
-    found = [(judged(look, change), change) for change in tried]
-    best = max((gain for gain, _ in found), default=0.0) + look.total
-    poor = [view for view in weak if look.beside_biases(view) < GOOD]
-    if len(poor) > look.view_count / 2 and best < _EXPLAINED:
-        few = replace(look, evidence=look.evidence.thinned(_FEW_FRAMES))
+    if setup.view_count == 2 and len(weak) > 0:
+        tried += [_misread(setup, kind, (view,)) for view in (0, 1) for kind in _MISREAD]
+        tried += [change for view in (0, 1) for change in _in_mirror(setup, view)]
+    found = [(judged(setup, change), change) for change in tried]
+    best = max((gain for gain, _ in found), default=0.0) + setup.total
+    misfits = [view for view in weak if setup.score_without_biases(view) < GOOD]
+    if len(misfits) > setup.view_count / 2 and best < _EXPLAINED:
+        thinned = replace(setup, evidence=setup.evidence.thinned(_FEW_FRAMES))
         found += [
             (
-                judged(few, change),
-                replace(change, look=replace(change.look, evidence=look.evidence)),
+                judged(thinned, change),
+                replace(change, setup=replace(change.setup, evidence=setup.evidence)),
             )
-            for change in _of_all(few)
+            for change in _of_all(thinned)
         ]
-    found = [(gain, change) for gain, change in found if gain > GAIN / look.view_count]
+    found = [(gain, change) for gain, change in found if gain > GAIN / setup.view_count]
     # A camera that moves by little is looked for among all, once none is far off.
-    for view in (weak or range(look.view_count)) if look.cameras_used > 2 else ():
+    for view in (weak or range(setup.view_count)) if setup.cameras_used > 2 else ():
         changes = [
-            Change(finding, after, freedom) for finding, after, freedom in motions(look, view, rng)
+            Change(finding, after, freedom) for finding, after, freedom in motions(setup, view, rng)
         ]
-        found += [(judged(look, change), change) for change in changes]
-    return _likeliest(look, found)
+        found += [(judged(setup, change), change) for change in changes]
+    return _likeliest(setup, found)
 
 
-def _likeliest(look: Look, found: list[tuple[float, Change]]) -> Change | None:
+def _likeliest(setup: SetupHypothesis, found: list[tuple[float, Change]]) -> Change | None:
     """The best of the changes with scores of `judged`, with its probability and alternatives.
 
     A change that moves a camera must be more probable than biases of the detector, else it is
@@ -130,8 +132,8 @@ def _likeliest(look: Look, found: list[tuple[float, Change]]) -> Change | None:
         return None
     # Evidence counts all independent joints of people and cameras.
     gains = np.array([gain for gain, _ in found]) * GATE / ERROR
-    gains *= look.view_count * max(
-        independent(look.others(view)) for view in range(look.view_count)
+    gains *= setup.view_count * max(
+        independent(setup.others(view)) for view in range(setup.view_count)
     )
     weights = np.exp(gains - gains.max()) / np.exp(gains - gains.max()).sum()
     changes = [
@@ -141,7 +143,7 @@ def _likeliest(look: Look, found: list[tuple[float, Change]]) -> Change | None:
         )
     ]
     best, (view, *_) = changes[0], changes[0].finding.cameras
-    if best.look.evidence is not look.evidence or best.look.lag is not look.lag:
+    if best.setup.evidence is not setup.evidence or best.setup.lag is not setup.lag:
         return replace(best, finding=one_of([each.finding for each in changes]))
     # Which parameters of a camera are wrong is decided on single joints, with the people's
     # positions free.
@@ -150,28 +152,32 @@ def _likeliest(look: Look, found: list[tuple[float, Change]]) -> Change | None:
         for each in changes
         if each.fitted is not None and each.finding.cameras == best.finding.cameras
     ]
-    problem = SmallErrors.of(best.look, look.views)
+    problem = SmallErrors.of(best.setup, setup.views)
     if best.fitted is None:
-        of_camera = [problem.as_they_are(best.finding, best.look.views)]
+        of_camera = [problem.as_they_are(best.finding, best.setup.views)]
     else:
         starts = {
-            each.fitted: each.look.views for each in reversed(rivals) if each.fitted is not None
+            each.fitted: each.setup.views for each in reversed(rivals) if each.fitted is not None
         }
         of_camera = problem.explained(view, starts)
-    told = probable([problem.as_they_are(None, look.views), *problem.biases(), *of_camera])
-    guilty = [
-        (each.finding, each.views) for each in told if each.finding is not None and each.person < 0
+    causes = probable([problem.as_they_are(None, setup.views), *problem.biases(), *of_camera])
+    mistakes = [
+        (each.finding, each.views)
+        for each in causes
+        if each.finding is not None and each.person < 0
     ]
-    guilt = sum(finding.sure for finding, _ in guilty)
-    if guilt < SURE:
+    p_mistake = sum(finding.sure for finding, _ in mistakes)
+    if p_mistake < SURE:
         return _likeliest(
-            look, [each for each in found if each[1].finding.cameras != best.finding.cameras]
+            setup, [each for each in found if each[1].finding.cameras != best.finding.cameras]
         )
     if best.fitted is not None:
-        share = sum(each.finding.sure for each in rivals) / guilt
+        share = sum(each.finding.sure for each in rivals) / p_mistake
         fitted = [
-            replace(best, finding=replace(f, sure=f.sure * share), look=replace(look, views=views))
-            for f, views in guilty
+            replace(
+                best, finding=replace(f, sure=f.sure * share), setup=replace(setup, views=views)
+            )
+            for f, views in mistakes
         ]
         changes = fitted + [each for each in changes if each not in rivals]
     return replace(changes[0], finding=one_of([each.finding for each in changes]))
@@ -182,85 +188,85 @@ def _slight(finding: Finding) -> bool:
     return finding.kind in (Kind.FOCAL, Kind.RESIZED) and abs(np.log(finding.amount)) < 0.08
 
 
-def judged(look: Look, change: Change) -> float:
+def judged(setup: SetupHypothesis, change: Change) -> float:
     """Gain in total score by a change, less the penalty for its parameters."""
-    return change.look.total - look.total - _PRICE * change.freedom / look.view_count
+    return change.setup.total - setup.total - _PRICE * change.freedom / setup.view_count
 
 
-def score_of(look: Look, change: Change) -> float:
+def score_of(setup: SetupHypothesis, change: Change) -> float:
     """Score of the changed cameras for the people that all others see (`Match.score`), the lowest;
     0 if they see none.
     """
-    others = look.others(*change.finding.cameras)
+    others = setup.others(*change.finding.cameras)
     return min(
-        match(others, change.look.seen_by(view), change.look.camera(view)).score
+        match(others, change.setup.seen_by(view), change.setup.camera(view)).score
         for view in change.finding.cameras
     )
 
 
-def _of_one(look: Look, view: int, rng: np.random.Generator) -> Iterator[Change]:
+def _of_one(setup: SetupHypothesis, view: int, rng: np.random.Generator) -> Iterator[Change]:
     """Changes of one camera that fit it to the people of the others, the best of each kind."""
-    others, seen, camera = look.others(view), look.seen_by(view), look.camera(view)
+    others, seen, camera = setup.others(view), setup.seen_by(view), setup.camera(view)
     if len(others) == 0 or len(seen) == 0:
         return
     for kind in _MISREAD:
-        yield _misread(look, kind, (view,))
-    yield from _in_mirror(look, view)
-    lag = lag_of(look, view).frames
-    yield Change(Finding(Kind.LATE, (view,), lag), look.later(view, lag), 1)
+        yield _misread(setup, kind, (view,))
+    yield from _in_mirror(setup, view)
+    lag = lag_of(setup, view).frames
+    yield Change(Finding(Kind.LATE, (view,), lag), setup.later(view, lag), 1)
     pairs = list(resection.tries(others, seen, rng))
     for kind, fitted, columns in _FITTED:
         best = resection.best_of(others, seen, camera, pairs, fitted)
         if best is None:
             continue
         best = resection.refined(others, seen, best, columns) if columns else best
-        after = look.with_cameras({view: best})
+        after = setup.with_cameras({view: best})
         if kind == Kind.RESIZED:
             finding = Finding(kind, (view,), float(best.K[0, 0] / camera.K[0, 0]))
         else:
-            finding = named(kind, view, look.views, after.views)
+            finding = named(kind, view, setup.views, after.views)
         # Cameras are bumped more often than lenses change: a shift must not win by having one
         # parameter less.
         freedom = len(TURN) if kind == Kind.PRINCIPAL_POINT else max(len(columns), 1)
         yield Change(finding, after, freedom, kind if kind in ONE else None)
 
 
-def _in_mirror(look: Look, view: int) -> list[Change]:
+def _in_mirror(setup: SetupHypothesis, view: int) -> list[Change]:
     """Mirrored pictures of one camera: before detection, which exchanges left and right, or
     afterwards.
     """
-    width = np.broadcast_to(look.views.image_sizes, (look.view_count, 2))[view, 0]
+    width = np.broadcast_to(setup.views.image_sizes, (setup.view_count, 2))[view, 0]
 
     def mirrored(seen: Sightings, joints: Index) -> Sightings:
         xy = seen.xy[:, joints]
         xy[..., 0] = width - 1 - xy[..., 0]
         return replace(seen, xy=xy, confidence=seen.confidence[:, joints])
 
-    side = look.evidence.other_side
+    side = setup.evidence.other_side
     looks = [
-        look.seeing(view, partial(mirrored, joints=each)) for each in (side, np.arange(len(side)))
+        setup.seeing(view, partial(mirrored, joints=each)) for each in (side, np.arange(len(side)))
     ]
     return [Change(Finding(Kind.MIRRORED, (view,)), each) for each in looks]
 
 
-def _of_all(look: Look) -> Iterator[Change]:
+def _of_all(setup: SetupHypothesis) -> Iterator[Change]:
     """Mistakes common to all cameras."""
-    everybody = tuple(range(look.view_count))
+    everybody = tuple(range(setup.view_count))
     for kind in _MISREAD:
-        yield _misread(look, kind, everybody)
+        yield _misread(setup, kind, everybody)
     # Factors of picture sizes that are tested for all cameras.
     for factor in (0.25, 1 / 3, 0.5, 2 / 3, 0.75, 4 / 3, 1.5, 2.0, 3.0, 4.0):
         cameras = {
-            view: resection.scaled(look.camera(view), factor, resection.CORNER)
+            view: resection.scaled(setup.camera(view), factor, resection.CORNER)
             for view in everybody
         }
-        yield Change(Finding(Kind.RESIZED, everybody, factor), look.with_cameras(cameras))
+        yield Change(Finding(Kind.RESIZED, everybody, factor), setup.with_cameras(cameras))
 
 
-def _misread(look: Look, kind: Kind, views: tuple[int, ...]) -> Change:
+def _misread(setup: SetupHypothesis, kind: Kind, views: tuple[int, ...]) -> Change:
     """Misinterpreted poses of some cameras."""
-    cameras = {view: misread(kind, look.camera(view)) for view in views}
-    return Change(Finding(kind, views), look.with_cameras(cameras))
+    cameras = {view: misread(kind, setup.camera(view)) for view in views}
+    return Change(Finding(kind, views), setup.with_cameras(cameras))
 
 
 def misread(kind: Kind, camera: Pinhole) -> Pinhole:

@@ -9,7 +9,7 @@ import numpy as np
 
 from shapepose_fg.body.joint_order import LIKE_A_BODY, exchanges, fit_of_order
 from shapepose_fg.body.model.target_skeletons import BODY_POINTS
-from shapepose_fg.cameras.check.evidence import Look
+from shapepose_fg.cameras.check.evidence import SetupHypothesis
 from shapepose_fg.cameras.check.findings import Finding, Kind
 from shapepose_fg.cameras.check.small_errors import MOST_PEOPLE
 from shapepose_fg.cameras.sightings import MIN_SIGHTINGS, people_of
@@ -33,19 +33,19 @@ capture, 0.67 and more for real detections."""
 _ARMS, _LEGS = ("Shoulder", "Elbow", "Wrist"), ("Hip", "Knee", "Ankle")
 
 
-def order_of_joints(detections: DetectionSequence, look: Look) -> list[Finding]:
-    """Findings on the names of joints; `look` has the set-up with other mistakes corrected."""
+def order_of_joints(detections: DetectionSequence, setup: SetupHypothesis) -> list[Finding]:
+    """Findings on the names of joints; `setup` has the set-up with other mistakes corrected."""
     skeleton = detections.skeleton
-    pictures = _people(detections, look, skeleton)
-    told = _other_layout(pictures, skeleton) if len(pictures) >= MIN_SIGHTINGS else None
-    if told is not None:
-        return [Finding(Kind.JOINT_ORDER, (), joints=(told, skeleton.name))]
+    pictures = _people(detections, setup, skeleton)
+    layout = _other_layout(pictures, skeleton) if len(pictures) >= MIN_SIGHTINGS else None
+    if layout is not None:
+        return [Finding(Kind.JOINT_ORDER, (), joints=(layout, skeleton.name))]
     made = {joint for joint, _, _ in skeleton.middles}
     known = [joint not in made and skeleton.joints[joint] in BODY_POINTS for joint in skeleton.core]
     own = np.flatnonzero(known).tolist()
     names = [skeleton.joints[skeleton.core[place]] for place in own]
-    flat = _some(look.sightings.xy[:, own])
-    space = _some(look.structure()[1].points[:, own])
+    flat = _some(setup.sightings.xy[:, own])
+    space = _some(setup.structure()[1].points[:, own])
     # Minimum number of joints in trunk and limbs for any statement.
     if len(flat) < MIN_SIGHTINGS or len(own) < 7:
         return []
@@ -178,11 +178,11 @@ def _sides(names: Sequence[str]) -> list[list[tuple[int, int]]]:
     return [each for each in groups if len(each) > 1]
 
 
-def _people(detections: DetectionSequence, look: Look, skeleton: Skeleton) -> Array:
+def _people(detections: DetectionSequence, setup: SetupHypothesis, skeleton: Skeleton) -> Array:
     """(N, K, 2) people in pictures in some of the frames used, by keypoint, NaN where not seen."""
     names = keypoint_names(skeleton)
     place = np.array([names.index(joint) if joint in names else -1 for joint in skeleton.joints])
-    frames = look.evidence.anchors[:: max(1, len(look.evidence.anchors) // 30)].tolist()
+    frames = setup.evidence.anchors[:: max(1, len(setup.evidence.anchors) // 30)].tolist()
     found = [
         people_of(detections[frame], place, len(names), max(1, len(names) // 3))[1]
         for frame in frames

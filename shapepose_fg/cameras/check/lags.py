@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shapepose_fg.cameras.check.evidence import Look
+from shapepose_fg.cameras.check.evidence import SetupHypothesis
 from shapepose_fg.cameras.offsets.scan import LEAST_MISS, scan
 from shapepose_fg.cameras.sightings import GATE
 
@@ -32,26 +32,26 @@ class Lag:
         return self.exceeds(1.0)
 
 
-def lags(look: Look) -> list[Lag]:
+def lags(setup: SetupHypothesis) -> list[Lag]:
     """Time offset of each camera against the others; none in a short recording."""
     # Minimum number of frames for time offsets. In fewer, people hardly move enough to separate a
     # small time offset from chance.
-    if len(np.unique(look.evidence.sightings.frame)) < 40:
-        return [Lag()] * look.view_count
-    return [lag_of(look, view) for view in range(look.view_count)]
+    if len(np.unique(setup.evidence.sightings.frame)) < 40:
+        return [Lag()] * setup.view_count
+    return [lag_of(setup, view) for view in range(setup.view_count)]
 
 
-def lag_of(look: Look, view: int, most: int | None = None) -> Lag:
+def lag_of(setup: SetupHypothesis, view: int, most: int | None = None) -> Lag:
     """Time offset of a camera against the others, up to `most` frames, with the smallest mean
     residual.
     """
-    most = look.evidence.most_lag if most is None else min(most, look.evidence.most_lag)
-    offsets, seen, around = np.arange(-most, most + 1), look.shifted, look.evidence.around
+    most = setup.evidence.most_lag if most is None else min(most, setup.evidence.most_lag)
+    offsets, seen, around = np.arange(-most, most + 1), setup.shifted, setup.evidence.around
     rows = seen.rows((seen.view == view) | np.isin(seen.frame, around))
     # Distance of people above which they count as missed by a camera, as a share of the size; other
     # people come that near seldom.
     of_pairs = [
-        scan(rows, look.views, other, view, offsets, np.ptp(around) / 4, GATE / 3)
+        scan(rows, setup.views, other, view, offsets, np.ptp(around) / 4, GATE / 3)
         for other in np.unique(rows.view).tolist()
         if other != view
     ]

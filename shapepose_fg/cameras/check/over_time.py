@@ -12,7 +12,7 @@ import numpy as np
 
 from shapepose_fg.body.model.rotation import exp_so3, log_so3
 from shapepose_fg.cameras import resection
-from shapepose_fg.cameras.check.evidence import Look
+from shapepose_fg.cameras.check.evidence import SetupHypothesis
 from shapepose_fg.cameras.check.findings import Finding, Kind
 from shapepose_fg.cameras.parameters import POSE, TURN
 from shapepose_fg.cameras.resection import Others, independent, likelihood, match
@@ -80,22 +80,22 @@ def parting(one: Index, other: Index, frame: Index, error: Array) -> Parting | N
     return Parting(int(frames[n + 1]), float(before[n]), float(after[n]))
 
 
-def parting_of(look: Look, view: int) -> Parting | None:
+def parting_of(setup: SetupHypothesis, view: int) -> Parting | None:
     """The split of a recording at which a camera's score for the others' people changes most."""
-    others, seen = look.others(view), look.seen_by(view)
-    found = match(others, seen, look.camera(view))
+    others, seen = setup.others(view), setup.seen_by(view)
+    found = match(others, seen, setup.camera(view))
     return parting(others.frame, seen.frame, others.frame[found.person], found.error)
 
 
-def parted(look: Look) -> tuple[int | None, int | None] | None:
+def parted(setup: SetupHypothesis) -> tuple[int | None, int | None] | None:
     """The frames in which two cameras disagree though they agree in the others; for more cameras
     see `motions`.
     """
-    views = np.unique(look.sightings.view).tolist()
+    views = np.unique(setup.sightings.view).tolist()
     if len(views) != 2:
         return None
-    groups, _ = look.pair(*views)
-    one, other = (look.seen_by(view).frame for view in views)
+    groups, _ = setup.pair(*views)
+    one, other = (setup.seen_by(view).frame for view in views)
     found = parting(one, other, groups.frame, groups.error)
     if found is None or found.drop < _PARTED or min(found.before, found.after) > _POOR:
         return None
@@ -117,21 +117,23 @@ Share = Callable[[Index], Array]
 """Function from frames (S,) to the shares (S,) of a rotation that a camera has in them."""
 
 
-def motions(look: Look, view: int, rng: np.random.Generator) -> Iterator[tuple[Finding, Look, int]]:
+def motions(
+    setup: SetupHypothesis, view: int, rng: np.random.Generator
+) -> Iterator[tuple[Finding, SetupHypothesis, int]]:
     """Findings on motions of one camera over time that explain its sightings better than a constant
     pose.
 
-    Each comes with the corrected look, and the number of parameters.
+    Each comes with the corrected set-up, and the number of parameters.
     """
-    split = parting_of(look, view)
+    split = parting_of(setup, view)
     if split is None or split.drop < _RESTLESS:
         return
-    others, seen, camera = look.others(view), look.seen_by(view), look.camera(view)
-    worth = independent(others)
-    before = likelihood(match(others, seen, camera).score, worth, 0)
+    others, seen, camera = setup.others(view), setup.seen_by(view), setup.camera(view)
+    count = independent(others)
+    before = likelihood(match(others, seen, camera).score, count, 0)
     for columns in (TURN, POSE):
         lasting = match(others, seen, resection.refined(others, seen, camera, columns)).score
-        before = max(before, likelihood(lasting, worth, len(columns)))
+        before = max(before, likelihood(lasting, count, len(columns)))
     ends, late = np.intersect1d(others.frame, seen.frame)[[0, -1]], split.after < split.before
 
     def bumped(frame: Index) -> Array:
@@ -147,18 +149,18 @@ def motions(look: Look, view: int, rng: np.random.Generator) -> Iterator[tuple[F
     ):
         turn = _turn(others, seen, camera, share, rng)
         after = match(others, warped(seen, camera, share(seen.frame)[:, None] * turn), camera).score
-        gain = likelihood(after, worth, freedom) - before
+        gain = likelihood(after, count, freedom) - before
         amount = float(np.rad2deg(np.linalg.norm(turn)))
         if gain > _SURE and amount > _LEAST_DEG:
-            yield replace(finding, amount=amount), _as_if_still(look, view, share, turn), freedom
+            yield replace(finding, amount=amount), _as_if_still(setup, view, share, turn), freedom
 
 
-def _as_if_still(look: Look, view: int, share: Share, turn: Array) -> Look:
-    """The look corrected for the `share` of a rotation that a camera has in each frame."""
-    return look.seeing(
+def _as_if_still(setup: SetupHypothesis, view: int, share: Share, turn: Array) -> SetupHypothesis:
+    """The set-up corrected for the `share` of a rotation that a camera has in each frame."""
+    return setup.seeing(
         view,
         lambda seen: warped(
-            seen, look.camera(view), share(seen.frame - look.lag[view])[:, None] * turn
+            seen, setup.camera(view), share(seen.frame - setup.lag[view])[:, None] * turn
         ),
     )
 

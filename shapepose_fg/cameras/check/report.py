@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shapepose_fg.cameras.check.diagnosis import Diagnosis, diagnose
-from shapepose_fg.cameras.check.evidence import Look
+from shapepose_fg.cameras.check.evidence import SetupHypothesis
 from shapepose_fg.cameras.check.findings import Finding, Kind, sentence
 from shapepose_fg.cameras.resection import match
 from shapepose_fg.cameras.sightings import GATE, miss_px, size_of
@@ -97,10 +97,10 @@ class SetupReport:
         """The warnings, with their consequences for a reconstruction."""
         out = {view for view, _, _ in self.trust.left_out}
         words = [
-            f"{said}. It is left out of these frames (--no-check keeps it)"
+            f"{warning}. It is left out of these frames (--no-check keeps it)"
             if out & set(found.cameras)
-            else said
-            for found, said in zip(self.findings, self.warnings, strict=True)
+            else warning
+            for found, warning in zip(self.findings, self.warnings, strict=True)
         ]
         if len(self.trust.doubted) > 0:
             names = ", ".join(
@@ -154,9 +154,9 @@ def check_setup(
         tuple(sentence(finding, rig) for finding in findings),
         _camera_figures(diagnosis, rig),
         tuple(
-            _pair_figures(diagnosis.look, rig, *pair) for pair in combinations(range(len(rig)), 2)
+            _pair_figures(diagnosis.setup, rig, *pair) for pair in combinations(range(len(rig)), 2)
         ),
-        len(diagnosis.look.evidence.anchors),
+        len(diagnosis.setup.evidence.anchors),
         build.stature if build is not None and build.count > 0 else None,
         diagnosis.trust,
         (*(sentence(finding, rig) for finding in diagnosis.biased), *_children(build)),
@@ -184,20 +184,20 @@ def _spells(spells: Sequence[Spell], names: Sequence[str]) -> list[dict[str, Any
 
 def _camera_figures(diagnosis: Diagnosis, rig: Rig) -> tuple[CameraFigures, ...]:
     """Figures of every camera."""
-    look = diagnosis.look
-    groups, structure = look.structure(steps=5)
+    setup = diagnosis.setup
+    groups, structure = setup.structure(steps=5)
     px = structure.miss_px
-    mm = 1e3 * px * structure.depth / look.views.focal_px
-    seen = np.bincount(look.sightings.view, minlength=len(rig))
+    mm = 1e3 * px * structure.depth / setup.views.focal_px
+    seen = np.bincount(setup.sightings.view, minlength=len(rig))
     remaining = [lag.frames if lag.is_offset else 0 for lag in diagnosis.lags] or [0] * len(rig)
     late = diagnosis.corrected.lag + remaining  # corrected and remaining offset
     found = []
     for view, name in enumerate(rig.names):
-        others, mine, camera = look.others(view), look.seen_by(view), look.camera(view)
-        matched = match(others, mine, camera)
+        others, own, camera = setup.others(view), setup.seen_by(view), setup.camera(view)
+        matched = match(others, own, camera)
         points = others.points[matched.person]
         at, depth = camera.project(points)
-        out_px = miss_px(at, depth, mine.xy[matched.sighting])
+        out_px = miss_px(at, depth, own.xy[matched.sighting])
         figures = CameraFigures(
             camera=name,
             people=int(seen[view]),
@@ -207,7 +207,7 @@ def _camera_figures(diagnosis: Diagnosis, rig: Rig) -> tuple[CameraFigures, ...]
             median_mm=quantile(mm[..., view], 0.5),
             high_mm=quantile(mm[..., view], 0.9),
             left_out_px=quantile(out_px, 0.5),
-            left_out_mm=quantile(1e3 * out_px * depth / look.views.focal_px[view], 0.5),
+            left_out_mm=quantile(1e3 * out_px * depth / setup.views.focal_px[view], 0.5),
             left_out_matched=float(len(matched.person) / max(matched.possible, 1)),
             late_frames=int(late[view]),
         )
@@ -215,12 +215,12 @@ def _camera_figures(diagnosis: Diagnosis, rig: Rig) -> tuple[CameraFigures, ...]
     return tuple(found)
 
 
-def _pair_figures(look: Look, rig: Rig, first: int, second: int) -> PairFigures:
+def _pair_figures(setup: SetupHypothesis, rig: Rig, first: int, second: int) -> PairFigures:
     names = rig.names[first], rig.names[second]
-    groups, possible = look.pair(first, second)
+    groups, possible = setup.pair(first, second)
     if possible == 0:
         return PairFigures(*names, None, None)
-    miss = groups.error * look.sightings.size_px[groups.member[:, first]]
+    miss = groups.error * setup.sightings.size_px[groups.member[:, first]]
     return PairFigures(
         *names, float((groups.error < GATE / 2).sum() / possible), quantile(miss, 0.5)
     )
@@ -509,9 +509,12 @@ def unseen(
         for view in range(len(names)):
             joints = np.bincount(found.joint[found.view == view], minlength=max(core) + 1)
             seen[row, view] = np.median(joints[core])
-    by_two, here = float(np.sort(seen, axis=1)[:, -2].mean()), float(per_frame[looked_at].mean())
+    by_two, mean_rows = (
+        float(np.sort(seen, axis=1)[:, -2].mean()),
+        float(per_frame[looked_at].mean()),
+    )
     # Minimum number of missing people per frame, and minimum share of them, for a warning.
-    if by_two - here < max(0.5, 0.1 * by_two):
+    if by_two - mean_rows < max(0.5, 0.1 * by_two):
         return []
     why = "the others are seen too little, or the cameras do not agree on them"
     # Duration, s, below which people seen by two cameras may lack evidence.
@@ -524,7 +527,7 @@ def unseen(
     most = " and ".join(names[view] for view in two)
     return [
         (
-            f"two cameras see {by_two:.1f} people per frame, but {here:.1f} are found: {why} "
+            f"two cameras see {by_two:.1f} people per frame, but {mean_rows:.1f} are found: {why} "
             f"({most} see most)"
         )
     ]

@@ -13,7 +13,7 @@ import numpy as np
 
 from shapepose_fg.body.model.rotation import exp_so3, log_so3
 from shapepose_fg.cameras.check.biases import BiasedResiduals, BiasMarginal
-from shapepose_fg.cameras.check.evidence import Look
+from shapepose_fg.cameras.check.evidence import SetupHypothesis
 from shapepose_fg.cameras.check.findings import Finding, Kind
 from shapepose_fg.cameras.parameters import (
     CENTRE,
@@ -78,7 +78,7 @@ class SmallErrors:
     """The residuals of a recording, to be explained."""
 
     residuals: BiasedResiduals
-    """Residuals of people associated under the cameras of a look."""
+    """Residuals of people associated under the cameras of a set-up."""
     frame: Index
     """(N,) frame of each person."""
     given: Views
@@ -87,17 +87,19 @@ class SmallErrors:
     """People and views with an unusual bias already accounted for."""
 
     @classmethod
-    def of(cls, look: Look, given: Views | None = None) -> "SmallErrors":
-        """Build the problem from people spread over the frames, relative to the look's own cameras
-        or to `given`.
+    def of(cls, setup: SetupHypothesis, given: Views | None = None) -> "SmallErrors":
+        """Build the problem from people spread over the frames, relative to `given`, by default the
+        set-up's own cameras.
         """
-        groups, structure = look.structure(steps=2)
-        who = followed(groups.frame, structure.points)
+        groups, structure = setup.structure(steps=2)
+        identity = followed(groups.frame, structure.points)
         step = max(1, -(-len(groups) // MOST_PEOPLE))
-        groups, who = groups.rows(slice(None, None, step)), who[::step]
+        groups, identity = groups.rows(slice(None, None, step)), identity[::step]
         frame = groups.frame
-        often = np.bincount(who, minlength=1) >= _LEAST_OF_ONE
-        person = np.unique(np.where(often[who], who, len(often)), return_inverse=True)[1]
+        enough = np.bincount(identity, minlength=1) >= _LEAST_OF_ONE
+        person = np.unique(np.where(enough[identity], identity, len(enough)), return_inverse=True)[
+            1
+        ]
         # Maximum number of parts of a recording at whose borders a camera may be bumped; errors of
         # a detector last for some frames, so a part has `_LEAST_OF_ONE` or more.
         parts = min(8, len(np.unique(frame)) // _LEAST_OF_ONE)
@@ -105,11 +107,11 @@ class SmallErrors:
         part = np.unique(
             np.searchsorted(np.unique(np.ceil(ends)), frame, side="right"), return_inverse=True
         )[1]
-        seen = observed(groups, look.sightings)
+        seen = observed(groups, setup.sightings)
         return cls(
-            BiasedResiduals.of(seen, look.views, person, part),
+            BiasedResiduals.of(seen, setup.views, person, part),
             frame,
-            look.views if given is None else given,
+            setup.views if given is None else given,
         )
 
     @cached_property
@@ -139,10 +141,10 @@ class SmallErrors:
         done = np.zeros(to.shape[1])
         if before is not None:
             done[: len(sigma)] = before / sigma
-        there = np.flatnonzero(to.any(axis=1))
-        to = to[there]
-        H = to.T @ np.array([each.H[np.ix_(there, there)] for each in marginals]) @ to
-        g = np.array([each.g[there] for each in marginals]) @ to - done
+        columns = np.flatnonzero(to.any(axis=1))
+        to = to[columns]
+        H = to.T @ np.array([each.H[np.ix_(columns, columns)] for each in marginals]) @ to
+        g = np.array([each.g[columns] for each in marginals]) @ to - done
         known = H + np.eye(len(done))
         best = np.linalg.solve(known, g[..., None])[..., 0]
         gain = (g * best).sum(axis=1) - done @ done - np.linalg.slogdet(known)[1]
@@ -269,22 +271,22 @@ class SmallErrors:
 
     def _rare(self, kind: Kind) -> float:
         """Log prior probability of one kind of mistake of one camera."""
-        often = _KNOCKED if kind in (Kind.TURNED, Kind.MOVED) else 1
-        return float(np.log(_WRONG * often / (len(self.given) * (len(ONE) + 2 * _KNOCKED))))
+        frequency = _KNOCKED if kind in (Kind.TURNED, Kind.MOVED) else 1
+        return float(np.log(_WRONG * frequency / (len(self.given) * (len(ONE) + 2 * _KNOCKED))))
 
 
 def probable(causes: list[ErrorCause]) -> list[ErrorCause]:
     """Mutually exclusive causes, most probable first, with the probability of each finding."""
     total = np.logaddexp.reduce([each.log for each in causes])
-    told = list[ErrorCause]()
+    ranked = list[ErrorCause]()
     for each in sorted(causes, key=lambda each: -each.log):
         sure = float(np.exp(each.log - total))
-        told.append(
+        ranked.append(
             replace(
                 each, finding=None if each.finding is None else replace(each.finding, sure=sure)
             )
         )
-    return told
+    return ranked
 
 
 def _between(given: Views, views: Views, view: int) -> Array:

@@ -40,7 +40,10 @@ _FITS_S = 5.0
 
 
 def offsets_without_poses(
-    tracks: list[CameraTracks], fps: float, most_s: float, told: Callable[[], None] = lambda: None
+    tracks: list[CameraTracks],
+    fps: float,
+    most_s: float,
+    advance: Callable[[], None] = lambda: None,
 ) -> Array:
     """(V,) shifts in frames: frame f of the first camera is frame f + shift of another, to a few
     frames.
@@ -73,28 +76,28 @@ def offsets_without_poses(
     groups = [{view: 0} for view in range(len(tracks))]
     while len(groups) > 1:
         offers = [
-            (worth, one, other, apart)
+            (prominence, one, other, apart)
             for one, other in combinations(range(len(groups)), 2)
-            for worth, apart in _peaks(
+            for prominence, apart in _peaks(
                 groups[one], groups[other], curves, most, round(_AROUND_S * fps / step)
             )
         ]
         best = (-1.0, 0, 1, 0)
-        for worth, one, other, apart in sorted(offers, reverse=True):
+        for prominence, one, other, apart in sorted(offers, reverse=True):
             pairs = [
                 (a, b, apart + groups[other][b] - groups[one][a])
                 for a in groups[one]
                 for b in groups[other]
             ]
             pairs.sort(key=lambda pair: -curves[pair[:2]][np.clip(pair[2] + most, 0, 2 * most)])
-            merit = worth * float(np.mean([fit(*pair) for pair in pairs[:_PAIRS]]))
+            merit = prominence * float(np.mean([fit(*pair) for pair in pairs[:_PAIRS]]))
             best = max(best, (merit, one, other, apart))
             if merit > _SURE:
                 break
         _, one, other, apart = best
         groups[one] |= {view: at + apart for view, at in groups[other].items()}
         del groups[other]
-        told()
+        advance()
     shift = np.array([groups[0][view] for view in range(len(tracks))])
     return (shift - shift[0]) * float(step)
 
@@ -137,9 +140,9 @@ def _rises(tracks: CameraTracks, step: int, fps: float) -> list[tuple[int, Array
 
 
 def _add_likeness(
-    worth: Array, a: list[tuple[int, Array]], b: list[tuple[int, Array]], least: int
+    significance: Array, a: list[tuple[int, Array]], b: list[tuple[int, Array]], least: int
 ) -> None:
-    """Add to `worth` (2 L + 1,), at offsets -L to L of b against a, the significance of the
+    """Add to `significance` (2 L + 1,), at offsets -L to L of b against a, the significance of the
     similarity of tracks.
 
     Tracks are compared if they have at least `least` common samples.
@@ -158,9 +161,9 @@ def _add_likeness(
                 power_other[stop + apart] - power_other[start + apart]
             )
             square = dots**2 / np.maximum(energy, 1e-12)
-            place = begin_other - begin_one + apart + len(worth) // 2
-            alike = (stop - start >= least) & (dots > 0) & (square > _LEAST_ALIKE**2)
-            alike &= (place >= 0) & (place < len(worth))
-            worth[place[alike]] -= (stop - start)[alike] * np.log(
-                np.maximum(1 - square[alike], 1e-6)
+            place = begin_other - begin_one + apart + len(significance) // 2
+            significant = (stop - start >= least) & (dots > 0) & (square > _LEAST_ALIKE**2)
+            significant &= (place >= 0) & (place < len(significance))
+            significance[place[significant]] -= (stop - start)[significant] * np.log(
+                np.maximum(1 - square[significant], 1e-6)
             )

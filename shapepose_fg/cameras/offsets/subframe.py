@@ -86,9 +86,9 @@ class Pairwise:
                 break
             width = 3.8 * np.median(np.abs(miss[known]))
             pace = max(float(np.median(np.diff(one.frame[rows]))), 1.0)
-            who = one.track[rows] * len(other.first) + track
+            pair = one.track[rows] * len(other.first) + track
             miss, change = (
-                fast_part(each, known, who, FAST_S * self.fps / pace)
+                fast_part(each, known, pair, FAST_S * self.fps / pace)
                 for each in (np.clip(miss, -width, width), change)
             )
             width = 3.8 * np.median(np.abs(miss[known]))
@@ -143,14 +143,14 @@ class InSpace:
             now = times[:, None] + shift[v]
             row, which = np.nonzero((now >= each.frame[each.first]) & (now < each.lasts))
             xy = _pixels(each.at(which, times[row] + shift[v])[0], views.K[v] @ views.cTw[v, :, :3])
-            there = np.isfinite(xy[..., 0]).astype(float)
-            parts.append(Sightings(row, np.full(len(row), v), xy, there))
+            known = np.isfinite(xy[..., 0]).astype(float)
+            parts.append(Sightings(row, np.full(len(row), v), xy, known))
             owners.append(which)
-        seen, whose = Sightings.concatenate(parts), np.concatenate(owners)
+        seen, owner = Sightings.concatenate(parts), np.concatenate(owners)
         enough = seen.confidence.sum(axis=1) >= MIN_JOINTS
-        seen, whose = seen.rows(enough), whose[enough]
+        seen, owner = seen.rows(enough), owner[enough]
         groups = Pairs.of(seen, views).groups(len(seen), tuple(range(len(tracks))))
-        member = np.where(groups.member >= 0, np.append(whose, -1)[groups.member], -1)
+        member = np.where(groups.member >= 0, np.append(owner, -1)[groups.member], -1)
         agree = np.zeros(member.shape)
         for a, b in combinations(range(len(tracks)), 2):
             same = np.zeros((len(tracks[a].first) + 1, len(tracks[b].first) + 1))
@@ -199,9 +199,9 @@ class InSpace:
         members = enumerate(zip(self.tracks, np.maximum(self.member, 0).T, strict=True))
         found = [each.at(track, self.time + shift[view]) for view, (each, track) in members]
         rays, speed = (np.stack([each[n] for each in found], axis=2) for n in (0, 1))
-        there = self.member >= 0
-        rays = np.where(there[:, None, :, None], rays, np.nan)
-        size = np.where(there, np.stack([each[2] for each in found], axis=1), np.nan)
+        has_track = self.member >= 0
+        rays = np.where(has_track[:, None, :, None], rays, np.nan)
+        size = np.where(has_track, np.stack([each[2] for each in found], axis=1), np.nan)
         return rays, speed, _pixels(rays, self.views.K @ self.views.cTw[:, :, :3]), size
 
     def _moving(self, points: Array, speed: Array) -> Array:
@@ -239,19 +239,19 @@ class InSpace:
         away = placed.points - centres_of(self.views)[view]
         miss = np.where(seen, placed.miss_px / (size * self.views.focal_px)[:, None], 0.0)
         good = ((seen.sum(axis=-1) >= 2) & (miss.max(axis=-1) < GATE / 2))[..., None]
-        there = np.where(good, away / np.linalg.norm(away, axis=-1, keepdims=True), np.nan)
+        directions = np.where(good, away / np.linalg.norm(away, axis=-1, keepdims=True), np.nan)
         moving = self._moving(placed.points, np.where(seen[..., None], speed, np.nan))
-        theirs = _across(placed.points, moving, centres_of(self.views)[view])
+        predicted = _across(placed.points, moving, centres_of(self.views)[view])
         order = np.lexsort((self.time, self.member[:, view]))
         rows = order[self.member[order, view] >= 0]
-        whom, time, mine = self.member[rows, view], self.time[rows], rays[rows]
-        mine = mine / np.linalg.norm(mine, axis=-1, keepdims=True)
-        each = np.stack([mine - there[rows], theirs[rows], speed[rows, :, view]])
+        track, time, own_rays = self.member[rows, view], self.time[rows], rays[rows]
+        own_rays = own_rays / np.linalg.norm(own_rays, axis=-1, keepdims=True)
+        each = np.stack([own_rays - directions[rows], predicted[rows], speed[rows, :, view]])
         each /= size[rows, view][:, None, None]
         length = np.linalg.norm(each, axis=-1)
         known = (length[0] < GATE / 2) & (length[1:] < FASTEST / self.fps).all(axis=0)
         width = FAST_S * self.fps / self.step
-        miss, calm, fast = (fast_part(part, known[..., None], whom, width) for part in each)
+        miss, calm, fast = (fast_part(part, known[..., None], track, width) for part in each)
         if not known.any():
             return 0.0, np.full(blocks, np.inf)
         length = np.linalg.norm(miss, axis=-1)
@@ -264,7 +264,7 @@ class InSpace:
             return 0.0, np.full(blocks, np.inf)
         score = (weight * (calm * miss).sum(axis=-1)).sum(axis=1)
         when = ((time - self.time.min()) // block).astype(np.intp)
-        (when, _), each = np.unique(np.stack([when, whom]), axis=1, return_inverse=True)
+        (when, _), each = np.unique(np.stack([when, track]), axis=1, return_inverse=True)
         score, gains = np.bincount(each.reshape(-1), score), np.bincount(each.reshape(-1), gains)
         late, trust = score.sum() / gain, np.ones(len(score))
         for _ in range(10):  # reweighted mean

@@ -20,7 +20,7 @@ from shapepose_fg.cli.options import (
     option,
 )
 from shapepose_fg.cli.stopping import Stopped
-from shapepose_fg.cli.terminal import bars, note, show, warn
+from shapepose_fg.cli.terminal import bars, note, show, show_written, warn
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.result_files import PEOPLE
 from shapepose_fg.core.result_files import RUN as RUN_FILE
@@ -76,8 +76,8 @@ def _run(
     sizes = look_at_all(table, todo, output, begun=running.resume or running.restart)
     if len(todo) > 0:
         with ExitStack() as opened:
-            here = running.cluster in (None, "local")
-            if here:
+            is_local = running.cluster in (None, "local")
+            if is_local:
                 scheduler = opened.enter_context(
                     local_cluster(running.workers or cores(), dashboard=True)
                 )
@@ -92,7 +92,7 @@ def _run(
                 if len(todo) == len(entries)
                 else f", {len(entries) - len(todo)} of them are already done"
             )
-            _say(scheduler, f"{len(entries)} recordings{done}", count, here=here)
+            _say(scheduler, f"{len(entries)} recordings{done}", count, here=is_local)
             batch_status.write()
             runner = BatchRunner(entries, sizes, output, scheduler.address, count)
             try:
@@ -106,7 +106,7 @@ def _run(
                 )
                 raise Stopped(stop.number, where) from None
     show(batch_status.summary(time.monotonic() - begin))
-    print(f"written  {output / BATCH}")
+    show_written([str(output / BATCH)])
     for name in (failed := batch_status.names("failed")):
         warn(f"{name}: {batch_status.of[name].reasons[-1]}")
     if len(failed) > 0:
@@ -135,11 +135,11 @@ def status_of(
     for entry in entries:
         wanted = asked(entry.request)
         old = before.get(entry.name, RecordingStatus(wanted, anew=restart))
-        there = all((output / entry.name / name).is_file() for name in (PEOPLE, RUN_FILE))
+        finished = all((output / entry.name / name).is_file() for name in (PEOPLE, RUN_FILE))
         changed = old.asked != wanted
         if changed:
             note(f"{entry.name}: its options in the table have changed; it is reconstructed again")
-        is_done = not changed and old.status == "done" and there
+        is_done = not changed and old.status == "done" and finished
         found[entry.name] = old if is_done else RecordingStatus(wanted, anew=changed or old.anew)
     return found
 

@@ -28,7 +28,7 @@ from shapepose_fg.cli.batch.table import LOG, Entry
 from shapepose_fg.cli.reconstruct.request import OUTPUTS, Request, prepare
 from shapepose_fg.cli.reconstruct.run import Ended, carry_out
 from shapepose_fg.cli.stopping import Stopped, stoppable
-from shapepose_fg.cli.terminal import note, use_any_streams
+from shapepose_fg.cli.terminal import forget_notes, note, use_any_streams
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.result_files import PEOPLE
 from shapepose_fg.core.storage.files import files_below, inside, open_regular
@@ -103,8 +103,8 @@ class BatchRunner:
                     leaders.append(Leader(Assignment(entry.name, entry.request, folder, *how)))
                 if len(leaders) == 0:
                     break
-                for ready in wait([leader.told for leader in leaders]):
-                    leader = next(each for each in leaders if each.told is ready)
+                for ready in wait([leader.messages for leader in leaders]):
+                    leader = next(each for each in leaders if each.messages is ready)
                     if self._heard(leader, batch_status, watcher):
                         leaders.remove(leader)
         finally:
@@ -142,11 +142,11 @@ class BatchRunner:
 
     def _heard(self, leader: "Leader", batch_status: BatchStatus, watcher: Bars) -> bool:
         """Process the next message of a coordinator; returns whether it has ended."""
-        name, told = leader.assignment.name, leader.next()
-        if told is not None:
+        name, message = leader.assignment.name, leader.next()
+        if message is not None:
             if batch_status.of[name].anew:  # what is saved from now on belongs to this run
                 batch_status.set(name, replace(batch_status.of[name], anew=False))
-            watcher.frames(name, *told)
+            watcher.frames(name, *message)
             return False
         found = leader.end()
         if isinstance(found, Ended):
@@ -173,7 +173,7 @@ class Leader:
         self.assignment = assignment
         self.began = time.monotonic()
         """Start time, by `time.monotonic`."""
-        self.told, tell = Pipe(duplex=False)
+        self.messages, tell = Pipe(duplex=False)
         """Messages of the process: (finished frames, all frames). It is closed at the end."""
         self._process = Processes(1, _tell_by, tell)
         tell.close()
@@ -183,7 +183,7 @@ class Leader:
     def next(self) -> tuple[int, int] | None:
         """The next message; None if the process has ended."""
         try:
-            return self.told.recv()
+            return self.messages.recv()
         except (EOFError, OSError):
             return None
 
@@ -194,7 +194,7 @@ class Leader:
         # Maximum time for a coordinator to stop, s.
         wait_for([self._end], 20.0)
         self._process.shutdown()
-        self.told.close()
+        self.messages.close()
         try:
             return self._end.result(0)
         except (BrokenProcessPool, OSError):
@@ -221,6 +221,7 @@ def _lead(assignment: Assignment) -> Ended | str:
     failure. All output is appended to the log of the recording.
     """
     use_any_streams()
+    forget_notes()
     log = inside(assignment.folder, LOG)
     with log.open("ab", buffering=0) as stream:
         stream.write(f"--- {time.strftime('%Y-%m-%d %H:%M:%S')}\n".encode())
@@ -230,7 +231,7 @@ def _lead(assignment: Assignment) -> Ended | str:
         reconfigure: Any = getattr(stream, "reconfigure", lambda **_: None)
         reconfigure(encoding="utf-8", line_buffering=True)
     execution = Execution(
-        None, assignment.cluster, assignment.sharing, progress=lambda *told: _tell.send(told)
+        None, assignment.cluster, assignment.sharing, progress=lambda *counts: _tell.send(counts)
     )
     try:
         with stoppable():
@@ -290,7 +291,7 @@ def look_at_all(
 
 def _look_at(entry: Entry, folder: Path, begun: bool) -> int:
     """Check one recording; returns the size of its detections, bytes."""
-    known = prepare(entry.request, folder, tell=lambda *_: None)
+    known = prepare(entry.request, folder, notify=lambda *_: None)
     asked = known.request
     _, places, _ = find_places(known.detections, asked.rig())
     find_skeleton(asked.skeleton)

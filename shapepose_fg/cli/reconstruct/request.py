@@ -183,15 +183,15 @@ class Prepared:
             return check_cuts(self.request.cuts, count)
 
 
-def prepare(request: Request, output: Path | None, tell: Callable[..., None] = note) -> Prepared:
+def prepare(request: Request, output: Path | None, notify: Callable[..., None] = note) -> Prepared:
     """Find a request's paths, and check its options, before any large file is read.
 
-    `tell` receives notes on how a project's files were interpreted. InputError if something is
+    `notify` receives notes on how a project's files were interpreted. InputError if something is
     missing or wrong.
     """
     from shapepose_fg.io.recording import times_beside
 
-    request, project = request.completed(tell)
+    request, project = request.completed(notify)
     if project is not None:
         output = output or project.output
         if request.fps is None and request.timestamps is None:

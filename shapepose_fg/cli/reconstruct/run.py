@@ -20,7 +20,7 @@ from shapepose_fg.cli.found_cameras import MOST_S, found_clocks, show_clocks
 from shapepose_fg.cli.reconstruct.request import OUTPUTS, Prepared
 from shapepose_fg.cli.reconstruct.summary import check_setup, show_check, summary_table
 from shapepose_fg.cli.stopping import Stopped
-from shapepose_fg.cli.terminal import note, progress, show
+from shapepose_fg.cli.terminal import note, note_of_reading, progress, show, show_written
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.errors import InputError, failure, naming
 from shapepose_fg.core.provenance import ReadInputs, checksums, program_digest, versions
@@ -98,10 +98,10 @@ def carry_out(
         recording, times = read_recording(
             known.detections, rig, known.skeleton, kept, asked.fps, asked.timestamps
         )
-        note(*recording.notes)
+        note_of_reading(*recording.notes)
         count = len(recording)
         span, cuts = known.span(count, recording.first), known.cuts(count)
-        execution = replace(execution, chunk_frames=asked.chunk_frames).worth(len(span))
+        execution = replace(execution, chunk_frames=asked.chunk_frames).with_workers(len(span))
         fitter = None
         if asked.body is not None:
             model = BodyModel.load(asked.body).with_keypoints(recording.skeleton.joints)
@@ -153,14 +153,14 @@ def _about_moving(task: Task) -> list[str]:
     rig, (_, times, _) = task.rig, task.whole()
     if not rig.moves:
         return []
-    told = ["cameras move: the set-up check needs fixed cameras and is left out"]
+    notes = ["cameras move: the set-up check needs fixed cameras and is left out"]
     if (rig.carrier >= 0).all():
-        told.append(
+        notes.append(
             "no camera is fixed: the world frame is the start of the first trajectory, and "
             "drifts with it"
         )
     if not task.config.temporal:
-        told.append("frame by frame: trajectories are used as given, without uncertainty")
+        notes.append("frame by frame: trajectories are used as given, without uncertainty")
     spells = without_poses(rig, times)
     for view in sorted({view for view, _, _ in spells}):
         spans = [(first, last) for each, first, last in spells if each == view]
@@ -168,7 +168,7 @@ def _about_moving(task: Task) -> list[str]:
             sum(last - first for first, last in spans),
             ", ".join(f"{a}:{b}" for a, b in spans[:4]),
         )
-        told.append(
+        notes.append(
             f"{rig.names[view]}: frames outside its trajectory are not used: {count} "
             f"({where}{' ...' * (len(spans) > 4)})"
         )
@@ -179,7 +179,7 @@ def _about_moving(task: Task) -> list[str]:
                 f"pictures of {rig.names[view]} from {time_s[0]:.10g} to {time_s[-1]:.10g}; give "
                 "--timestamps of its clock"
             )
-    return told
+    return notes
 
 
 @contextmanager
@@ -252,11 +252,11 @@ class _Run:
             with naming(kept.folder, ANEW) if resume else nullcontext():
                 return self._finished(kept)
         except Stopped as stop:
-            raise Stopped(stop.number, self._standing()) from None
+            raise Stopped(stop.number, self._interrupted_state()) from None
         except (OSError, MemoryError, RuntimeError) as error:
             if (what := failure(error)) is None:
                 raise
-            raise InputError(f"{what}; {self._standing()}") from None
+            raise InputError(f"{what}; {self._interrupted_state()}") from None
 
     def _finished(self, kept: InFolder) -> Ended:
         """Assemble the reconstruction, write its files, and return its summary."""
@@ -271,10 +271,10 @@ class _Run:
         if file is not None:
             known = manifest.people_at_start(kept, file, lambda: _known_people(file, asked.body))
         start = time.perf_counter()
-        told = self.execution.progress
+        callback = self.execution.progress
         task = replace(self.task, shapes=known)
-        with progress("reconstructing") if told is None else nullcontext(told) as told:
-            result = reconstruct_parts(kept, task, replace(self.execution, progress=told))
+        with progress("reconstructing") if callback is None else nullcontext(callback) as callback:
+            result = reconstruct_parts(kept, task, replace(self.execution, progress=callback))
         seconds = time.perf_counter() - start
         if file is not None and known is not None and len(known) > 0:
             inputs[str(file)] = manifest.checksum_at_start(kept)
@@ -321,13 +321,13 @@ class _Run:
         else:
             (output / MOMENTS).unlink(missing_ok=True)
         summary = summary_table(result, people, self.task, seconds, unchecked=checked is None)
-        for n, written in enumerate(self._written(result, people, rig, every)):
-            summary.add_row("" if n > 0 else "written", written)
+        written = self._written(result, people, rig, every)
         if file is not None and known is not None and result.shapes is not None:
             manifest.write_people(kept, file, known.updated(result.shapes))
-            summary.add_row("", f"{file}  shapes of {len(result.shapes)} people")
+            written.append(f"{file}  shapes of {len(result.shapes)} people")
         manifest.end_run(output)
         show(summary)
+        show_written(written)
         if checked is not None:
             show_check(checked)
         count = len(result.parts_of) if self.task.config.temporal else None
@@ -369,7 +369,7 @@ class _Run:
             note(*made.notes)
         return written
 
-    def _standing(self) -> str:
+    def _interrupted_state(self) -> str:
         """The state of an interrupted run, and how to resume it."""
         output, count = self.known.output, len(self.task.whole()[0])
         try:

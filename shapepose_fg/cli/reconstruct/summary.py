@@ -56,7 +56,7 @@ def summary_table(
     run, counts, span, cameras = result.run, result.counts(), task.whole()[0], len(task.rig)
     per_frame = np.bincount(result.columns()["frame"].array() - span.start, minlength=len(span))
     table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
-    table.add_column(style="bold")
+    table.add_column(style="bold", min_width=len("written"))  # the line after the table
     table.add_column(overflow="fold")
     table.add_row(
         "frames", f"{len(span)} ({span.start}:{span.stop}) of {cameras} cameras{rate_words(run)}"
@@ -134,26 +134,28 @@ def _doubtful(run: dict[str, Any]) -> str:
     """People with a probability below `_SURE`; without identities, their number of rows; empty if
     there are none.
     """
-    said = run.get("probability", [])
-    if isinstance(said, dict):
-        count = sum(rows for tenth, rows in said.items() if float(tenth) < _SURE)
+    probabilities = run.get("probability", [])
+    if isinstance(probabilities, dict):
+        count = sum(rows for tenth, rows in probabilities.items() if float(tenth) < _SURE)
         return f"{count} have a probability below {_SURE}" if count > 0 else ""
-    few = [
+    unlikely = [
         f"{each['person']} ({each['probability']:.2f})"
-        for each in said
+        for each in probabilities
         if each["probability"] < _SURE
     ]
     return (
-        f"probability below {_SURE}: person {', '.join(few[:8])}{' ...' * (len(few) > 8)}"
-        if few
+        f"probability below {_SURE}: person {', '.join(unlikely[:8])}{' ...' * (len(unlikely) > 8)}"
+        if unlikely
         else ""
     )
 
 
 def _frames_words(spans: list[list[int]]) -> str:
     """The frames in words, shortened to fit; run.json has all."""
-    told = [f"{start}" if stop == start + 1 else f"{start}-{stop - 1}" for start, stop in spans[:4]]
-    return f" (frames {' '.join(told)}{' ...' * (len(spans) > 4)})" if told else ""
+    words = [
+        f"{start}" if stop == start + 1 else f"{start}-{stop - 1}" for start, stop in spans[:4]
+    ]
+    return f" (frames {' '.join(words)}{' ...' * (len(spans) > 4)})" if words else ""
 
 
 def _joints(count: dict[str, int], people: Reconstruction) -> str:

@@ -120,9 +120,11 @@ class InFolder(KeptArrays):
 
     def keep(self, name: str, arrays: Arrays, about: Any = None) -> None:
         content = {key: np.ascontiguousarray(array) for key, array in arrays.items()}
-        arrays_say = json.dumps({key: _digest(key, array) for key, array in content.items()})
-        said = {"about": json.dumps(about), "arrays": arrays_say}
-        write_content(self._file(name), save(content, said | {"sha256": self._seal(name, said)}))
+        arrays_text = json.dumps({key: _digest(key, array) for key, array in content.items()})
+        metadata = {"about": json.dumps(about), "arrays": arrays_text}
+        write_content(
+            self._file(name), save(content, metadata | {"sha256": self._seal(name, metadata)})
+        )
 
     def drop(self, name: str) -> None:
         self._file(name).unlink(missing_ok=True)
@@ -145,10 +147,10 @@ class InFolder(KeptArrays):
     def _file(self, name: str) -> Path:
         return self.folder / f"{name}{_SUFFIX}"
 
-    def _seal(self, name: str, said: Mapping[str, str]) -> str:
+    def _seal(self, name: str, metadata: Mapping[str, str]) -> str:
         """Digest of all metadata of a file, which include the digests of its arrays."""
         return hashlib.sha256(
-            json.dumps([self.run, name, said["about"], said["arrays"]]).encode()
+            json.dumps([self.run, name, metadata["about"], metadata["arrays"]]).encode()
         ).hexdigest()
 
     @contextmanager
@@ -166,13 +168,15 @@ class InFolder(KeptArrays):
             if self._checked.get((name, None)) != stamp:
                 open_regular(inside(self.folder, file.name), ANEW, LARGE).close()
             with safe_open(file, framework="numpy") as content:
-                said, right = content.metadata() or {}, True
+                metadata, right = content.metadata() or {}, True
                 if self._checked.get((name, None)) != stamp:
-                    right = said.keys() == {"about", "arrays", "sha256"} and said[
+                    right = metadata.keys() == {"about", "arrays", "sha256"} and metadata[
                         "sha256"
-                    ] == self._seal(name, said)
+                    ] == self._seal(name, metadata)
                 if right and key is not None and self._checked.get((name, key)) != stamp:
-                    right = json.loads(said["arrays"])[key] == _digest(key, content.get_tensor(key))
+                    right = json.loads(metadata["arrays"])[key] == _digest(
+                        key, content.get_tensor(key)
+                    )
                 if not right:
                     raise ValueError("its content has changed, or it belongs to another run")
                 self._checked[name, None] = self._checked[name, key] = stamp

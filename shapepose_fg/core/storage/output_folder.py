@@ -51,9 +51,9 @@ def only_run_in(folder: Path, names: Iterable[str]) -> Iterator[None]:
         lock.acquire()
     except Timeout:
         number = file.read_text().strip() if file.is_file() else ""
-        whose = f" (process {number})" if number.isdecimal() else ""
+        process = f" (process {number})" if number.isdecimal() else ""
         raise InputError(
-            f"{folder}: another run writes its results here{whose}; wait for it, or give another "
+            f"{folder}: another run writes its results here{process}; wait for it, or give another "
             "--output"
         ) from None
     try:

@@ -258,7 +258,7 @@ _FREEMOCAP = ("charuco_", "freemocap", "groundplane_", "solver_method", "board")
 2."""
 
 
-def _said_by_freemocap(metadata: Mapping[str, Any]) -> tuple[Unit | None, Axis | None]:
+def _unit_and_up_of_freemocap(metadata: Mapping[str, Any]) -> tuple[Unit | None, Axis | None]:
     """Unit and up axis of FreeMoCap's files, if its version wrote them: the board's size in mm; z
     is up if the board was on the floor.
     """
@@ -317,7 +317,7 @@ def _read_tables(content: Content, program: str) -> WrittenRig | None:
         cameras.append(node.camera(name, "matrix", wTc, ["size"], "distortions", lens))
     unit, up, cures = _DIALECTS[program]
     if program == "FreeMoCap":
-        unit, up = _said_by_freemocap(metadata)
+        unit, up = _unit_and_up_of_freemocap(metadata)
     return WrittenRig(cameras, unit, up, cures, notes=notes)
 
 

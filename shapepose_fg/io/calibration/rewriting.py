@@ -155,11 +155,11 @@ def _opencv(content: Content, rig: Rig, metres: float) -> Files:
     of_all = {"Ks": INTRINSIC, "Rs": TURN, "Ts": SHIFT, "distortions": BEND}
 
     def value(keys: tuple[str, ...], count: int) -> ArrayLike | None:
-        (whose, key), (name, _, tag) = keys[-2:], keys[-1].partition("_")
+        (parent, key), (name, _, tag) = keys[-2:], keys[-1].partition("_")
         if name in tagged and tag in tags:
             return numbers_of(tagged[name].split()[0], tags[tag], metres, count)
-        if whose in cameras or key not in of_all:
-            return numbers_of(key, cameras[whose], metres, count) if whose in cameras else None
+        if parent in cameras or key not in of_all:
+            return numbers_of(key, cameras[parent], metres, count) if parent in cameras else None
         # Four coefficients per fisheye camera, and an equal number for each other camera.
         kind, four = (
             of_all[key],

@@ -38,14 +38,16 @@ def write_like(source: Path, rig: Rig, target: Path, unit: Unit | None = None) -
     name and the written path.
 
     Poses, intrinsics and distortions are replaced; all other values are unchanged. For formats
-    of several files, `target` is a folder, without file extension. `unit` is the argument given to
+    of several files, `target` is a folder, without file extension. If the format is no JSON, a
+    target named .json gets this project's rig file. `unit` is the argument given to
     `read_rig`. The file is read back; if the result is not equal to `rig` (the format lacks a
     field, the file is unusual, or `rig` has only some of its cameras), this project's rig file is
     written instead, with the extension .json. Raises InputError as `check_target` does.
     """
     check_target(source, target)
     content, form, written = _found(source)
-    if [each.name for each in written.cameras] != list(rig.names):
+    asks_own = target.suffix.lower() == ".json" and content.syntax != "JSON"
+    if asks_own or [each.name for each in written.cameras] != list(rig.names):
         return _own(rig, target)
     metres = METRES[unit or written.unit or "m"]
     if content.syntax == "JSON":

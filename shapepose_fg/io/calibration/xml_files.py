@@ -71,11 +71,11 @@ def _cameras(
         if not camera.get(name):
             raise InputError(f"{place}: {name} is missing; export the calibration again")
         cameras.append(read(camera, f'{place} "{camera.get(name)}"'))
-        if (said := camera.get(_RESOLUTION, "")) and _LINES.fullmatch(said) is None:
-            unnamed.setdefault(said[:20], []).append(camera.attrib[name])
-    for said, names in unnamed.items():
+        if (resolution := camera.get(_RESOLUTION, "")) and _LINES.fullmatch(resolution) is None:
+            unnamed.setdefault(resolution[:20], []).append(camera.attrib[name])
+    for resolution, names in unnamed.items():
         size = "the size of the pictures is assumed to be that of fov_video"
-        notes.append(f"{_RESOLUTION} is {said!r} of camera {listing(names)}; {size}")
+        notes.append(f"{_RESOLUTION} is {resolution!r} of camera {listing(names)}; {size}")
     for camera in content.value.findall(path):
         if camera not in used:
             why = (

@@ -60,8 +60,10 @@ def read_deeplabcut(path: Path) -> CameraPeople:
             f"{_RERUN}"
         )
     count = min(len(heads["bodyparts"]), len(heads["coords"]))
-    whose = heads.get("individuals", [""] * count)
-    joints, picked = body_parts(path, zip(whose, heads["bodyparts"], heads["coords"], strict=False))
+    individuals = heads.get("individuals", [""] * count)
+    joints, picked = body_parts(
+        path, zip(individuals, heads["bodyparts"], heads["coords"], strict=False)
+    )
     width = count + 1
 
     blocks, first, last = list[PeopleBlock](), 0, -1
@@ -138,14 +140,16 @@ def _points(path: Path) -> Array:
     rows = _rows(path)
     _, head = next(rows)
     names = [word.strip() for word in head]
-    who = next((name for name in ("cam_id", "port") if name in names), None)
+    camera_column = next((name for name in ("cam_id", "port") if name in names), None)
     what = next((name for name in ("keypoint_id", "point_id") if name in names), None)
-    if who is None or what is None:
+    if camera_column is None or what is None:
         raise InputError(
             f"{path}: columns cam_id and keypoint_id (or port and point_id) are missing; export "
             "it again"
         )
-    columns = [names.index(each) for each in ("sync_index", who, what, "img_loc_x", "img_loc_y")]
+    columns = [
+        names.index(each) for each in ("sync_index", camera_column, what, "img_loc_x", "img_loc_y")
+    ]
     parts = []
     while len(some := list(islice(rows, ROWS_AT_ONCE))) > 0:
         values = np.array([_numbers(path, line, row, len(names)) for line, row in some])[:, columns]

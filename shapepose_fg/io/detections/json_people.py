@@ -103,8 +103,8 @@ def _keypoints(person: Any, place: str, program: str) -> Array:
 def _member(record: Any, key: str, place: str, program: str) -> Any:
     """The value of a key; InputError if it is missing."""
     if not isinstance(record, dict) or key not in record:
-        told = "" if isinstance(record, dict) else f" in {describe(record)}"
-        raise InputError(f"{place}{key} is missing{told}; {_RERUN[program]}")
+        description = "" if isinstance(record, dict) else f" in {describe(record)}"
+        raise InputError(f"{place}{key} is missing{description}; {_RERUN[program]}")
     return record[key]
 
 

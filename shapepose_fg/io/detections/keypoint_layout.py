@@ -51,7 +51,7 @@ def skeleton_of_people(
             return wanted, [f"{named[1]}, but they are read as {wanted.name}, as requested"]
         return wanted, []
     if named is not None:
-        skeleton, who, passed = named
+        skeleton, source, passed = named
         over = (
             [
                 (
@@ -62,23 +62,23 @@ def skeleton_of_people(
             if passed
             else []
         )
-        return skeleton, [f"joints are those of {skeleton.name}: {who}", *over]
+        return skeleton, [f"joints are those of {skeleton.name}: {source}", *over]
     if declared is not None:
         found, what = _declared(declared, count)
         if found is not None:
             return found[0], [*notes, f"joints are those of {found[0].name}: {what}"]
         notes.append(what)
-    alike = [each for each in SKELETONS.values() if each.keypoint_count == count]
-    if len(alike) == 0:
+    layouts = [each for each in SKELETONS.values() if each.keypoint_count == count]
+    if len(layouts) == 0:
         known = ", ".join(f"{each.keypoint_count} ({each.name})" for each in SKELETONS.values())
         problem = "which is not a known layout"
         raise InputError(
             f"{place}, {problem}; describe the layout in a --skeleton file; known layouts are "
             f"{known}"
         )
-    found, why = (alike[0], "") if len(alike) == 1 else _best_fit(people, alike)
-    said = f"{count} keypoints per person without joint names: read as {found.name}{why}"
-    return found, [*notes, said]
+    found, why = (layouts[0], "") if len(layouts) == 1 else _best_fit(people, layouts)
+    note = f"{count} keypoints per person without joint names: read as {found.name}{why}"
+    return found, [*notes, note]
 
 
 def _best_fit(people: Sequence[KeptPeople], layouts: Sequence[Skeleton]) -> tuple[Skeleton, str]:

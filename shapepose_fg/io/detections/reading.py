@@ -13,7 +13,7 @@ from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import BODY_25, Skeleton
 from shapepose_fg.core.storage.kept_arrays import InMemory, KeptArrays
-from shapepose_fg.io.camera_names import listing, told_by_parts
+from shapepose_fg.io.camera_names import listing, match_by_parts
 from shapepose_fg.io.detection_table import DetectionTable
 from shapepose_fg.io.detections.arrays import (
     cameras_of_freemocap,
@@ -40,7 +40,7 @@ from shapepose_fg.io.detections.people import (
 )
 from shapepose_fg.io.detections.view_streams import ViewStream, assemble
 from shapepose_fg.io.detections.yolo import label_files, read_yolo
-from shapepose_fg.io.footage.placement import FOOTAGE
+from shapepose_fg.io.footage.placement import FOOTAGE, UNFINISHED, UNFINISHED_SETTINGS
 from shapepose_fg.io.skeleton_file import find_skeleton
 
 
@@ -115,17 +115,19 @@ def read_detections(
         else:
             streams.append(read)
     if len(people) > 0:
-        skeleton, told = skeleton_of_people(people, wanted, declared)
-        how = "they are the midpoints of two joints, if both were detected"
-        streams, said, first = _streams_of(people, skeleton)
-        notes += [*said, *told]
+        skeleton, skeleton_notes = skeleton_of_people(people, wanted, declared)
+        how = "the midpoint of two joints, if both were detected"
+        streams, stream_notes, first = _streams_of(people, skeleton)
+        notes += [*stream_notes, *skeleton_notes]
     else:
         skeleton, how = (
             _skeleton_of_streams(streams, wanted),
-            ("they are midpoints of the two joints that their limbs connect"),
+            "the midpoint of the two joints that its limbs connect",
         )
     made = [skeleton.joints[joint] for joint, _, _ in skeleton.middles]
-    notes += [f"{skeleton.name} has no {' and no '.join(made)}: {how}"] if made else []
+    if made:
+        each = "it" if len(made) == 1 else "each"
+        notes.append(f"{skeleton.name} has no {' and no '.join(made)}: {each} is {how}")
     table = assemble(streams, rig, skeleton, kept, own_frames)
     return replace(table, notes=(*notes, *table.notes), first=first)
 
@@ -148,12 +150,17 @@ def find_places(path: Path, rig: Rig) -> tuple[DetectionFormat, list[Path], list
         raise InputError(f"{path}: there is no such folder; check the path")
     folder, entries = _entries(path)
     holds = listing([each.name for each in entries])
+    if (folder / UNFINISHED / UNFINISHED_SETTINGS).is_file():
+        raise InputError(
+            f"{folder}: `detect` was interrupted and has not finished these detections; start the "
+            "same command again to continue"
+        )
     for form in FORMATS:
         found = [_named(folder, name, form.names) for name in rig.names]
-        there = [place for place in found if place is not None]
-        if len(there) == len(rig):
-            return form, there, []
-        if len(there) > 0:
+        places = [place for place in found if place is not None]
+        if len(places) == len(rig):
+            return form, places, []
+        if len(places) > 0:
             missing = rig.names[found.index(None)]
             raise InputError(
                 f'{folder / form.names[0].format(missing)}: the detections of camera "{missing}"'
@@ -163,8 +170,8 @@ def find_places(path: Path, rig: Rig) -> tuple[DetectionFormat, list[Path], list
             )
     # Such as `walk_Miqus_1_23087_json` for camera `23087`, or `cam01_json` for camera `int_cam1`.
     for form, offered, names in _offered(entries):
-        if (told := told_by_parts(folder, rig.names, offered, names)) is not None:
-            return form, *told
+        if (matched := match_by_parts(folder, rig.names, offered, names)) is not None:
+            return form, *matched
     whole = [
         (form, each) for each in entries if (form := _of_all_cameras(each, rig.names)) is not None
     ]
@@ -260,8 +267,8 @@ def _of_all_cameras(file: Path, names: Sequence[str]) -> DetectionFormat | None:
 
 def _unfiltered(files: list[Path]) -> list[Path]:
     """Files without DeepLabCut's `_filtered` versions, if unfiltered ones exist."""
-    there = {each.name for each in files}
-    return [each for each in files if each.name.replace("_filtered", "") not in there - {each.name}]
+    names = {each.name for each in files}
+    return [each for each in files if each.name.replace("_filtered", "") not in names - {each.name}]
 
 
 def _read_folder(place: Path, camera: Camera) -> CameraPeople:

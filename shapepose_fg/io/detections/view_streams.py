@@ -76,7 +76,7 @@ def assemble(
     used, and missing ones are empty. InputError if there are none, or if the detections do not fit
     the size of the pictures.
     """
-    views, count, said = _aligned(views, own_frames)
+    views, count, frame_notes = _aligned(views, own_frames)
     ideal = [
         _Undistorted(view.source, camera) for view, camera in zip(views, rig.cameras, strict=True)
     ]
@@ -86,7 +86,7 @@ def assemble(
         keep_block(kept, n, *_together(seen, range(n * BLOCK_FRAMES, stop)))
     notes = tuple(note for each in ideal for reason in each.reasons for note in reason.note())
     table = DetectionTable(
-        skeleton, kept, count, tuple(view.source for view in views), (*said, *notes)
+        skeleton, kept, count, tuple(view.source for view in views), (*frame_notes, *notes)
     )
     if all(view.frame_count == count for view in views):
         return table
@@ -217,11 +217,12 @@ def in_moments(recording: DetectionTable, picture: Index, kept: KeptArrays) -> D
 
 def _frames_of(recording: DetectionTable, view: int, picture: Index, begin: int) -> ViewCandidates:
     """Candidates of a view in the frames `picture`, renumbered from `begin` on; -1 for none."""
-    there = np.flatnonzero(picture >= 0)
-    every = [recording[frame] for frame in picture[there].tolist()]
+    present = np.flatnonzero(picture >= 0)
+    every = [recording[frame] for frame in picture[present].tolist()]
     parts = [each.only(each.view == view) for each in every]
     frames = [
-        np.full(len(part), begin + frame) for part, frame in zip(parts, there.tolist(), strict=True)
+        np.full(len(part), begin + frame)
+        for part, frame in zip(parts, present.tolist(), strict=True)
     ]
     return _joined([_NOTHING, *map(ViewCandidates, frames, parts)])
 

@@ -56,8 +56,8 @@ def glb_bytes(
         shared[f"WEIGHTS_{number}"] = file.array(weights, _ARRAY)
     triangles = file.array(arrays.faces.reshape(-1).astype(np.uint32), _ELEMENTS)
     roots = []
-    for who, motion in motions.items():
-        roots.append(_add_person(file, who, motion, shared, triangles))
+    for person, motion in motions.items():
+        roots.append(_add_person(file, person, motion, shared, triangles))
         _animate(file, roots[-1], motion, times_s - times_s[0])
     extras = (
         {}
@@ -151,14 +151,14 @@ def influences(weights: Array) -> list[tuple[NDArray[np.uint8], NDArray[np.float
 
 
 def _add_person(
-    file: _File, who: int, motion: SkinnedMotion, shared: dict[str, int], triangles: int
+    file: _File, person: int, motion: SkinnedMotion, shared: dict[str, int], triangles: int
 ) -> int:
     """Add the nodes of a person in the pose of the first frame, with mesh, material and skin;
     returns the index of the first node.
 
     All people have the same `triangles` and `shared` vertex attributes, which are accessors.
     """
-    first, rest, name = len(file.lists["nodes"]), motion.rest, f"person_{who}"
+    first, rest, name = len(file.lists["nodes"]), motion.rest, f"person_{person}"
     file.add("nodes", name=name, children=[first + 1, first + 1 + BONES])
     for joint in range(BONES):
         place = motion.pelvis[0] if joint == 0 else rest.offsets[joint]
@@ -176,7 +176,7 @@ def _add_person(
         "NORMAL": file.array(normals, _ARRAY),
         **shared,
     }
-    surface = {"baseColorFactor": [*_linear(colour_of(who)), 1.0], "metallicFactor": 0.0}
+    surface = {"baseColorFactor": [*_linear(colour_of(person)), 1.0], "metallicFactor": 0.0}
     material = file.add("materials", name=name, pbrMetallicRoughness=surface)
     primitive = {"attributes": attributes, "indices": triangles, "material": material}
     mesh = file.add("meshes", name=name, primitives=[primitive])

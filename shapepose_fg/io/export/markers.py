@@ -125,14 +125,14 @@ def _each(
     write: Callable[[int, Markers, Take, Written], None],
 ) -> Written:
     """Call `write` for each person with a marker; people without markers are noted."""
-    for person, who in enumerate(take.persons.tolist()):
+    for person, identity in enumerate(take.persons.tolist()):
         markers = markers_of(
             take, person, job.markers, job.arrays if job.markers == MarkerSet.BODY else None
         )
         if len(markers.frames) > 0:
-            write(who, markers, take, written)
+            write(identity, markers, take, written)
         else:
-            written.notes.append(f"{kind}: person {who} has no marker in any frame")
+            written.notes.append(f"{kind}: person {identity} has no marker in any frame")
     return written
 
 
@@ -206,7 +206,7 @@ def c3d_bytes(
     world, in the axes of the file.
     """
     ezc3d = optional("ezc3d", "export")
-    xyz, sigma, there = markers.xyz[part], markers.sigma_m[part], markers.there[part]
+    xyz, sigma, exists = markers.xyz[part], markers.sigma_m[part], markers.there[part]
     file = ezc3d.c3d()
     file["header"]["points"]["first_frame"] = first_frame
     point = file["parameters"]["POINT"]
@@ -219,10 +219,10 @@ def c3d_bytes(
     if origin_m is not None and origin_m.any():
         file.add_parameter("POINT", "ORIGIN_M", origin_m.tolist())
     points = np.ones((4, xyz.shape[1], len(xyz)))
-    points[:3] = 1e3 * np.where(there[..., None], xyz, 0).transpose(2, 1, 0)
+    points[:3] = 1e3 * np.where(exists[..., None], xyz, 0).transpose(2, 1, 0)
     residuals = np.nan_to_num(np.clip(np.rint(1e3 * sigma), 1, 255), nan=0.0)
     file["data"]["points"] = points
-    file["data"]["meta_points"]["residuals"] = np.where(there, residuals, -1).T[None]
+    file["data"]["meta_points"]["residuals"] = np.where(exists, residuals, -1).T[None]
     file["data"]["meta_points"]["camera_masks"] = np.zeros((7, xyz.shape[1], len(xyz)), dtype=bool)
     with tempfile.TemporaryDirectory() as folder:  # ezc3d writes only to a path
         path = Path(folder) / "person.c3d"

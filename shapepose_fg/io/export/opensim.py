@@ -71,11 +71,11 @@ def write_opensim(job: Job) -> Written:
          if SKELETONS[layout].joints == tuple(names)),
         None,
     )  # fmt: skip
-    for place, who in enumerate(take.persons.tolist()):
+    for place, identity in enumerate(take.persons.tolist()):
         markers = markers_of(take, place, MarkerSet.OPENSIM)
         if len(markers.frames) == 0:
             continue
-        name = f"person_{who}"
+        name = f"person_{identity}"
         span = "{:.6f} {:.6f}".format(*take.times_s[markers.frames[[0, -1]]])
         scale = _scale_tool(name, markers, span, marker_file or "markers.xml")
         for part, tool in {"scale": scale, "ik": _ik_tool(name, markers, span)}.items():
@@ -99,11 +99,11 @@ def mot_text(take: Take, person: int, model: BodyModel, name: str) -> str | None
     rows = np.flatnonzero(take.rows[person] >= 0)
     people = take.people.rows(take.rows[person][rows])
     angles = joint_angles(people, take.up, model, OPENSIM)
-    there = np.flatnonzero(np.isfinite(angles.degrees[:, 0]))
-    if len(there) == 0:
+    index = np.flatnonzero(np.isfinite(angles.degrees[:, 0]))
+    if len(index) == 0:
         return None
-    people, rows = people.rows(there), rows[there]
-    degrees = np.unwrap(angles.degrees[there], axis=0, period=360)
+    people, rows = people.rows(index), rows[index]
+    degrees = np.unwrap(angles.degrees[index], axis=0, period=360)
     values = {"time": take.times_s[rows]}
     for name_of, column in zip(angles.names, degrees.T, strict=True):
         joint, side = name_of, ""
@@ -132,11 +132,11 @@ def _scale_tool(name: str, markers: Markers, span: str, marker_file: str) -> str
     """Scaling of the model by distances of markers, over the whole recording."""
     measurements = list[str]()
     for what, (pairs, bodies) in _MEASUREMENTS.items():
-        there = [pair for pair in pairs if set(pair.split()) <= set(markers.names)]
-        each = (f"<MarkerPair><markers>{pair}</markers></MarkerPair>" for pair in there)
+        present = [pair for pair in pairs if set(pair.split()) <= set(markers.names)]
+        each = (f"<MarkerPair><markers>{pair}</markers></MarkerPair>" for pair in present)
         scaled = (f'<BodyScale name="{body}"><axes>X Y Z</axes></BodyScale>'
                   for body in bodies.split())  # fmt: skip
-        if there:
+        if present:
             parts = _set("MarkerPairSet", each) + _set("BodyScaleSet", scaled)
             measurements.append(
                 f'<Measurement name="{what}"><apply>true</apply>{parts}</Measurement>'

@@ -244,22 +244,22 @@ def chosen_rows(
     """(R,) rows of these frames and people; None for all. InputError for unknown people."""
     if frames is None and persons is None:
         return None
-    mine = np.ones(len(opened), dtype=bool)
+    selected = np.ones(len(opened), dtype=bool)
     if persons is not None:
         strangers = sorted(set(persons) - set(opened.person.tolist()))
         if strangers:
-            there = " ".join(map(str, np.unique(opened.person).tolist()))
-            raise InputError(f"--person {strangers[0]}: {path} has no such person; it has {there}")
-        mine = np.isin(opened.person, persons)
+            known = " ".join(map(str, np.unique(opened.person).tolist()))
+            raise InputError(f"--person {strangers[0]}: {path} has no such person; it has {known}")
+        selected = np.isin(opened.person, persons)
     if frames is None:
-        return np.flatnonzero(mine)
-    found, there = (
-        mine & (opened.frame >= frames.start) & (opened.frame < frames.stop),
-        opened.frame[mine],
+        return np.flatnonzero(selected)
+    found, known = (
+        selected & (opened.frame >= frames.start) & (opened.frame < frames.stop),
+        opened.frame[selected],
     )
-    if len(there) > 0 and not found.any():
+    if len(known) > 0 and not found.any():
         problem = f"{path} has no people in these frames"
         raise InputError(
-            f"--frames: {problem}; people are in frames {there.min()} to {there.max()}"
+            f"--frames: {problem}; people are in frames {known.min()} to {known.max()}"
         )
     return np.flatnonzero(found)

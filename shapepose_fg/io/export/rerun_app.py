@@ -134,7 +134,7 @@ def write_rrd(job: Job) -> Written:
 
 def layout_of(take: Take) -> Any:
     """The viewer's initial layout for a take."""
-    drawn = [f"{person_path(who)}/bones" for who in take.persons.tolist()]
+    drawn = [f"{person_path(identity)}/bones" for identity in take.persons.tolist()]
     return layout(take.up, take.rig, take.people.joints.reshape(-1, 3), drawn)
 
 

@@ -43,9 +43,9 @@ _GATES = {
 """Colours of unused detections, by reason; used ones have the colour of their person."""
 
 
-def person_path(who: int) -> str:
+def person_path(identity: int) -> str:
     """Path of a person's entities in the recording."""
-    return f"world/people/{who}"
+    return f"world/people/{identity}"
 
 
 def camera_path(name: str) -> str:
@@ -94,11 +94,13 @@ class LiveLog:
         persons, time_s = rows.person.astype(np.int64), rows.time_s[:1]
         if len(rows) > 0:
             self._stream.set_time("time", duration=float(time_s[0]))
-        for who in self._there - set(persons.tolist()):
-            for gone in (person_path(who), _sigma_path(who)):
-                self._stream.log(gone, self._rr.Clear(recursive=True))
+        for identity in self._there - set(persons.tolist()):
+            for path in (person_path(identity), _sigma_path(identity)):
+                self._stream.log(path, self._rr.Clear(recursive=True))
         self._there = set(persons.tolist())
-        self._drawn = {who: parts for who, parts in self._drawn.items() if who in self._there}
+        self._drawn = {
+            identity: parts for identity, parts in self._drawn.items() if identity in self._there
+        }
         if len(rows) == 0:
             return
         places = np.arange(len(rows), dtype=np.intp)[:, None]
@@ -112,10 +114,10 @@ class LiveLog:
             self._rig.up,
             self._rig,
         )
-        for person, who in enumerate(persons.tolist()):
-            if who not in self._met:
-                self._met.add(who)
-                _log_looks(self._rr, self._stream, who, self._skin)
+        for person, identity in enumerate(persons.tolist()):
+            if identity not in self._met:
+                self._met.add(identity)
+                _log_looks(self._rr, self._stream, identity, self._skin)
             _log_person(self._rr, self._stream, take, person)
             _log_bodies(self._rr, self._stream, take, person, self._skin, self._drawn)
 
@@ -154,32 +156,34 @@ def log_world(stream: Any, up: Axis, rig: Rig | None) -> None:
         _log_cameras(rr, stream, rig)
 
 
-def _part_path(who: int, bone: int) -> str:
-    return f"{person_path(who)}/body/{SMPL_24[bone]}"
+def _part_path(identity: int, bone: int) -> str:
+    return f"{person_path(identity)}/body/{SMPL_24[bone]}"
 
 
-def _sigma_path(who: int) -> str:
-    return f"plots/sigma/person_{who}"
+def _sigma_path(identity: int) -> str:
+    return f"plots/sigma/person_{identity}"
 
 
-def _log_looks(rr: ModuleType, stream: Any, who: int, skin_of: Skin | None) -> None:
+def _log_looks(rr: ModuleType, stream: Any, identity: int, skin_of: Skin | None) -> None:
     """Log static content of a person: line colour, and triangles of the surface."""
-    colour = _rgb8(np.array(colour_of(who)))
+    colour = _rgb8(np.array(colour_of(identity)))
     stream.log(
-        _sigma_path(who), rr.SeriesLines(colors=colour[None], names=f"person {who}"), static=True
+        _sigma_path(identity),
+        rr.SeriesLines(colors=colour[None], names=f"person {identity}"),
+        static=True,
     )
     shade = [*colour.tolist(), round(255 * 0.55)]
     for bone, (_, faces) in enumerate(() if skin_of is None else skin_of.parts):
         surface = rr.Mesh3D.from_fields(triangle_indices=faces, albedo_factor=shade)
-        stream.log(_part_path(who, bone), surface, static=True)
+        stream.log(_part_path(identity, bone), surface, static=True)
 
 
 def _log_person(rr: ModuleType, stream: Any, take: Take, person: int) -> None:
     """Log joints, bones, ellipsoids and sigmas of one person, frame by frame; clear them when the
     person leaves.
     """
-    who, people, there_before = int(take.persons[person]), take.people, False
-    path, plot, colour = person_path(who), _sigma_path(who), np.array(colour_of(who))
+    identity, people, there_before = int(take.persons[person]), take.people, False
+    path, plot, colour = person_path(identity), _sigma_path(identity), np.array(colour_of(identity))
     bones, sigma = bones_of(tuple(people.joint_names.tolist())), 1e3 * sigma_m(people.covariance)
     for index, row in enumerate(take.rows[person].tolist()):
         if row < 0 and not there_before:
@@ -187,8 +191,8 @@ def _log_person(rr: ModuleType, stream: Any, take: Take, person: int) -> None:
         _set_time(stream, take, index)
         there_before = row >= 0
         if row < 0:
-            for gone in (path, plot):
-                stream.log(gone, rr.Clear(recursive=True))
+            for path_ in (path, plot):
+                stream.log(path_, rr.Clear(recursive=True))
             continue
         joints, known = people.joints[row], sigma[row][np.isfinite(sigma[row])]
         placed = np.flatnonzero(np.isfinite(joints).all(axis=1))
@@ -234,34 +238,34 @@ def _log_bodies(
     """Log the body of one person, in the frames that have one: the poses of the bones, and the
     shape of a part when it appears, or when a joint has bent since.
     """
-    who, arrays = int(take.persons[person]), skin_of.arrays
+    identity, arrays = int(take.persons[person]), skin_of.arrays
     motion = motion_of(take, person, arrays, np.eye(3))
     index = np.zeros(0, dtype=np.intp) if motion is None else motion.index
-    appears = np.diff(index, prepend=-1 if who in drawn else -2) > 1
-    gone = np.setdiff1d(np.r_[0, index + 1], index)
-    for at in gone[gone < len(take.frames)].tolist():
+    appears = np.diff(index, prepend=-1 if identity in drawn else -2) > 1
+    absent = np.setdiff1d(np.r_[0, index + 1], index)
+    for at in absent[absent < len(take.frames)].tolist():
         _set_time(stream, take, at)
-        stream.log(f"{person_path(who)}/body", rr.Clear(recursive=True))
-    shapes = drawn.pop(who, {})
+        stream.log(f"{person_path(identity)}/body", rr.Clear(recursive=True))
+    shapes = drawn.pop(identity, {})
     if motion is None:
         return
     if index[-1] == len(take.frames) - 1:
-        drawn[who] = shapes
+        drawn[identity] = shapes
     times = [
         rr.TimeColumn("frame", sequence=take.frames[index]),
         rr.TimeColumn("time", duration=take.times_s[index]),
     ]
     turns, joints = motion.turns(), motion.joints()
     for bone, (kept, faces) in enumerate(skin_of.parts):
-        path = _part_path(who, bone)
+        path = _part_path(identity, bone)
         # Minimum weight of a bone that shapes a part.
         near = arrays.weights[kept].max(axis=0) > 0.1
         bends = turns[:, bone, None].mT @ turns[:, near]
         for n, at in enumerate(index.tolist()):
-            alike = (bends[n] * shapes.get(bone, 0.0)).sum(axis=(1, 2))  # 1 + 2 cos of the bend
+            trace = (bends[n] * shapes.get(bone, 0.0)).sum(axis=(1, 2))  # 1 + 2 cos of the bend
             # Bend of a joint, radians, after which the shapes of the parts nearby
             # are logged again.
-            if appears[n] or alike.min() < 1 + 2 * math.cos(0.35):
+            if appears[n] or trace.min() < 1 + 2 * math.cos(0.35):
                 shapes[bone] = bends[n]
                 turn, way = motion.rotations[n, None], motion.pelvis[n, None]
                 vertices = skin(arrays, motion.rest.betas[None], turn, way, kept)[0]
@@ -319,7 +323,7 @@ def _log_observations(rr: ModuleType, stream: Any, take: Take, rig: Rig) -> None
     if table is None or tuple(table.view_names.tolist()) != rig.names:
         return
     row_frame = np.searchsorted(take.frames, take.people.frame)
-    colours = _rgb8(np.array([colour_of(who) for who in take.people.person.tolist()]))
+    colours = _rgb8(np.array([colour_of(identity) for identity in take.people.person.tolist()]))
     used, seen = table.gate == Gate.USED, table.gate != Gate.NOT_SEEN
     residual = np.where(used, np.linalg.norm(table.residual_px, axis=-1), np.nan)
     for index in range(len(take.frames)):

@@ -139,18 +139,18 @@ def everybody(
 
     People without a body, or with several shapes, are noted in `written`.
     """
-    for person, who in enumerate(take.persons.tolist()):
+    for person, identity in enumerate(take.persons.tolist()):
         motion = motion_of(take, person, job.arrays, axes)
         if motion is None:
-            written.notes.append(f"{kind}: person {who} has no body in any frame")
+            written.notes.append(f"{kind}: person {identity} has no body in any frame")
             continue
         # Maximum difference between the shapes of one person, m, without a note.
         if motion.spread_m > 1e-3:
             written.notes.append(
-                f"{kind}: person {who} has several body shapes; the file has their mean, which "
-                f"moves joints by up to {1e3 * motion.spread_m:.0f} mm"
+                f"{kind}: person {identity} has several body shapes; the file has their mean, "
+                f"which moves joints by up to {1e3 * motion.spread_m:.0f} mm"
             )
-        yield who, motion
+        yield identity, motion
 
 
 def all_segments(
@@ -160,10 +160,10 @@ def all_segments(
     its frames.
     """
     take = written.at_one_rate(job.take)
-    for who, motion in everybody(job, take, kind, axes, written):
+    for identity, motion in everybody(job, take, kind, axes, written):
         for segment in motion.segments(int(job.fill_gaps_s * take.fps + 1e-6)):
             first, last = take.frames[segment.index[[0, -1]]].tolist()
-            yield job.folder / f"person_{who}_frames_{first}-{last}", segment, take
+            yield job.folder / f"person_{identity}_frames_{first}-{last}", segment, take
 
 
 def rest_joints(arrays: SmplArrays, betas: Array) -> Array:

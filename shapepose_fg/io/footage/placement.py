@@ -22,6 +22,10 @@ from shapepose_fg.io.footage.places import per_camera
 
 FOOTAGE = "footage.json"
 """Name of the file beside the detections."""
+UNFINISHED = "unfinished"
+"""Name of the folder with finished blocks, beside detections that are not finished."""
+UNFINISHED_SETTINGS = "settings.json"
+"""Name of the file in it with the settings of the run."""
 
 
 class PlacementKind(StrEnum):

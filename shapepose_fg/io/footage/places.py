@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.io.camera_names import listing, told_by_parts
+from shapepose_fg.io.camera_names import listing, match_by_parts
 
 VIDEOS = frozenset(".mp4 .m4v .mov .avi .mkv .webm .mpg .mpeg .ts .mts .m2ts .wmv".split())
 """File extensions of videos."""
@@ -36,8 +36,8 @@ def per_camera(
             )
         name = text[:cut]
         if name not in cameras:
-            there = " ".join(cameras)
-            raise InputError(f"{option} {text}: there is no camera {name!r}; there are {there}")
+            known = " ".join(cameras)
+            raise InputError(f"{option} {text}: there is no camera {name!r}; there are {known}")
         if name in values:
             raise InputError(f"{option} {text}: camera {name} is given twice; give it once")
         values[name] = text[cut + 1 :]
@@ -108,9 +108,9 @@ def _in_folder(folder: Path, cameras: Sequence[str]) -> tuple[list[Path], list[s
     if all(exact):
         return [found[0] for found in exact], []
     if not any(exact):
-        told = told_by_parts(folder, cameras, offered, names)
-        if told is not None:
-            return told
+        matched = match_by_parts(folder, cameras, offered, names)
+        if matched is not None:
+            return matched
         inner = [folder / name for name in _INNER if (folder / name).is_dir()]
         if len(inner) == 1:
             return _in_folder(inner[0], cameras)

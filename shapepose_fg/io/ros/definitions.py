@@ -109,11 +109,11 @@ def check_definition(name: str, text: str) -> None:
     any number of them.
     """
     parts = re.split(r"^=+\s*MSG: *(\S+) *$", "\n".join(text.splitlines()), flags=re.MULTILINE)
-    theirs = {
+    messages = {
         _plain(each): _fields(each, part)
         for each, part in zip([name, *parts[1::2]], parts[::2], strict=True)
     }
-    for each, fields in theirs.items():
+    for each, fields in messages.items():
         size = max(
             (int(n) for kind in fields.values() for n in re.findall(r"\[(?:<=)?(\d+)\]", kind)),
             default=0,
@@ -123,15 +123,15 @@ def check_definition(name: str, text: str) -> None:
             raise ValueError(f"{each} has {f'an array of {size}' if size else 'no field'}")
     waiting = [(name, name)]
     while len(waiting) > 0:
-        mine, other = waiting.pop()
-        if other not in _TIME and other not in theirs:
+        own_name, other = waiting.pop()
+        if other not in _TIME and other not in messages:
             raise ValueError(f"{other} is not defined")
-        found = theirs.get(other, _TIME.get(other, {}))
-        for kind, field in (each.split() for each in FIELDS[mine].split(";")):
+        found = messages.get(other, _TIME.get(other, {}))
+        for kind, field in (each.split() for each in FIELDS[own_name].split(";")):
             inner, _, array = kind.partition("[")
             has, _, has_array = found.get(field, "").partition("[")
-            alike = _FAMILY.get(inner, "message") == _FAMILY.get(has, "message") and has != ""
-            if not alike or array != has_array:
+            same_family = _FAMILY.get(inner, "message") == _FAMILY.get(has, "message") and has != ""
+            if not same_family or array != has_array:
                 raise ValueError(f"{other} has no {field} of {kind}")
             if inner in FIELDS:
                 waiting.append((inner, has))

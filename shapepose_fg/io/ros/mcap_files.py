@@ -221,8 +221,8 @@ def _decoded(
     except (
         Exception
     ) as error:  # of damaged files the library raises anything: struct.error, KeyError, zstd's own
-        said = f"{type(error).__name__}: {str(error).strip()[:80]}"
-        raise InputError(f"{file}: cannot be read ({said}); {cure}") from None
+        problem = f"{type(error).__name__}: {str(error).strip()[:80]}"
+        raise InputError(f"{file}: cannot be read ({problem}); {cure}") from None
 
 
 def _messages(stream: IO[bytes]) -> Iterator[tuple[Any, Any, Any]]:

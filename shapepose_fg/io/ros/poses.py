@@ -81,18 +81,18 @@ class Frames:
         close enough in time exist.
         """
         poses = np.tile(np.eye(4), (len(time_s), 1, 1))
-        covariances, there = np.zeros((len(time_s), 6, 6)), np.full(len(time_s), self.moves(frame))
+        covariances, exists = np.zeros((len(time_s), 6, 6)), np.full(len(time_s), self.moves(frame))
         for each in self.chain(frame):
             # The error of a product A B is the error of A, transformed to B, plus the error of B.
             link = self._trajectory(each) if each in self._received else None
             if link is not None:
-                there &= link.covers(time_s)
+                exists &= link.covers(time_s)
                 carry = _of_inverse(poses)
                 covariances += carry @ link.covariance_at(time_s) @ carry.mT
             elif each in self._received:
-                there[:] = False
+                exists[:] = False
             poses = (self._fixed.get(each, np.eye(4)) if link is None else link.at(time_s)) @ poses
-        return poses, covariances, there
+        return poses, covariances, exists
 
     def trajectory(self, frame: str, name: str) -> Trajectory:
         """The trajectory of a frame, at the times of the link in its chain with the most poses.
@@ -101,13 +101,15 @@ class Frames:
         moved = [each for each in self.chain(frame) if each in self._received]
         most = max(moved, key=lambda each: len(self._received[each]))
         time_s = np.array(sorted(self._received[most])) / NS
-        poses, covariances, there = self.at(frame, time_s)
-        if there.sum() < 2:
+        poses, covariances, exists = self.at(frame, time_s)
+        if exists.sum() < 2:
             raise ValueError(
                 f"2 poses are needed, with {' in '.join(self.chain(frame))} known at the same time"
             )
-        says = covariances[there].any()
-        return Trajectory(name, time_s[there], poses[there], covariances[there] if says else None)
+        says = covariances[exists].any()
+        return Trajectory(
+            name, time_s[exists], poses[exists], covariances[exists] if says else None
+        )
 
     def forget(self, before_s: float) -> None:
         """Drop poses before `before_s`, except for the last one of each link."""

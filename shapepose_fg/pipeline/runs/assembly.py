@@ -77,8 +77,8 @@ class Assembly:
     def own_pieces(self, number: int, columns: Sequence[str]) -> Iterator[tuple[NDArray[Any], ...]]:
         """`columns` of one person's rows, by part."""
         for n in self.parts_of[number]:
-            mine = self.persons[n] == number
-            yield tuple(self.parts.column(n, name)[mine] for name in columns)
+            of_person = self.persons[n] == number
+            yield tuple(self.parts.column(n, name)[of_person] for name in columns)
 
     def bodies(self, n: int) -> WindowBodies:
         """The bodies of a part, as they were solved."""
@@ -125,10 +125,10 @@ class Assembly:
             name: np.empty((count, *each.shape[1:]), each.dtype) for name, each in columns.items()
         }
         stop = 0
-        for n, mine in enumerate(chosen):
-            start, stop = stop, stop + len(mine)
+        for n, index in enumerate(chosen):
+            start, stop = stop, stop + len(index)
             for name, all_rows in rows.items():
-                all_rows[start:stop] = self._piece(n, name)[mine]
+                all_rows[start:stop] = self._piece(n, name)[index]
             if consume:
                 self.parts.drop(n)
                 self.parts.kept.drop(_bodies(n))
@@ -194,8 +194,8 @@ class Assembly:
             )
             look = (parts.column(n, "time_s")[rows] // LOOK_S).astype(np.int64)
             looks.append(np.stack([parts.column(n, "person")[rows], side, look], axis=1))
-        whose = np.unique(np.concatenate(looks), axis=0, return_inverse=True)[1]
-        return find_floor(np.concatenate(points), whose.ravel(), up)
+        group = np.unique(np.concatenate(looks), axis=0, return_inverse=True)[1]
+        return find_floor(np.concatenate(points), group.ravel(), up)
 
 
 def _bodies(n: int) -> str:

@@ -130,12 +130,14 @@ def same_people(before: Border, after: Border) -> dict[int, int]:
     shared = np.intersect1d(before.frame, after.frame)
     before, after = (each.rows(np.isin(each.frame, shared)) for each in (before, after))
     old, new = np.unique(before.track), np.unique(after.track)
-    alike = np.zeros((len(old), len(new)))
+    similarity = np.zeros((len(old), len(new)))
     for i, a in enumerate(old):
-        mine = before.rows(before.track == a)
-        alike[i] = [_alike(mine, after.rows(after.track == b)) for b in new]
-    rows, columns = least_cost_pairs(-alike)
-    return {int(new[k]): int(old[i]) for i, k in zip(rows, columns, strict=True) if alike[i, k] > 0}
+        rows_before = before.rows(before.track == a)
+        similarity[i] = [_alike(rows_before, after.rows(after.track == b)) for b in new]
+    rows, columns = least_cost_pairs(-similarity)
+    return {
+        int(new[k]): int(old[i]) for i, k in zip(rows, columns, strict=True) if similarity[i, k] > 0
+    }
 
 
 def _alike(a: Border, b: Border) -> float:
@@ -145,10 +147,10 @@ def _alike(a: Border, b: Border) -> float:
     _, first, second = np.intersect1d(a.frame, b.frame, return_indices=True)
     if len(first) == 0:
         return 0.0
-    mine, theirs = a.candidate[first], b.candidate[second]
-    count = min(int((mine >= 0).sum()), int((theirs >= 0).sum()))
+    detections_a, detections_b = a.candidate[first], b.candidate[second]
+    count = min(int((detections_a >= 0).sum()), int((detections_b >= 0).sum()))
     if count > 0:
-        share = int(((mine == theirs) & (mine >= 0)).sum()) / count
+        share = int(((detections_a == detections_b) & (detections_a >= 0)).sum()) / count
         return 1.0 + share if share >= _SAME else 0.0
     apart = np.linalg.norm(a.place[first] - b.place[second], axis=-1)
     apart = apart[np.isfinite(apart)]
@@ -165,11 +167,11 @@ class Identities:
         self.next_id = next_id
         self.border = border
 
-    def names(self, begins: Border, *, alone: bool) -> dict[int, int]:
+    def names(self, begins: Border, *, isolated: bool) -> dict[int, int]:
         """Identities of tracks that continue one of the chunk before; empty if frames
-        are `alone`.
+        are `isolated`.
         """
-        return {} if alone or self.border is None else same_people(self.border, begins)
+        return {} if isolated or self.border is None else same_people(self.border, begins)
 
     def name(self, track: int, names: dict[int, int]) -> int:
         """Identity of a track; a track without one gets the next free one."""

@@ -83,11 +83,11 @@ def _digest(begun: Any) -> str:
 
 def end_run(output: Path) -> None:
     """Remove the files of a finished run."""
-    gone = inside(output, _GONE)
-    shutil.rmtree(gone, ignore_errors=True)
+    removed = inside(output, _GONE)
+    shutil.rmtree(removed, ignore_errors=True)
     if (output / PARTS).exists():
-        (output / PARTS).rename(gone)
-        shutil.rmtree(gone)
+        (output / PARTS).rename(removed)
+        shutil.rmtree(removed)
 
 
 def _refuse_other(folder: Path, before: Any, now: dict[str, Any]) -> None:

@@ -133,14 +133,14 @@ class _Draw:
 def _kept(xyz: Tensor, draw: _Draw, config: CorruptionConfig) -> Tensor:
     """(B, K) 0 for missing joints, 1 for the others."""
     B, K = xyz.shape[:2]
-    gone = (draw.uniform(B, K) < config.single * draw.uniform(B, 1)).float()
+    missing = (draw.uniform(B, K) < config.single * draw.uniform(B, 1)).float()
     for _ in range(2):
         limb = _LIMBS[draw.integers(len(_LIMBS), B)]
-        gone = torch.maximum(gone, (draw.uniform(B, 1) < config.limb) * limb)
-    gone = torch.maximum(
-        gone, (draw.uniform(B, 1) < config.region) * _REGIONS[draw.integers(len(_REGIONS), B)]
+        missing = torch.maximum(missing, (draw.uniform(B, 1) < config.limb) * limb)
+    missing = torch.maximum(
+        missing, (draw.uniform(B, 1) < config.region) * _REGIONS[draw.integers(len(_REGIONS), B)]
     )
-    return 1 - gone * (draw.uniform(B, 1) >= config.complete)
+    return 1 - missing * (draw.uniform(B, 1) >= config.complete)
 
 
 def _isotropic(xyz: Tensor, draw: _Draw, clean: float) -> tuple[Tensor, Tensor]:
@@ -173,9 +173,9 @@ def triangulated(xyz: Tensor, draw: _Draw, statistics: DetectorStatistics) -> tu
         across_first = direction if across_first is None else across_first
         state = _hidden(xyz, direction, across, draw)
         missed, sigma, claimed = _reports(state, draw, statistics)
-        there = (~missed & (view < number))[..., None, None]
+        seen = (~missed & (view < number))[..., None, None]
         plane = torch.eye(3) - direction[:, None, :, None] * direction[:, None, None, :]
-        weight = there * plane / claimed.square()[..., None, None]
+        weight = seen * plane / claimed.square()[..., None, None]
         error = sigma[..., None] * draw.normal(B, K, 3)
         information = information + weight
         target = target + (weight @ (xyz + error)[..., None]).squeeze(-1)

@@ -136,7 +136,7 @@ class Skeletons:
 
 
 def draw_skeletons(picture: Picture, view: PictureView, people: Skeletons) -> None:
-    """Draw bones, joints (rings if they are inferred) and labels on `picture`."""
+    """Draw bones, joints (dark if they are inferred) and labels on `picture`."""
     stroke = stroke_of(view.size)
     # Number of straight segments in which a bone is drawn, because lens distortion curves
     # it.
@@ -182,8 +182,8 @@ def draw_detections(picture: Picture, xy: Array, used: Mask, colours: Whole) -> 
     others as red crosses.
     """
     reach = max(2, stroke_of(picture.shape[1::-1]))
-    there = np.isfinite(xy).all(axis=1) & (np.abs(xy) < 30000).all(axis=1)
-    drawn = np.rint(xy[there]).astype(int).tolist(), used[there].tolist(), colours[there]
+    visible = np.isfinite(xy).all(axis=1) & (np.abs(xy) < 30000).all(axis=1)
+    drawn = np.rint(xy[visible]).astype(int).tolist(), used[visible].tolist(), colours[visible]
     for at, good, colour in zip(*drawn, strict=True):
         kind, size, pens = cv2.MARKER_TILTED_CROSS, 3 * reach, (max(3, reach), max(1, reach // 2))
         if good:

@@ -29,7 +29,7 @@ def pictures_of(
     image_placement: Sequence[str] = (),
     moments: Mapping[str, Index] | None = None,
     open_one: Callable[[str, Path], Footage] = lambda _, path: open_footage(path),
-    tell: Callable[[str], None] = print,
+    notify: Callable[[str], None] = print,
 ) -> list[tuple[CameraFootage, Footage]]:
     """The pictures of the cameras `drawn`, with the picture of each frame; InputError if they are
     missing.
@@ -39,7 +39,7 @@ def pictures_of(
     inputs of the result. `image_placement` (arguments of `placements_of`) states how pictures of
     another size than the calibration's were made. `moments` has, by camera, (T,) the number of its
     own frame in each frame of the result, if these differ (`read_moments`). `open_one` opens the
-    pictures of a camera by name and path; `tell` receives notes on inferred files.
+    pictures of a camera by name and path; `notify` receives notes on inferred files.
     """
     used = {each.name: each for each in _used_footage(run, detections)}
     unknown = [name for name in drawn if name not in used]
@@ -61,23 +61,23 @@ def pictures_of(
             )
     opened = {name: open_one(name, path) for name, path in paths.items()}
     # The placement recorded by `detect` is valid as long as the pictures have the same size.
-    alike = {
+    matching = {
         name: used[name].placement
         for name, each in opened.items()
         if name in used and used[name].placement.picture_size == each.size and not image_placement
     }
-    for name, placement in alike.items():
+    for name, placement in matching.items():
         size = rig.cameras[rig.names.index(name)].image_size
         if placement.calibrated_size != size:
-            theirs, ours = (
+            calibrated, stored = (
                 f"{width} x {height}" for width, height in (placement.calibrated_size, size)
             )
             raise InputError(
-                f"{FOOTAGE}: camera {name} was calibrated for pictures of {theirs}, but "
-                f"cameras.json of the result is for {ours}; give --detections with the folder of "
+                f"{FOOTAGE}: camera {name} was calibrated for pictures of {calibrated}, but "
+                f"cameras.json of the result is for {stored}; give --detections with the folder of "
                 "this result, or --image-placement"
             )
-    sizes = {name: each.size for name, each in opened.items() if name not in alike}
+    sizes = {name: each.size for name, each in opened.items() if name not in matching}
     placements, concluded = placements_of(image_placement, sizes, rig)
     notes += concluded
     if len(unknown) > 0 and not moments:
@@ -88,7 +88,7 @@ def pictures_of(
             f"{' '.join(unknown)}, and so on"
         )
     for text in notes:
-        tell(text)
+        notify(text)
     pairs = []
     for name, footage in opened.items():
         index = used[name].places if name in used else _counted(footage, "numbered_from" in run)
@@ -96,7 +96,7 @@ def pictures_of(
             index = np.append(index, -1)[np.minimum(moments[name], len(index))]
         index = np.where(index < len(footage.number), index, -1)
         pairs.append(
-            (CameraFootage(name, footage.path, (placements | alike)[name], index), footage)
+            (CameraFootage(name, footage.path, (placements | matching)[name], index), footage)
         )
     return pairs
 

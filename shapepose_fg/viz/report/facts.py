@@ -12,7 +12,7 @@ from shapepose_fg.pipeline.config import PipelineConfig
 Run = Mapping[str, Any]
 
 
-def told_by(run: Run) -> dict[str, Any]:
+def page_entries(run: Run) -> dict[str, Any]:
     """The entries of a run that the page shows, by the names in the page's template. InputError if
     one of them is invalid.
     """
@@ -99,5 +99,7 @@ def _text(value: object) -> str:
 
 def _frames_words(spans: Sequence[Sequence[int]]) -> str:
     """`0–3, 17, 20–25 and more` of [start, stop) spans."""
-    told = [f"{start}" if stop == start + 1 else f"{start}–{stop - 1}" for start, stop in spans]
-    return ", ".join(told[:12]) + (f" and {len(told) - 12} more segments" if len(told) > 12 else "")
+    words = [f"{start}" if stop == start + 1 else f"{start}–{stop - 1}" for start, stop in spans]
+    return ", ".join(words[:12]) + (
+        f" and {len(words) - 12} more segments" if len(words) > 12 else ""
+    )

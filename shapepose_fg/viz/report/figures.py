@@ -112,11 +112,11 @@ def camera_figures(people: Reconstruction) -> list[CameraStatistics]:
     if table is None:
         return []
     px, segment = np.linalg.norm(table.residual_px, axis=-1), _segments(table)
-    told = {each.camera: each for each in entries_of(people.run).cameras}
+    entries = {each.camera: each for each in entries_of(people.run).cameras}
     made = []
     for view, name in enumerate(table.view_names.tolist()):  # only a few cameras
         gate, error = table.gate[..., view], px[..., view]
-        more = told.get(name, CameraEntry())
+        more = entries.get(name, CameraEntry())
         made.append(
             CameraStatistics(
                 name,
@@ -146,8 +146,8 @@ def overall(people: Reconstruction) -> dict[str, Any]:
     spans = [np.arange(span.start, span.stop) for span in covered_frames(people.run) or []]
     gate = np.zeros(0) if table is None else table.gate[table.gate != Gate.NOT_SEEN]
     cameras = entries_of(people.run).cameras
-    told = [each.offered for each in cameras if each.offered is not None]
-    offered = sum(told) if 0 < len(told) == len(cameras) else None
+    counts = [each.offered for each in cameras if each.offered is not None]
+    offered = sum(counts) if 0 < len(counts) == len(cameras) else None
     count = sum(each.used for each in cameras)
     return {
         "placed": bool(np.isfinite(people.joints).all(axis=-1).any()),
@@ -184,18 +184,18 @@ def angle_curves(people: Reconstruction, up: Axis, model: BodyModel) -> dict[int
     # row. Of longer recordings the beginning is drawn: steps over 0.15 s would not show a gait.
     most, times_s = 640 // max(len(chosen), 1), people.time_s
     times_s = np.where(np.isfinite(times_s), times_s, people.frame / ASSUMED_FPS)
-    for who in chosen:
-        rows = np.flatnonzero(people.person == who)
+    for person in chosen:
+        rows = np.flatnonzero(people.person == person)
         rows = rows[np.argsort(people.frame[rows], kind="stable")]
         longest = max(1, int(0.15 * len(rows) / max(float(np.ptp(times_s[rows])), 0.15)))
         rows = rows[:: min(-(-len(rows) // most), longest)][:most]
         angles = joint_angles(people.rows(rows), up, model)
-        drawn[who] = [
+        drawn[person] = [
             Curve.of(name, angles, people.frame[rows])
             for name in CURVES
             if np.isfinite(angles.degrees).any()
         ]
-    return {who: curves for who, curves in drawn.items() if curves}
+    return {person: curves for person, curves in drawn.items() if curves}
 
 
 def known_counts(people: Reconstruction, by: Whole | None = None) -> NDArray[np.int64]:

@@ -13,7 +13,7 @@ from shapepose_fg.core.drawing import PALETTE
 from shapepose_fg.core.observation_table import Gate
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.results.track_summary import TrackSummary
-from shapepose_fg.viz.report.facts import told_by
+from shapepose_fg.viz.report.facts import page_entries
 from shapepose_fg.viz.report.figures import KINDS, Curve, camera_figures, known_counts, overall
 from shapepose_fg.viz.report.scene import PageScene
 
@@ -47,7 +47,7 @@ def page_text(
         Gate=Gate,
         title=title,
         remarks=[*remarks],
-        run=told_by(people.run),
+        run=page_entries(people.run),
         overall=overall(people),
         cameras=camera_figures(people),
         curves=curves,

@@ -80,7 +80,10 @@ def scene_of(take: Take, arrays: SmplArrays | None, most_bytes: int) -> PageScen
         "known": _base64(_known_and_sigma(take.people.known[rows], sigma), "u1"),
         "joint_names": take.people.joint_names.tolist(),
         "bones": bones_of(tuple(take.people.joint_names.tolist())).tolist(),
-        "people": [{"id": int(who), "colour": PALETTE[who % len(PALETTE)]} for who in take.persons],
+        "people": [
+            {"id": int(identity), "colour": PALETTE[identity % len(PALETTE)]}
+            for identity in take.persons
+        ],
         "cameras": [scene_camera(camera, axes) for camera in cameras],
         "floor": _floor(joints),
         "view": _view(joints, centres),
@@ -202,10 +205,10 @@ def _bodies(
         rest[each], joints[each] = motion.rest.vertices[kept], motion.rest.joints
         place = np.full(len(take.frames), -1)
         place[motion.index] = np.arange(len(motion.index))
-        mine = np.flatnonzero((person == each) & (place[frame] >= 0))
-        turns[mine], pelvis[mine] = (
-            motion.rotations[place[frame[mine]]],
-            motion.pelvis[place[frame[mine]]],
+        rows = np.flatnonzero((person == each) & (place[frame] >= 0))
+        turns[rows], pelvis[rows] = (
+            motion.rotations[place[frame[rows]]],
+            motion.pelvis[place[frame[rows]]],
         )
     millimetres = _Packing(np.zeros(3), 1e-3)
     # Scale of quaternion entries, which are stored as integers.

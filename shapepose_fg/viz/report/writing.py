@@ -49,7 +49,7 @@ def write_report(
     if every > 1:
         remarks.append(f"the result is long: this page uses every {th(every)} frame")
     if rig is None or isinstance(rig, str):
-        up, rig = rig or _standing(people), None
+        up, rig = rig or _standing_axis(people), None
         remarks.append(f"{CAMERAS} is missing: cameras are not drawn, and {up} is assumed to be up")
     else:
         up = rig.up
@@ -114,7 +114,7 @@ def _timed(people: Reconstruction) -> bool:
     return len(times) > 1 or (len(times) == 1 and rate is not None and rate > 0)
 
 
-def _standing(people: Reconstruction) -> Axis:
+def _standing_axis(people: Reconstruction) -> Axis:
     """The axis along which people stand: the most frequent direction from feet to head."""
     ends = (("Neck", "Nose", "Head"), ("RAnkle", "LAnkle", "RKnee", "LKnee"))
     heads, feet = (people.joints[:, np.isin(people.joint_names, each)] for each in ends)

@@ -9,7 +9,7 @@ import pytest
 
 from shapepose_fg.cameras.check.biases import COMMON
 from shapepose_fg.cameras.check.diagnosis import diagnose
-from shapepose_fg.cameras.check.evidence import Look, gather
+from shapepose_fg.cameras.check.evidence import SetupHypothesis, gather
 from shapepose_fg.cameras.check.findings import Kind, sentence
 from shapepose_fg.cameras.check.report import check_setup
 from shapepose_fg.cameras.check.small_errors import SmallErrors
@@ -62,7 +62,7 @@ def test_nothing_is_said_where_nothing_is_wrong_and_a_turned_camera_is_named(rec
     assert diagnosis.build.stature == pytest.approx(1.7, abs=0.17)
     np.testing.assert_allclose(diagnosis.build.up, [0, 0, 1], atol=0.03)
     odd = diagnose(recording, turned(room, 2, 5.0, np.array([0.0, 1.0, 0.0])))
-    assert len(diagnosis.look.evidence.anchors) < len(odd.look.evidence.anchors) / 2
+    assert len(diagnosis.setup.evidence.anchors) < len(odd.setup.evidence.anchors) / 2
     assert [(each.kind, each.cameras) for each in odd.findings] == [(Kind.TURNED, (2,))]
     assert odd.findings[0].amount == pytest.approx(5, rel=0.05, abs=0.35)
 
@@ -142,7 +142,7 @@ def test_a_view_may_have_larger_biases_than_the_others(recording, room, people, 
     if of == "one view":
         bias[:, :, 1:] = 0
     seen = gather(biased(recording, room, people, bias), range(len(recording)), len(room))
-    problem = SmallErrors.of(Look.given(seen, room))
+    problem = SmallErrors.of(SetupHypothesis.given(seen, room))
     marginals = problem.residuals.marginals
     alike = marginals(problem.given, common=COMMON)
     also = marginals(problem.given)

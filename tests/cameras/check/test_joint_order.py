@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from shapepose_fg.cameras.check.evidence import Look, gather
+from shapepose_fg.cameras.check.evidence import SetupHypothesis, gather
 from shapepose_fg.cameras.check.findings import Kind
 from shapepose_fg.cameras.check.joint_order import order_of_joints
 from shapepose_fg.cameras.check.report import check_setup
@@ -115,5 +115,5 @@ def test_a_biased_detector_is_no_other_order(room, people, look_at):
     for seed in range(8):
         bias = lasting(np.random.default_rng(seed), 0.02, 0.12, 1, 25, len(room))
         seen = biased(look_at(room, one), room, one, bias)
-        look = Look.given(gather(seen, range(len(seen)), len(room)), room)
-        assert order_of_joints(seen, look) == []
+        setup = SetupHypothesis.given(gather(seen, range(len(seen)), len(room)), room)
+        assert order_of_joints(seen, setup) == []
