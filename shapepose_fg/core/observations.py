@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from shapepose_fg.core.arrays import Array, Index, Mask
+from shapepose_fg.core.arrays import Array, Index, Mask, pair_keys
 from shapepose_fg.core.detections import Detections
 from shapepose_fg.core.storage.schema import Column, Table
 
@@ -79,8 +79,7 @@ def rows_in(before: Observations, now: Observations) -> Index:
     """(N,) indices, among the rows of `before`, of the rows of `now`: a subset of the same people,
     in any order.
     """
-    most = 1 + max(before.track.max(initial=0), now.track.max(initial=0))
-    was, key = (each.frame * most + each.track for each in (before, now))
+    was, key = pair_keys(*((each.frame, each.track) for each in (before, now)))
     order = np.argsort(was, kind="stable")
     return order[np.searchsorted(was[order], key)]
 

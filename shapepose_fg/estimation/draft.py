@@ -12,7 +12,7 @@ from shapepose_fg.body.fitting.fitter import (
     FitStatus,
     JointTargets,
 )
-from shapepose_fg.core.arrays import Array, Index, Mask
+from shapepose_fg.core.arrays import Array, Index, Mask, pair_keys
 from shapepose_fg.core.camera import Views
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.rows import Rows
@@ -123,9 +123,8 @@ def _unchanged(now: Observations, before: Observations) -> tuple[Index, Index]:
     """(K,) rows with the same detections as in the row of their track and frame `before`, and (K,)
     these rows.
     """
-    width = int(max(now.track.max(initial=0), before.track.max(initial=0))) + 1
-    names = [each.frame * width + each.track for each in (now, before)]
-    _, index, previous = np.intersect1d(*names, assume_unique=True, return_indices=True)
+    keys = pair_keys(*((each.frame, each.track) for each in (now, before)))
+    _, index, previous = np.intersect1d(*keys, assume_unique=True, return_indices=True)
     same = (now.xy[index] == before.xy[previous]).all(axis=(1, 2, 3))
     return index[same], previous[same]
 

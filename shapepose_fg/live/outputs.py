@@ -13,15 +13,17 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
+from types import TracebackType
+from typing import IO, Any, cast
 
 import numpy as np
 
 from shapepose_fg.body.model.result_body import body_of
 from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.reconstruction import BODY, Reconstruction
+from shapepose_fg.core.storage.files import naming_file
 from shapepose_fg.io.ros.mcap_files import McapWriter
 from shapepose_fg.io.ros.messages import COVARIANCES
 from shapepose_fg.live.sockets import MOST_CLIENTS, accept, listen
@@ -49,15 +51,41 @@ def published(
         yield publish
 
 
+class _OutputFile(AbstractContextManager["_OutputFile"]):
+    """A file that is written while people arrive; its OSErrors name it."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._stream = path, path.open("wb")
+
+    def write(self, data: bytes) -> int:
+        with naming_file(self._path):
+            return self._stream.write(data)
+
+    def flush(self) -> None:
+        with naming_file(self._path):
+            self._stream.flush()
+
+    def tell(self) -> int:
+        return self._stream.tell()
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        with naming_file(self._path):
+            self._stream.close()
+
+
 @contextmanager
 def _target(
     where: str, rig: Rig, note: Callable[[str], None], covariances: str
 ) -> Iterator[Publish]:
     with ExitStack() as files:
         if where.endswith(".mcap"):
-            written = files.enter_context(
-                McapWriter(files.enter_context(Path(where).open("wb")), rig, covariances)
-            )
+            stream = files.enter_context(_OutputFile(Path(where)))
+            written = files.enter_context(McapWriter(cast("IO[bytes]", stream), rig, covariances))
             yield lambda kind, people: _by_time(
                 people, lambda rows, time_s: written.frame(rows, time_s, kind)
             )
@@ -83,15 +111,15 @@ def _target(
         if where.startswith("tcp:"):
             send = files.enter_context(_Listeners(listen(where), note)).send
         else:
-            sink = (
-                sys.stdout
-                if where == "-"
-                else files.enter_context(Path(where).open("w", encoding="utf-8"))
-            )
+            sink = None if where == "-" else files.enter_context(_OutputFile(Path(where)))
 
             def send(line: str) -> None:
-                sink.write(line)
-                sink.flush()
+                if sink is None:
+                    sys.stdout.write(line)
+                    sys.stdout.flush()
+                else:
+                    sink.write(line.encode())
+                    sink.flush()
 
         yield lambda kind, people: _by_time(
             people, lambda rows, time_s: send(line_of(kind, rows, time_s, covariances))

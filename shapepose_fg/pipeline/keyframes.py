@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from shapepose_fg.core.arrays import Array, Index, Mask, Whole
+from shapepose_fg.core.arrays import Array, Index, Mask, Whole, pair_keys
 from shapepose_fg.core.frame_times import segments
 from shapepose_fg.core.observation_table import Gate
 from shapepose_fg.core.reconstruction import BODY, Known, Reconstruction, Status
@@ -108,9 +108,9 @@ def with_rows_like(
     """Add to the `solved` rows those of `rows` that lie between them, for the same people; joints
     and bodies of the added rows are interpolated.
     """
-    width = int(rows.frame.max(initial=0)) + 1
     order = np.lexsort((solved.frame, solved.person))
-    known, asked = (each.person * width + each.frame for each in (solved.rows(order), rows))
+    tables = (solved.rows(order), rows)
+    known, asked = pair_keys(*((each.person, each.frame) for each in tables))
     new = np.flatnonzero(~np.isin(asked, known))
     after = np.searchsorted(known, asked[new])
     first, second = (order[np.clip(each, 0, len(order) - 1)] for each in (after - 1, after))

@@ -51,12 +51,12 @@ Decided = tuple[Input, Observations]
 
 @dataclass(frozen=True)
 class FollowState:
-    """State carried from frame to frame: people of the last decided frame, and the undecided
+    """State carried from frame to frame: people of the last decided keyframe, and the undecided
     frames.
     """
 
     people: Tracks
-    """People of the last decided frame; their numbers are identities."""
+    """People of the last decided keyframe; their numbers are identities."""
     next_id: int = 0
     """The identity of the next new person."""
     pending: tuple[Input, ...] = field(default=())
@@ -113,13 +113,16 @@ def _decide(tracker: Tracker, state: FollowState, own: int) -> tuple[FollowState
     ]
     last = chosen.during(own - 1) & (identity >= 0)
     who = chosen.hypothesis[last]
-    people = people_at(frames[own - 1], identity[last], found.joints.rows(who))
+    time_s = float(frames[own - 1].time_s.mean())
+    people = people_at(time_s, identity[last], found.joints.rows(who))
     return FollowState(people, next_id, state.pending[until:]), decided
 
 
-def people_at(frame: Input, ids: Index, joints: JointStates) -> Tracks:
-    """Tracks of the people `ids` (A,) of a decided frame, with the states of their joints."""
-    time_s, zero = float(frame.time_s.mean()), np.zeros(len(ids), dtype=np.intp)
+def people_at(time_s: float, ids: Index, joints: JointStates) -> Tracks:
+    """Tracks of the people `ids` (A,) of the last decided keyframe, at `time_s`, with the states of
+    their joints.
+    """
+    zero = np.zeros(len(ids), dtype=np.intp)
     return Tracks(time_s, ids, zero, joints, np.full(len(ids), time_s))
 
 

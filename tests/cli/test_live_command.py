@@ -1,6 +1,7 @@
 """`shapepose-fg live`: lines of detections in, lines of people out."""
 
 import json
+import resource
 import socket
 import threading
 import time
@@ -293,3 +294,21 @@ def test_a_socket_listens_on_this_machine_only_unless_told_otherwise():
     for wrong in ("tcp://", "tcp://:70000", "tcp://:5000/way", "tcp://no.such.host.invalid:5000"):
         with pytest.raises(InputError, match="cannot be opened"):
             listen(wrong)
+
+
+@pytest.mark.parametrize("name", ["out.jsonl", "out.mcap"])
+def test_a_full_disk_names_the_output(tmp_path, cameras, five_cameras, two_people, capsys, name):
+    """A limit on file sizes stands for the full disk."""
+    if name.endswith(".mcap"):
+        pytest.importorskip("mcap_ros2")
+    (tmp_path / "in.jsonl").write_text(lines(five_cameras, two_people, 4))
+    given = ["--calibration", cameras, "--detections", str(tmp_path / "in.jsonl")]
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
+    try:
+        with pytest.raises(SystemExit) as ended:
+            main(["live", *given, "--workers", "1", "--output", str(tmp_path / name)])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert ended.value.code == 2
+    assert f"error: {tmp_path / name}: File too large; check" in capsys.readouterr().err

@@ -1,6 +1,7 @@
 """`overlay` from the command line, over pictures that are made here."""
 
 import json
+import resource
 from pathlib import Path
 
 import cv2
@@ -79,6 +80,19 @@ def test_a_grid_of_all_cameras_that_plays(solved, tmp_path, capsys):
     np.testing.assert_allclose(corner, [40, 80, 120], atol=8)
     first = [int(np.median(frame[40:52, :20])) for frame in frames]
     np.testing.assert_allclose(first, [80, 120, 160], atol=8)
+
+
+def test_a_video_that_does_not_fit_on_the_disk_is_an_error(solved, tmp_path, capfd):
+    """OpenCV itself says nothing; a limit on file sizes stands for the full disk."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
+    try:
+        assert run(solved / "results", "--output", tmp_path, "--width", 960) == 2
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    wanted = f"error: {tmp_path / 'grid.mp4'}: the video could not be written to its end; check"
+    assert wanted in " ".join(capfd.readouterr().err.split())
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_stills_of_each_camera_show_people_where_they_are(solved, tmp_path):

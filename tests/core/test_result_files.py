@@ -4,6 +4,7 @@ import io
 import json
 import shutil
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ import shapepose_fg.core.result_files
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import Reconstruction, Status
 from shapepose_fg.core.result_files import write_result
-from shapepose_fg.core.storage.files import write_together
+from shapepose_fg.core.storage.files import write_content, write_together
 from shapepose_fg.core.storage.npz import Pieces, write_npz
 from shapepose_fg.simulation import built_in_scene
 from shapepose_fg.simulation.files import truth_of
@@ -146,3 +147,16 @@ def test_a_disk_that_is_full_at_any_write_leaves_the_old_files_and_is_named(
             write_result(a, new.columns(), None, new.run)
         assert caught.value.filename in (str(a / "people.npz"), str(a / "run.json"))
         assert {file.name: file.read_bytes() for file in a.iterdir()} == old
+
+
+def test_the_error_of_a_read_only_disk_names_the_file_itself(tmp_path, monkeypatch):
+    """Removing the temporary file fails, too, and its name is no file of the user's."""
+
+    def refuse(path: Path, *_: object, **__: object) -> None:
+        raise OSError(30, "Read-only file system", str(path))
+
+    monkeypatch.setattr(Path, "open", refuse)
+    monkeypatch.setattr(Path, "unlink", refuse)
+    with pytest.raises(OSError, match="Read-only file system") as caught:
+        write_content(tmp_path / "times.csv", "frame, time")
+    assert caught.value.filename == str(tmp_path / "times.csv")

@@ -26,6 +26,7 @@ from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.reconstruction import Reconstruction
 from shapepose_fg.core.storage.kept_arrays import InFolder
 from shapepose_fg.core.storage.output_folder import only_run_in
+from shapepose_fg.core.trust import BELIEVED, Trust, Trusted
 from shapepose_fg.estimation.detector_offsets import OffsetConfig
 from shapepose_fg.io.config import toml_text
 from shapepose_fg.pipeline.execution import Execution
@@ -136,18 +137,36 @@ def test_a_run_that_is_stopped_again_and_again_ends_the_same(scene, recording, w
     assert people.observations is not None and "run_id" not in people.run
 
 
+KEYFRAMES = replace(CONFIG, windows=replace(CONFIG.windows, keyframe_s=0.12))
+WITHOUT_OFFSETS = OffsetConfig(source="none")
+
+
 @pytest.mark.slow
-def test_a_run_whose_detector_exchanges_sides_goes_on(scene, recording, tmp_path):
-    """One of three views sees everybody's left as right: its detections are exchanged before they
-    are given out, and are so when the run goes on.
+@pytest.mark.parametrize(
+    ("config", "exchanged", "trust"),
+    [
+        (CONFIG, (0,), BELIEVED),
+        (KEYFRAMES, (), BELIEVED),
+        (KEYFRAMES, (0,), Trust(left_out=((1, 5, 9),), doubted=((2, 0, 24),))),
+    ],
+    ids=["one view exchanges sides", "keyframes", "both, and cameras are left out"],
+)
+def test_a_run_goes_on_whose_frames_are_not_as_the_detector_gave_them(
+    scene, recording, tmp_path, config, exchanged, trust
+):
+    """Detections that are exchanged, thinned or left out before they are given out, and frames
+    without people: all are so again when the run goes on.
     """
     mirror = np.array(recording.skeleton.mirror)
     frames = [
-        replace(each, joint=np.where(each.view == 0, mirror[each.joint], each.joint))
-        for each in (recording[n] for n in range(24))
+        replace(each, joint=np.where(np.isin(each.view, exchanged), mirror[each.joint], each.joint))
+        for each in recording
     ]
-    config = replace(CONFIG, offsets=OffsetConfig(source="none"))
-    task = Task(Recording(recording.skeleton, frames), scene.rig, config)
+    task = Task(
+        Trusted(Recording(recording.skeleton, frames), trust),
+        scene.rig,
+        replace(config, offsets=WITHOUT_OFFSETS),
+    )
     with_stops(task, tmp_path / "parts").save(tmp_path / "results")
     reconstruct_parts(InFolder(tmp_path / "others"), task).save(tmp_path / "whole")
     assert_same_files(tmp_path / "results", tmp_path / "whole")
@@ -163,7 +182,7 @@ def test_what_is_in_memory_and_what_is_in_the_files_is_the_same(dance, tmp_path)
 
 @pytest.mark.slow
 def test_without_time_it_goes_on_too(scene, recording, tmp_path):
-    config = PipelineConfig(temporal=False, batch_frames=4, offsets=OffsetConfig(source="none"))
+    config = PipelineConfig(temporal=False, batch_frames=4, offsets=WITHOUT_OFFSETS)
     frames = range(4, 12)
     kept = Interrupted(tmp_path / "parts", 4, behind=False)
     with pytest.raises(Stopped):

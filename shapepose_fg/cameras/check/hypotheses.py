@@ -113,7 +113,8 @@ def mistake_of_cameras(setup: SetupHypothesis, rng: np.random.Generator) -> Chan
             for change in _of_all(thinned)
         ]
     found = [(gain, change) for gain, change in found if gain > GAIN / setup.view_count]
-    for view in range(setup.view_count if setup.cameras_used > 2 else 0):
+    # A camera that moves by little is looked for among all, once none is far off.
+    for view in (weak or range(setup.view_count)) if setup.cameras_used > 2 else ():
         changes = [
             Change(finding, after, freedom) for finding, after, freedom in motions(setup, view, rng)
         ]

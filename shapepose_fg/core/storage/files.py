@@ -278,7 +278,7 @@ def write_together(
     temporary: dict[Path, Path] = {}
     try:
         for path, write in files.items():
-            with _naming(path):
+            with naming_file(path):
                 path.parent.mkdir(parents=True, exist_ok=True)
                 temporary[path] = path.with_name(f".{path.name}.{token_hex(4)}{_PART}")
                 with temporary[path].open("xb") as stream:
@@ -287,12 +287,13 @@ def write_together(
                     os.fsync(stream.fileno())
         check(temporary)
         for path in files:
-            with _naming(path):
+            with naming_file(path):
                 temporary[path].replace(path)
             del temporary[path]
     finally:
         for left in temporary.values():
-            left.unlink(missing_ok=True)
+            with suppress(OSError):  # such as on a read-only disk: the first error says why
+                left.unlink(missing_ok=True)
     # The renaming itself is synced to disk, if the system supports it; some network file systems do
     # not.
     for folder in {path.parent for path in files} if os.name == "posix" else ():
@@ -327,7 +328,7 @@ _PART = ".part"
 
 
 @contextmanager
-def _naming(path: Path) -> Iterator[None]:
+def naming_file(path: Path) -> Iterator[None]:
     """Add `path` to an OSError inside the block that names no file, or a temporary file beside
     `path`.
     """

@@ -184,8 +184,9 @@ def checkpoint_arrays(checkpoint: Checkpoint) -> dict[str, NDArray[Any]]:
     follow, decided = checkpoint.state.follow, checkpoint.state.decided
     arrays |= {"state.numbers": np.array([follow.next_id, checkpoint.state.before])}
     arrays |= {"state.rows": np.array([len(rows) for _, rows in decided], dtype=np.int64)}
-    arrays |= {"state.ids": follow.people.ids, "state.mean": follow.people.joints.mean}
-    arrays |= {"state.covariance": follow.people.joints.covariance}
+    people = follow.people
+    arrays |= {"state.ids": people.ids, "state.time_s": np.full(len(people), people.time_s)}
+    arrays |= {"state.mean": people.joints.mean, "state.covariance": people.joints.covariance}
     for name in _ROWS if len(decided) > 0 else ():
         arrays[f"rows.{name}"] = np.concatenate([getattr(rows, name) for _, rows in decided])
     for name in _SIDES if len(decided) > 0 else ():
@@ -208,6 +209,7 @@ the cameras."""
 _FOLLOWED = {"at": _NUMBERS("2"), "state.numbers": _NUMBERS("2"), "state.rows": _NUMBERS("F")}
 _FOLLOWED |= {
     "state.ids": _NUMBERS("A"),
+    "state.time_s": Column("A", finite=True),
     "state.mean": Column("A J S", most=MOST_METRES, finite=True),
 }
 _FOLLOWED |= {"state.covariance": Column("A J S S", most=1e12, finite=True)}
@@ -270,8 +272,7 @@ def checkpoint_of(
     )
     if len(ids) > 0:
         _check_tracks(ids, next_track)
-        last = given[decided.stop - 1] if len(decided) > 0 else read(decided.stop - 1)
-        people = people_at(last, ids, JointStates(*joints))
+        people = people_at(float(arrays["state.time_s"][0]), ids, JointStates(*joints))
     follow = FollowState(
         people, next_track, tuple(given[frame] for frame in range(decided.stop, following))
     )

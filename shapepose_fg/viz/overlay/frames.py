@@ -2,6 +2,7 @@
 images atomically.
 """
 
+import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -100,7 +101,7 @@ def write_overlay(
     columns, cells = (1, own) if width is None else grid_shape(own, width)
     names = [used.name for used, _ in over.cameras] if width is None else [_GRID]
     paths: list[Path] = []
-    videos: list[cv2.VideoWriter] = []
+    videos: list[Callable[[Picture], None]] = []
     with ExitStack() as stack:
         for at, frame in enumerate(frames):
             drawn = over.draw(frame, cells)
@@ -113,29 +114,47 @@ def write_overlay(
                 if at == 0:
                     paths.append(folder / f"{name}.mp4")
                     videos.append(stack.enter_context(_video(paths[-1], picture.shape[1::-1], fps)))
-                videos[index].write(np.ascontiguousarray(picture))
+                videos[index](np.ascontiguousarray(picture))
             done(at + 1, len(frames))
     return paths
 
 
 @contextmanager
-def _video(path: Path, size: Sequence[int], fps: float) -> Iterator[cv2.VideoWriter]:
-    """Context manager: an mp4 video that is moved to `path` when it is complete."""
+def _video(path: Path, size: Sequence[int], fps: float) -> Iterator[Callable[[Picture], None]]:
+    """Context manager: a function that appends a picture to an mp4 video, which is moved to `path`
+    when it is complete.
+    """
     part = path.with_name(f".{path.stem}.part.mp4")  # OpenCV selects the container by extension
     path.parent.mkdir(parents=True, exist_ok=True)
     part.unlink(missing_ok=True)  # it may be a symbolic link
+    # OpenCV does not report that a picture was not written, such as on a full disk: the pictures of
+    # the file are counted. Its messages are replaced by ours.
+    level, count = cv2.utils.logging.getLogLevel(), 0
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     writer = cv2.VideoWriter(str(part), cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
+
+    def append(picture: Picture) -> None:
+        nonlocal count
+        writer.write(picture)
+        count += 1
+
     try:
         if not writer.isOpened():
             raise InputError(
                 f"{path}: a video of {size[0]} x {size[1]} cannot be written; check the free disk"
                 " space and the permissions"
             )
-        yield writer
+        yield append
         writer.release()
+        if cv2.VideoCapture(str(part), cv2.CAP_FFMPEG).get(cv2.CAP_PROP_FRAME_COUNT) != count:
+            raise InputError(
+                f"{path}: the video could not be written to its end; check the free disk space"
+            )
         part.replace(path)
     finally:
         writer.release()
+        cv2.utils.logging.setLogLevel(level)
         part.unlink(missing_ok=True)
 
 
