@@ -243,10 +243,10 @@ def _in_mirror(setup: SetupHypothesis, view: int) -> list[Change]:
         return replace(seen, xy=xy, confidence=seen.confidence[:, joints])
 
     side = setup.evidence.other_side
-    looks = [
+    changed = [
         setup.seeing(view, partial(mirrored, joints=each)) for each in (side, np.arange(len(side)))
     ]
-    return [Change(Finding(Kind.MIRRORED, (view,)), each) for each in looks]
+    return [Change(Finding(Kind.MIRRORED, (view,)), each) for each in changed]
 
 
 def _of_all(setup: SetupHypothesis) -> Iterator[Change]:
