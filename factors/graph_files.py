@@ -209,7 +209,7 @@ class _Writer:
                 strict=True,
             ):
                 if not np.abs(here - there).max() <= 1e-9 * max(np.abs(here).max(), 1.0):
-                    raise ValueError("would differ when it is read")
+                    raise ValueError("a file cannot hold it exactly")
         except (ValueError, RuntimeError) as error:
             raise ValueError(f"factor {number}, {type(factor).__name__}: {error}") from None
         return found
@@ -376,7 +376,7 @@ def _factor(record: Any) -> gtsam.NonlinearFactor:
 def _linear(keys: list[int], A: Any, b: Any, sizes: Any) -> gtsam.NonlinearFactor:
     rows = len(b)
     if not (rows and keys) or len(set(keys)) < len(keys):
-        raise ValueError("needs rows, and keys that differ")
+        raise ValueError("must have one row or more, and distinct keys")
     if len(sizes) != len(keys) or not all(
         type(each) is int and 0 < each <= _LARGEST_VECTOR for each in sizes
     ):

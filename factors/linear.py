@@ -26,7 +26,7 @@ def linear_factor(
     """
     names = np.atleast_1d(np.asarray(keys)).tolist()
     if len(names) == 0 or len(set(names)) < len(names):
-        raise ValueError(f"keys must be one or more, and differ, got {names}")
+        raise ValueError(f"keys must be one or more distinct keys, got {names}")
     if len(matrices) != len(names):
         raise ValueError(f"matrices must be one for each of {len(names)} keys, got {len(matrices)}")
     blocks = [_block(each) for each in matrices]

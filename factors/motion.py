@@ -47,7 +47,7 @@ class Motion:
     def __post_init__(self) -> None:
         if self.order not in ORDERS or len(self.start) != self.order - 1:
             raise ValueError(
-                f"order must be one of {ORDERS} and start that many less one, got {self}"
+                f"order must be one of {ORDERS}, and start must have order - 1 values, got {self}"
             )
 
     def transition(self, dt_s: ArrayLike) -> Array:

@@ -19,7 +19,7 @@ from shapepose_fg.body.model.rotation import hat
 from shapepose_fg.cameras.bundle import Adjusted, Freedom, Undetermined, dilution
 from shapepose_fg.cameras.parameters import POSE, Q, by_parameters, placing, seen_by
 from shapepose_fg.cameras.people import Footage, People
-from shapepose_fg.cameras.relative_pose import LOOK_S
+from shapepose_fg.cameras.relative_pose import SAMPLING_S
 from shapepose_fg.cameras.sightings import Sightings, follow, median_of
 from shapepose_fg.cameras.synchronise import WHOLE_S
 from shapepose_fg.core.arrays import Array, Index, Mask
@@ -81,7 +81,7 @@ class Placed(Rows):
     time_s: Array
     """(P,) time of each person, seconds."""
     moment: Index
-    """(P,) number of the moment, `LOOK_S` apart."""
+    """(P,) number of the sampled time; sampled times are `SAMPLING_S` apart."""
     points: Array
     """(P, J, 3) core joints, metres; NaN where unknown."""
     velocity: Array
@@ -107,7 +107,7 @@ class Placed(Rows):
         one, other = (pair[np.diff(track[order]) == 0] for pair in (order[:-1], order[1:]))
         before, after = np.arange(len(moment)), np.arange(len(moment))
         before[other], after[one] = one, other
-        lasts = np.maximum(time_s[after] - time_s[before], LOOK_S / 2)[:, None, None]
+        lasts = np.maximum(time_s[after] - time_s[before], SAMPLING_S / 2)[:, None, None]
         velocity = np.nan_to_num((points[after] - points[before]) / lasts)
         spread = np.zeros((*points.shape, 0)) if spread is None else spread
         return cls(time_s, moment, points, velocity, track, spread)
@@ -121,7 +121,7 @@ class Placed(Rows):
         """
         first = float(np.sort(np.nanmin(time_s, axis=0))[1])
         last = min(float(np.sort(np.nanmax(time_s, axis=0))[-2]), first + WHOLE_S)
-        moments = np.arange(first, last, LOOK_S)
+        moments = np.arange(first, last, SAMPLING_S)
         number = np.full(time_s.shape, -1)
         for own, of_moment in zip(time_s.T, number.T, strict=True):
             frame = _nearest(own, moments)
@@ -250,7 +250,7 @@ class Start:
             return None
         return (
             f"camera {name}: its poses are known to {self.within()} only ({_SURE:.0%}), but "
-            f"{most_deg:g} degrees and {1e3 * most_m:g} mm are asked (--tolerance); give the "
+            f"{most_deg:g} degrees and {1e3 * most_m:g} mm are required (--tolerance); give the "
             "lenses of all cameras, film longer or two people, or accept the cameras as they are"
         )
 
@@ -348,8 +348,8 @@ class Filmed:
     def _registered(self, placed: Placed, most_s: float) -> list[Start]:
         """Approximate starts from pairs of tracks; `agreeing` is a score."""
         depth = _depth(self.rays, placed.points)
-        moment = np.rint((self.own_s - self.own_s[0]) / LOOK_S).astype(np.intp)
-        frames = _nearest(self.own_s, self.own_s[0] + LOOK_S * np.arange(moment.max() + 1))
+        moment = np.rint((self.own_s - self.own_s[0]) / SAMPLING_S).astype(np.intp)
+        frames = _nearest(self.own_s, self.own_s[0] + SAMPLING_S * np.arange(moment.max() + 1))
         frames = frames[frames >= 0]
         frame, person = np.nonzero(np.isfinite(depth[frames]))
         frame = frames[frame]
@@ -360,7 +360,7 @@ class Filmed:
             for track in range(placed.track.max(initial=-1) + 1)
             if _lasts(grid := placed.grid(track, length))
         ]
-        begin, found = float((placed.time_s - LOOK_S * placed.moment)[0]), list[Start]()
+        begin, found = float((placed.time_s - SAMPLING_S * placed.moment)[0]), list[Start]()
         for bTc in _QUARTERS:
             oTc = (self._oTb @ bTc)[frame]
             own = points @ oTc[:, :3, :3].mT + oTc[:, None, :3, 3]
@@ -369,8 +369,8 @@ class Filmed:
             spectra = [_Spectrum.of(grid) for grid in grids if _lasts(grid)]
             for one, other in product(fixed, spectra):
                 lags, wTo, score = one.over(other)
-                offset = LOOK_S * lags + begin - self.own_s[0]
-                score = np.where(np.abs(offset) <= most_s + LOOK_S, score, 0.0)
+                offset = SAMPLING_S * lags + begin - self.own_s[0]
+                score = np.where(np.abs(offset) <= most_s + SAMPLING_S, score, 0.0)
                 for _ in range(_PEAKS):
                     if score[at := int(score.argmax())] > 0:
                         found.append(
@@ -698,7 +698,7 @@ class _Spectrum:
         R = nearest_rotation(both)
         agreed = np.einsum("lij,lij->l", R, both)
         left = np.maximum(spread[0] + spread[1] - 2 * agreed, 0.0)
-        least = _LEAST_S / LOOK_S * self.known.shape[1] / 2
+        least = _LEAST_S / SAMPLING_S * self.known.shape[1] / 2
         score = count * np.clip(1 - left / _AGREE_M**2, 0.0, None)
         score[(count < least) | (spread[0] < _LEAST_WAY_M**2)] = 0.0
         t = p + self.centre - np.einsum("lij,lj->li", R, q + other.centre)
@@ -708,7 +708,7 @@ class _Spectrum:
 
 def _lasts(grid: Array) -> bool:
     """Whether a track is long enough to be registered."""
-    return bool(np.isfinite(grid[..., 0]).any(axis=1).sum() >= _LEAST_S / LOOK_S)
+    return bool(np.isfinite(grid[..., 0]).any(axis=1).sum() >= _LEAST_S / SAMPLING_S)
 
 
 def _nearest(own: Array, times: Array) -> Index:
@@ -719,7 +719,7 @@ def _nearest(own: Array, times: Array) -> Index:
     after = np.searchsorted(own[finite], times).clip(1, len(finite) - 1)
     nearer = times - own[finite[after - 1]] < own[finite[after]] - times
     frame = finite[after - nearer]
-    return np.where(np.abs(own[frame] - times) <= LOOK_S / 2, frame, -1)
+    return np.where(np.abs(own[frame] - times) <= SAMPLING_S / 2, frame, -1)
 
 
 def _depth(rays: Array, points: Array) -> Array:

@@ -19,9 +19,9 @@ from shapepose_fg.cameras.triangulation import KERNEL
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.decompositions import basis_across
 
-LOOK_S = 0.2
+SAMPLING_S = 0.2
 """Interval between compared frames, s: people's joints move by more than a detector's error."""
-_MOST_LOOKS = 80
+_MOST_FRAMES = 80
 """Maximum number of frames for scoring hypotheses."""
 _MOST_TRIED = 30
 """Maximum number of pairs of tracks for hypotheses, those with the longest common time."""
@@ -59,11 +59,11 @@ class Relative:
 class Together:
     """Sightings of two cameras in the same frames: N pairs of rows, K pairs of tracks."""
 
-    def __init__(self, one: CameraTracks, other: CameraTracks, looks: Index) -> None:
-        rows = [_rows(each, looks) for each in (one, other)]
+    def __init__(self, one: CameraTracks, other: CameraTracks, compared: Index) -> None:
+        rows = [_rows(each, compared) for each in (one, other)]
         both = (rows[0][:, None] >= 0) & (rows[1][None] >= 0)
-        a, b, look = np.nonzero(both)
-        self.rows = np.stack([rows[0][a, look], rows[1][b, look]], axis=1)
+        a, b, frame = np.nonzero(both)
+        self.rows = np.stack([rows[0][a, frame], rows[1][b, frame]], axis=1)
         self.tracks, self.pair = np.unique(np.stack([a, b], axis=1), axis=0, return_inverse=True)
         self.pair = self.pair.reshape(-1)
         self.count = np.bincount(self.pair, minlength=len(self.tracks))
@@ -126,16 +126,18 @@ def relative(one: CameraTracks, other: CameraTracks, fps: float) -> Relative | N
     frames = np.intersect1d(one.frame, other.frame)
     if len(frames) == 0:
         return None
-    looks = np.unique((frames // max(1, round(LOOK_S * fps))) * max(1, round(LOOK_S * fps)))
-    looks = looks[np.unique(np.linspace(0, len(looks) - 1, _MOST_LOOKS).astype(np.intp))]
-    seen = Together(one, other, looks)
+    compared = np.unique(
+        (frames // max(1, round(SAMPLING_S * fps))) * max(1, round(SAMPLING_S * fps))
+    )
+    compared = compared[np.unique(np.linspace(0, len(compared) - 1, _MOST_FRAMES).astype(np.intp))]
+    seen = Together(one, other, compared)
     guesses = _guesses(one, other, seen)
     if len(guesses) == 0:
         return None
     scores = np.array([seen.chosen(miss)[1] for miss in seen.misses(guesses)])
     found: Relative | None = None
     for E in guesses[np.argsort(-scores, kind="stable")[:_FINALISTS]]:
-        each = _settled(E, seen, fps, looks)
+        each = _settled(E, seen, fps, compared)
         if each is not None and (found is None or each.score > found.score):
             found = each
     return found
@@ -179,7 +181,7 @@ def _guesses(one: CameraTracks, other: CameraTracks, seen: Together) -> Array:
     return np.stack(found) if found else np.zeros((0, 3, 3))
 
 
-def _settled(E: Array, seen: Together, fps: float, looks: Index) -> Relative | None:
+def _settled(E: Array, seen: Together, fps: float, compared: Index) -> Relative | None:
     """Pose of a hypothesis, refined alternately with the set of agreeing tracks."""
     kept, score = seen.chosen(seen.misses(E[None])[0])
     best: Relative | None = None
@@ -197,7 +199,7 @@ def _settled(E: Array, seen: Together, fps: float, looks: Index) -> Relative | N
         share = (
             float(ahead[np.isfinite(points[..., 0])].mean()) if np.isfinite(points).any() else 0.0
         )
-        step = float(np.median(np.diff(looks))) / fps if len(looks) > 1 else LOOK_S
+        step = float(np.median(np.diff(compared))) / fps if len(compared) > 1 else SAMPLING_S
         best = Relative(R, t, score * max(0.0, 2 * share - 1), len(a) * step, points)
         kept = new
     return best
@@ -251,11 +253,11 @@ def refined_pose(R: Array, t: Array, a: Array, b: Array, size: Array) -> tuple[A
     return moved(found.x)
 
 
-def _rows(tracks: CameraTracks, looks: Index) -> Index:
+def _rows(tracks: CameraTracks, compared: Index) -> Index:
     """(K, F) the row of each track at each compared frame, -1 where it has none."""
     begins = tracks.frame[tracks.first]
-    inside = (looks >= begins[:, None]) & (looks <= tracks.lasts[:, None])
-    return np.where(inside, tracks.first[:, None] + looks - begins[:, None], -1)
+    inside = (compared >= begins[:, None]) & (compared <= tracks.lasts[:, None])
+    return np.where(inside, tracks.first[:, None] + compared - begins[:, None], -1)
 
 
 def _at_once(rows: Index) -> Mask:

@@ -49,7 +49,9 @@ class FreedomOptions:
         _CAMERAS, "Refine k1 k2 p1 p2, too (prior sigma 0.02).", False, "--distortion"
     )
     reference: str | None = option(
-        _CAMERAS, "Camera whose pose stays; by default the rig as a whole stays.", metavar="CAMERA"
+        _CAMERAS,
+        "Camera whose pose is fixed; by default that of the rig as a whole.",
+        metavar="CAMERA",
     )
     stature: Stature | None = option(
         _CAMERAS, "Mean stature of the people, metres; it then determines the scale."

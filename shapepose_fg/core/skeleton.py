@@ -20,8 +20,8 @@ def check_joint_names(names: Iterable[str]) -> None:
     for name in names:
         if not (0 < len(name) <= LONGEST_NAME and name.isprintable() and name[0] not in "=+-@"):
             raise ValueError(
-                f"joint_names must be 1 to {LONGEST_NAME} letters in one line, the first none of "
-                f"= + - @, got {name[:LONGEST_NAME]!r}"
+                f"joint_names must have 1 to {LONGEST_NAME} printable characters and not begin "
+                f"with = + - or @, got {name[:LONGEST_NAME]!r}"
             )
 
 

@@ -100,8 +100,8 @@ class BoxNetwork:
         ):
             raise InputError(
                 f"{self.network.file}: for pictures of {words(self.form.size)}, YOLOX has an "
-                f"output of 1 x {len(cells)} x 6 or more, or of 1 x N x 5 with suppression "
-                f"inside, but this network has {words(shape)}; give another --boxes"
+                f"output of 1 x {len(cells)} x 6 or more, or of 1 x N x 5 with non-maximum "
+                f"suppression in it, but this network has {words(shape)}; give another --boxes"
             )
         found = outputs[0][0]
         if shape[2] == 5:

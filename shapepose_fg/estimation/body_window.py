@@ -446,7 +446,7 @@ class BodyWindow:
             L, ahead = kept[t, :N, :N], kept[t, N : N + n * N, :N]
             inverse, singular = invert(L, lower=1)
             if singular:
-                raise np.linalg.LinAlgError("a frame of the window is not determined")
+                raise np.linalg.LinAlgError("the body in a frame of the window is not determined")
             inverse = np.tril(inverse)
             W = ahead @ inverse
             across = -after @ W  # of those after it with this one

@@ -9,10 +9,10 @@ import numpy as np
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.decompositions import basis_across
 
-LOOK_S = 1.5
+MEASUREMENT_S = 1.5
 """Time for which a standing foot counts as one measurement of the floor, s: errors of joints are
 correlated as long."""
-LEAST_LOOKS = 6
+LEAST_MEASUREMENTS = 6
 """Minimum number of measurements for a floor: two feet of one person over five seconds, or of three
 people in the same second."""
 AGREE = 0.6
@@ -66,18 +66,21 @@ class Floor:
         return cls(normal=np.array(values["normal"]), **rest)
 
 
-def find_floor(points: Array, look: Index, up: Array, tilt_rad: float = TILT_RAD) -> Floor | str:
+def find_floor(
+    points: Array, measurement: Index, up: Array, tilt_rad: float = TILT_RAD
+) -> Floor | str:
     """The floor under `points` (N, 3), the lowest points of standing feet; else the reason why
     there is none.
 
-    `look` (N,) is the number of the measurement to which each point belongs: errors within one are
-    correlated. A robust fit of a plane, level up to `tilt_rad`, starts at the height at which most
-    measurements agree.
+    `measurement` (N,) is the number of the measurement to which each point belongs: errors within
+    one are correlated. A robust fit of a plane, level up to `tilt_rad`, starts at the height at
+    which most measurements agree.
     """
-    numbers, group, count = np.unique(look, return_inverse=True, return_counts=True)
-    if len(numbers) < LEAST_LOOKS:
+    numbers, group, count = np.unique(measurement, return_inverse=True, return_counts=True)
+    if len(numbers) < LEAST_MEASUREMENTS:
         return (
-            f"{len(numbers)} measurements of standing feet, but at least {LEAST_LOOKS} are needed"
+            f"{len(numbers)} measurements of standing feet, but at least {LEAST_MEASUREMENTS} are "
+            "needed"
         )
     weight, height = 1.0 / count[group], points @ up
     order = np.argsort(height, kind="stable")

@@ -15,7 +15,7 @@ from shapepose_fg.core.camera import Views
 from shapepose_fg.core.kernel_geometry import ROBUST
 from shapepose_fg.core.observations import Observations
 from shapepose_fg.core.rows import Rows
-from shapepose_fg.estimation.kernels import complete, look, ready
+from shapepose_fg.estimation.kernels import complete, gate_and_linearise, ready
 
 MIN_DEPTH_M = 0.2
 """Minimum depth of a joint in front of a camera for its observation to be used, m."""
@@ -218,7 +218,7 @@ def linearise(
     shape, kernel = observations.confidence.shape, config.robust_kernel
     inlier, residual = np.zeros(shape, dtype=bool), np.full((*shape, 2), np.nan)
     information, gradient = np.zeros((*shape[:2], 3, 3)), np.zeros((*shape[:2], 3))
-    look(
+    gate_and_linearise(
         ready(points), views.projection, views.focal, ready(observations.xy),
         ready(np.where(observations.seen, sigmas, 0.0)), config.fixed_depth_m, MIN_DEPTH_M,
         config.rho_2d_m if reach_m is None else reach_m, reach_m is not None, ROBUST[kernel],

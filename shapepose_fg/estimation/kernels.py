@@ -83,7 +83,7 @@ def add_detection(
 
 
 @kernel("f3 f4 f2 f4 f3 f0 f0 f0 b0 i0 f0 b3 f4 f4 f3")
-def look(
+def gate_and_linearise(
     points, cameras, focal, xy, sigmas, fixed_depth, least_depth, reach, by_reach, robust, width,
     inlier, residual, information, gradient,
 ):  # fmt: skip

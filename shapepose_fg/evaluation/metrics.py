@@ -92,7 +92,7 @@ def match_people(
     numbers = range(len(true)) if frames is None else frames
     if len(numbers) != len(true):
         raise ValueError(
-            f"frames must number the {len(true)} frames of the truth, got {len(numbers)}"
+            f"frames must be {len(true)} numbers, one a frame of the truth, got {len(numbers)}"
         )
     has_joint = np.isfinite(predicted.sum(axis=2)).any(axis=1)
     is_there = np.isfinite(true.sum(axis=3)).any(axis=2)

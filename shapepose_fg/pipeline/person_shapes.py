@@ -31,7 +31,7 @@ from shapepose_fg.body.shapes import SubjectShapes, recognise
 from shapepose_fg.core.arrays import Array, Index, Whole
 from shapepose_fg.core.reconstruction import BODY, Reconstruction
 from shapepose_fg.core.rows import Rows
-from shapepose_fg.estimation.floor import LOOK_S, Floor
+from shapepose_fg.estimation.floor import MEASUREMENT_S, Floor
 
 _NOT_ROBUST = 1e9
 """Width of the robust kernel, standard deviations, at which it has no effect."""
@@ -81,8 +81,8 @@ class ShapeEvidence:
     """(10,) information times betas, summed over all rows."""
     count: int = 0
     """Number of rows."""
-    looks: set[int] = field(default_factory=set)
-    """Numbers of the intervals, `LOOK_S` long, in which there are rows. Errors of joints are
+    measurements: set[int] = field(default_factory=set)
+    """Numbers of the intervals, `MEASUREMENT_S` long, in which there are rows. Errors of joints are
     correlated as long, so all rows of an interval count as one measurement of the shape."""
 
     def add(self, other: "ShapeEvidence") -> None:
@@ -90,14 +90,14 @@ class ShapeEvidence:
         self.information = self.information + other.information
         self.pull = self.pull + other.pull
         self.count += other.count
-        self.looks |= other.looks
+        self.measurements |= other.measurements
 
     @property
     def measured(self) -> tuple[Array, Array]:
         """Information on the betas (10, 10), and information times betas (10,), if each interval
         counts as one measurement.
         """
-        share = min(len(self.looks) / max(self.count, 1), 1.0)
+        share = min(len(self.measurements) / max(self.count, 1), 1.0)
         return share * self.information, share * self.pull
 
 
@@ -112,9 +112,9 @@ def _evidence(model: BodyModel, sigma_m: float, rows: WindowBodies) -> dict[int,
         body = energy.evaluate(free, targets, _NOT_ROBUST, held, nothing(count))
         information = np.linalg.inv(body.covariances()[1]) - np.eye(10)
         pull = (information @ free[:, :10, None])[..., 0]
-        looks = (selected.time_s // LOOK_S).astype(np.int64).tolist()
+        measurements = (selected.time_s // MEASUREMENT_S).astype(np.int64).tolist()
         for n, number in enumerate(selected.person.tolist()):
-            each = ShapeEvidence(information[n], pull[n], 1, {looks[n]})
+            each = ShapeEvidence(information[n], pull[n], 1, {measurements[n]})
             found.setdefault(number, ShapeEvidence()).add(each)
     return found
 

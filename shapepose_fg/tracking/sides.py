@@ -144,8 +144,8 @@ class _Compared:
 
 
 @dataclass(frozen=True)
-class _Look:
-    """State of a person in one frame."""
+class _CheckedFrame:
+    """State of a person in a frame that was checked for swaps."""
 
     frame: int
     """Index of the frame."""
@@ -162,7 +162,7 @@ def correct_swaps(tracker: Tracker, frames: Sequence[Input], people: Tracks) -> 
     frame before.
     """
     tracks, sought_s, count = replace(people, ids=np.arange(len(people))), -np.inf, len(people)
-    compared, looks = list[_Compared](), dict[int, list[_Look]]()
+    compared, checked = list[_Compared](), dict[int, list[_CheckedFrame]]()
     for n, each in enumerate(frames):
         time_s, skeleton = float(each.time_s.mean()), tracker.skeleton
         seen = _Compared.of(each, tracks.ids, tracker.ahead(tracks, time_s), skeleton)
@@ -185,23 +185,25 @@ def correct_swaps(tracker: Tracker, frames: Sequence[Input], people: Tracks) -> 
                 seen = _Compared.of(each, tracks.ids, tracks.joints, skeleton)
         compared.append(seen)
         for row, number in enumerate(tracks.ids.tolist()):
-            views, before = seen.of_person(number), looks.get(number, [])
+            views, before = seen.of_person(number), checked.get(number, [])
             if not before or time_s - before[-1].time_s >= SEARCH_S:
-                looks[number] = [
+                checked[number] = [
                     *before,
-                    _Look(n, time_s, tracks.joints.rows(np.array([row])), views),
+                    _CheckedFrame(n, time_s, tracks.joints.rows(np.array([row])), views),
                 ]
     own = {
         name: _own_sides(tracker, found, followed=name < len(people))
-        for name, found in looks.items()
-        if any(look.views.argmax(axis=1).any() for look in found)
+        for name, found in checked.items()
+        if any(entry.views.argmax(axis=1).any() for entry in found)
     }
     held = list[Input]()
     for n, (each, seen) in enumerate(zip(frames, compared, strict=True)):
         now = dict[int, tuple[Mask, Array]]()
         for number, (turned, doubt) in own.items():
             at = max(
-                int(np.searchsorted([look.frame for look in looks[number]], n, side="right")) - 1, 0
+                int(np.searchsorted([entry.frame for entry in checked[number]], n, side="right"))
+                - 1,
+                0,
             )
             now[number] = turned[at], doubt[at]
         held.append(seen.corrected(each, now, tracker.skeleton))
@@ -221,8 +223,8 @@ def correct_swaps_now(
     for row, number in enumerate(tracks.ids.tolist()):
         views = seen.of_person(number)
         if views.argmax(axis=1).any():
-            look = _Look(given.frame, 0.0, joints.rows(np.array([row])), views)
-            (turned,), (doubt,) = _own_sides(tracker, [look], followed=followed)
+            entry = _CheckedFrame(given.frame, 0.0, joints.rows(np.array([row])), views)
+            (turned,), (doubt,) = _own_sides(tracker, [entry], followed=followed)
             own[number], order = (turned, doubt), _order(turned, skeleton)
             if not _doubtful(doubt, skeleton):
                 mean[row], covariance[row] = mean[row, order], covariance[row, order]
@@ -231,20 +233,22 @@ def correct_swaps_now(
     )
 
 
-def _own_sides(tracker: Tracker, looks: Sequence[_Look], *, followed: bool) -> tuple[Mask, Array]:
-    """Parts (N, K) that a person has swapped in each look, and probabilities (N, K) that this is
-    wrong.
+def _own_sides(
+    tracker: Tracker, checked: Sequence[_CheckedFrame], *, followed: bool
+) -> tuple[Mask, Array]:
+    """Parts (N, K) that a person has swapped in each checked frame, and probabilities (N, K) that
+    this is wrong.
 
-    A hidden Markov model: in each look the person is compared with a body, and with the swaps that
-    each state implies for the views. `followed`: the sides were right before.
+    A hidden Markov model: in each of these frames the person is compared with a body, and with the
+    swaps that each state implies for the views. `followed`: the sides were right before.
     """
     states = exchanges(tracker.skeleton)
     order = np.array([_order(state, tracker.skeleton) for state in states])  # (S, J)
-    joints = JointStates.concatenate([look.joints for look in looks])
+    joints = JointStates.concatenate([entry.joints for entry in checked])
     number = np.arange(len(states))
     prior = _prior(len(states))[number ^ number[:, None]]  # view's swaps given person's
     weight = np.array(
-        [np.logaddexp.reduce(look.views[:, None] + prior, axis=2).sum(axis=0) for look in looks]
+        [np.logaddexp.reduce(entry.views[:, None] + prior, axis=2).sum(axis=0) for entry in checked]
     )
     # A body can only lower a weight: none is fitted in states that are impossible anyway.
     first = number == weight.argmax(axis=1)[:, None]
@@ -256,7 +260,7 @@ def _own_sides(tracker: Tracker, looks: Sequence[_Look], *, followed: bool) -> t
     change = np.log(np.where(np.eye(len(states), dtype=bool), 1 - _LOST, _LOST))
     ahead, back = np.zeros_like(weight), np.zeros_like(weight)
     ahead[0] = change[0] if followed else 0.0
-    for n in range(1, len(looks)):
+    for n in range(1, len(checked)):
         ahead[n] = np.logaddexp.reduce(change + ahead[n - 1] + weight[n - 1], axis=1)
         back[-n - 1] = np.logaddexp.reduce(change + back[-n] + weight[-n], axis=1)
     log = ahead + weight + back

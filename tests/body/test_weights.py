@@ -181,6 +181,6 @@ def test_the_shipped_weights_are_for_the_shipped_body_and_say_where_they_are_fro
 def test_settings_of_before_are_told_what_took_their_place(tmp_path, table):
     (tmp_path / "settings.toml").write_text(f"[body.{table}]\nkernel_scale = 5.0\n")
     with pytest.raises(
-        InputError, match=rf"body\.{table} is one with \[body\] now, which has model_sigma_m"
+        InputError, match=rf"body\.{table} is part of \[body\] now, with model_sigma_m"
     ):
         read_config(tmp_path / "settings.toml", PipelineConfig)

@@ -92,7 +92,7 @@ def test_it_is_refused_if_it_is_less_sure_than_asked_or_the_fixed_cameras_are(wa
     assert start.within_deg > start.sigma_turn_deg and start.within_m > start.sigma_move_m
     said = start.refusal("phone", *(0.9 * bounds))
     assert said is not None and "camera phone: its poses are known to" in said
-    assert "are asked (--tolerance); give the lenses" in said
+    assert "are required (--tolerance); give the lenses" in said
     assert start.refusal("phone", *(1.1 * bounds)) is None
     shifted = replace(walk, spread=np.full((*walk.points.shape, 1), 0.05))
     other = filmed._refined(start, shifted, MOST_S, Freedom(), 0.0)

@@ -180,7 +180,7 @@ def test_shapes_that_disagree_are_refused(truth):
         joint_metrics(list(truth[:5]), truth)
     with pytest.raises(ValueError, match="joints must be"):
         match_people(np.zeros(3, int), truth[0, :, :20], truth)
-    with pytest.raises(ValueError, match="frames must number"):
+    with pytest.raises(ValueError, match="frames must be 6 numbers"):
         match_people(np.zeros(3, int), truth[0], truth, frames=[0, 1])
 
 

@@ -175,7 +175,7 @@ def test_a_file_of_somebody_is_read_or_refused_in_one_sentence(tmp_path):
         ({"data": [[0, 0, 1e300]]}, "numbers must be finite"),
         ({"noise": [[1, 0, 0], [0, 1, 0], [0, 1, 1]]}, "upper triangular"),
         ({"kernel": ["huber", -1]}, "with a positive width"),
-        ({"kind": "linear", "keys": [1, 1], "data": [[[0] * 6], [0]]}, "keys that differ"),
+        ({"kind": "linear", "keys": [1, 1], "data": [[[0] * 6], [0]]}, "distinct keys"),
     ):
         content = {"format": "shapepose-fg graph 1", "factors": [record | change], "values": {}}
         file.write_text(json.dumps(content))

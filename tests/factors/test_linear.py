@@ -73,7 +73,7 @@ def test_a_factor_without_a_point_of_linearisation_is_found_out():
     ("words", "arguments"),
     {
         "one for each of 2 keys": ([1, 2], [1.0]),
-        "differ": ([1, 1], [1.0, 2.0]),
+        "distinct keys": ([1, 1], [1.0, 2.0]),
         "as many rows": ([1, 2], [np.eye(3), np.ones((2, 3))]),
         "measured must be": ([1], [1.0], np.zeros(2)),
         "sigma must be positive": ([1], [1.0], 0.0, 0.0),

@@ -242,7 +242,7 @@ def test_names_of_joints_are_names(dance, tmp_path, name):
     columns = {key: each.array() for key, each in dance.people.columns().items()}
     columns["joint_names"] = np.array([name, *dance.people.joint_names[1:]])
     np.savez(tmp_path / "people.npz", **columns)
-    with pytest.raises(InputError, match="joint_names must be 1 to 64 letters in one line"):
+    with pytest.raises(InputError, match="joint_names must have 1 to 64 printable"):
         Reconstruction.load(tmp_path)
 
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 Method = Literal["auto", "learned", "plain"]
 _ONE_TABLE = (
-    "is one with [body] now, which has model_sigma_m, kernel_scale, polish_steps and unfinished; "
+    "is part of [body] now, with model_sigma_m, kernel_scale, polish_steps and unfinished; "
     "its other settings are constants"
 )
 _IN_WINDOWS = "was removed: bodies over time are those of the windows"

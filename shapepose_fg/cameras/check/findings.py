@@ -185,8 +185,8 @@ def _duplicate(finding: Finding) -> str:
         ("the same detections", "files") if detections else ("the same pose", "calibration")
     )
     return (
-        f"{{first}} and {{second}} have {same}; one of them has the {others} of the other; give "
-        "its own"
+        f"{{first}} and {{second}} have {same}: one of the two was given the {others} of the "
+        "other; give it its own"
     )
 
 
@@ -323,8 +323,8 @@ _WORDS: dict[Kind, str | Callable[[Finding], str]] = {
         "cannot be checked; use frames with fewer people"
     ),
     Kind.BIASED: (
-        "{who} sees one person beside where the others see this person, by {percent:.0f} % of the"
-        " stature: this is an error of the detector"
+        "{who} sees one person {percent:.0f} % of the stature away from where the other cameras "
+        "see this person: this is an error of the detector"
     ),
     Kind.PICTURE_SIZE: (
         "the pictures of {first} have {found} pixels, but the calibration is for {calibrated}; "

@@ -113,7 +113,8 @@ def mistake_of_cameras(setup: SetupHypothesis, rng: np.random.Generator) -> Chan
             for change in _of_all(thinned)
         ]
     found = [(gain, change) for gain, change in found if gain > GAIN / setup.view_count]
-    for view in range(setup.view_count if setup.cameras_used > 2 else 0):
+    # A camera that moves by little is looked for among all, once none is far off.
+    for view in (weak or range(setup.view_count)) if setup.cameras_used > 2 else ():
         changes = [
             Change(finding, after, freedom) for finding, after, freedom in motions(setup, view, rng)
         ]
@@ -242,10 +243,10 @@ def _in_mirror(setup: SetupHypothesis, view: int) -> list[Change]:
         return replace(seen, xy=xy, confidence=seen.confidence[:, joints])
 
     side = setup.evidence.other_side
-    looks = [
+    changed = [
         setup.seeing(view, partial(mirrored, joints=each)) for each in (side, np.arange(len(side)))
     ]
-    return [Change(Finding(Kind.MIRRORED, (view,)), each) for each in looks]
+    return [Change(Finding(Kind.MIRRORED, (view,)), each) for each in changed]
 
 
 def _of_all(setup: SetupHypothesis) -> Iterator[Change]:

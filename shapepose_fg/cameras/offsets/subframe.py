@@ -47,8 +47,8 @@ class Pairwise:
         """(K, 2) pairs of tracks of cameras a and b that are one person over their common time."""
         one, other = self.tracks[a], self.tracks[b]
         other = replace(other, frame=other.frame - round(self.shift[b] - self.shift[a]))
-        looks = np.unique(one.frame)[:: max(1, round(0.1 * self.fps))]
-        both, centres = Together(one, other, looks), centres_of(self.views)
+        compared = np.unique(one.frame)[:: max(1, round(0.1 * self.fps))]
+        both, centres = Together(one, other, compared), centres_of(self.views)
         kept, _ = both.chosen(both.misses(hat(centres[b] - centres[a])[None])[0])
         return both.tracks[kept]
 

@@ -26,7 +26,7 @@ from shapepose_fg.core.shapes import SubjectShapes
 from shapepose_fg.core.storage.npz import Pieces
 from shapepose_fg.core.storage.schema import Table
 from shapepose_fg.estimation.contact import feet_of
-from shapepose_fg.estimation.floor import LOOK_S, Floor, find_floor
+from shapepose_fg.estimation.floor import MEASUREMENT_S, Floor, find_floor
 from shapepose_fg.pipeline.person_shapes import WindowBodies
 from shapepose_fg.pipeline.runs.parts import OBSERVED, Parts
 
@@ -175,7 +175,7 @@ class Assembly:
         sides = [[n for n in soles if joints[n].startswith(side)] for side in "RL"]
         if len(soles) == 0:
             return "the detector has no heels and toes"
-        points, looks = [], []
+        points, measurements = [], []
         # Approximate number of rows, spread over all frames, for finding the floor.
         every = 1 + (len(self) - 1) // 4000
         for n in range(len(parts)):
@@ -192,9 +192,9 @@ class Assembly:
             points.append(
                 lowest_of_feet(model, (betas, orient, pose, transl), up)[np.arange(len(rows)), side]
             )
-            look = (parts.column(n, "time_s")[rows] // LOOK_S).astype(np.int64)
-            looks.append(np.stack([parts.column(n, "person")[rows], side, look], axis=1))
-        group = np.unique(np.concatenate(looks), axis=0, return_inverse=True)[1]
+            interval = (parts.column(n, "time_s")[rows] // MEASUREMENT_S).astype(np.int64)
+            measurements.append(np.stack([parts.column(n, "person")[rows], side, interval], axis=1))
+        group = np.unique(np.concatenate(measurements), axis=0, return_inverse=True)[1]
         return find_floor(np.concatenate(points), group.ravel(), up)
 
 
