@@ -86,10 +86,10 @@ class _Compared:
         # Sums over the joints of each part (G, parts, A), with the sides as they are, or exchanged.
         same, turned = np.zeros((2, len(groups), states.shape[1] + 1, len(ids)))
         for total, each in ((same, joint), (turned, mirror[joint])):
-            apart = (xy[view, :, each] - found.xy[rows, None]) / unit_px[view, :, each][..., None]
-            apart = np.square(apart).sum(axis=-1)
-            apart = np.minimum(np.nan_to_num(apart, nan=_FARTHEST), _FARTHEST)
-            np.add.at(total, (np.repeat(np.arange(len(groups)), count), part[joint]), apart)
+            squared = (xy[view, :, each] - found.xy[rows, None]) / unit_px[view, :, each][..., None]
+            squared = np.square(squared).sum(axis=-1)
+            squared = np.minimum(np.nan_to_num(squared, nan=_FARTHEST), _FARTHEST)
+            np.add.at(total, (np.repeat(np.arange(len(groups)), count), part[joint]), squared)
         apart_of = np.minimum(same, turned).sum(axis=1) / count[:, None]
         number, best = np.arange(len(groups)), apart_of.argmin(axis=1)
         fits = apart_of[number, best] < _FITS
@@ -105,8 +105,8 @@ class _Compared:
         states = exchanges(skeleton)
         right = np.exp(self.log) @ ~states > _AGREES
         same = (self.who[:, None] == self.who) & (self.who >= 0)
-        sure = self.log.max(axis=1) > self.log[:, 0] + _SURE
-        found = states[np.where(sure, self.log.argmax(axis=1), 0)]
+        certain = self.log.max(axis=1) > self.log[:, 0] + _SURE
+        found = states[np.where(certain, self.log.argmax(axis=1), 0)]
         return found & ((same @ right) | ~(same @ ~found) & (same.sum(axis=1, keepdims=True) > 1))
 
     def of_person(self, number: int) -> Array:
@@ -252,9 +252,9 @@ def _own_sides(
     )
     # A body can only lower a weight: none is fitted in states that are impossible anyway.
     first = number == weight.argmax(axis=1)[:, None]
-    for asked in (first, ~first):
+    for possible in (first, ~first):
         weight[weight < weight[first][:, None] + np.log(_NEVER)] = -np.inf
-        n, s = np.nonzero(asked & np.isfinite(weight))
+        n, s = np.nonzero(possible & np.isfinite(weight))
         at, sigma_m = joints.position[n[:, None], order[s]], joints.sigma_m[n[:, None], order[s]]
         weight[n, s] += _likeness(at, sigma_m, tracker.fitter)
     change = np.log(np.where(np.eye(len(states), dtype=bool), 1 - _LOST, _LOST))

@@ -71,9 +71,9 @@ def read_rig(
     with naming(path):
         wanted = choose([camera.name for camera in written.cameras], cameras, without)
     unwanted = [camera.name for camera in written.cameras if camera.name not in wanted]
-    asked = [f"camera {listing(unwanted)} is left out as requested"] if unwanted else []
+    requested = [f"camera {listing(unwanted)} is left out as requested"] if unwanted else []
     kept = [camera for camera in written.cameras if camera.name in wanted]
-    written = replace(written, cameras=kept, notes=[*written.notes, *asked])
+    written = replace(written, cameras=kept, notes=[*written.notes, *requested])
     up, unit = up or written.up, unit or written.unit
     sizes_missing = any(camera.image_size is None for camera in written.cameras)
     if image_size is not None and not sizes_missing:
