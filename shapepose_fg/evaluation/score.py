@@ -240,9 +240,12 @@ def _scored_frames(
     if len(scored) == 0:
         spans = spans_of(annotated.tolist())[:9]
         listed = ", ".join(f"{span[0]}-{span[-1]}" for span in spans)
-        raise InputError(
-            f"none of the reconstructed frames is annotated; reconstruct annotated frames: {listed}"
+        advice = (
+            f"reconstruct annotated frames: {listed}"
+            if listed
+            else "the truth has no people, check --truth"
         )
+        raise InputError(f"none of the reconstructed frames is annotated; {advice}")
     return scored
 
 

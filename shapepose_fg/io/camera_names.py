@@ -96,8 +96,8 @@ def last_number(name: str) -> int | None:
 
 
 def numbered(folder: Path, ending: str) -> list[tuple[int, Path]]:
-    """The files of a folder with names that end with a frame number and the pattern `ending`,
-    sorted by number.
+    """The files of a folder with names that end with a frame number and the pattern `ending`, in
+    capitals or not, sorted by number.
     """
     # macOS writes ._000000_keypoints.json beside each copied file.
     files = (
@@ -105,7 +105,7 @@ def numbered(folder: Path, ending: str) -> list[tuple[int, Path]]:
         if folder.is_dir()
         else []
     )
-    found = ((re.search(rf"(\d+){ending}$", each.name), each) for each in files)
+    found = ((re.search(rf"(\d+){ending}$", each.name, re.IGNORECASE), each) for each in files)
     return sorted(
         (int(match[1]), each) for match, each in found if match is not None and each.is_file()
     )

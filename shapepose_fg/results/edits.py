@@ -173,10 +173,12 @@ def _split(people: Reconstruction, edit: Edit, rows: Mask) -> Edited:
     assert edit.frame is not None
     later = rows & (people.frame >= edit.frame)
     if not later.any() or (later == rows).all():
-        frames = people.frame[rows]
+        first, last = int(people.frame[rows].min()), int(people.frame[rows].max())
+        if first == last:
+            raise ValueError(f"{edit.person} is present in frame {first} only, so cannot be split")
         raise ValueError(
-            f"{edit.person} is present in frames {frames.min()} to {frames.max()} and cannot be "
-            f"split at {edit.frame}; give a frame from {frames.min() + 1} to {frames.max()}"
+            f"{edit.person} is present in frames {first} to {last} and cannot be split at "
+            f"{edit.frame}; give a frame from {first + 1} to {last}"
         )
     return _relabelled(
         people, {edit.person: _other(edit)}, later, changed={edit.person, _other(edit)}

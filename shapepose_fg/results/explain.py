@@ -60,7 +60,7 @@ def explain(
     any; their `window.track` is the result's person. Raises InputError if the person, the joint or
     the frame is not in the result, or if the result has no observations.
     """
-    table = people.observations
+    row, table = _row_of(people, person, frame, time_s), people.observations
     if table is None:
         raise InputError(
             "the result has no observations.npz, which contains its detections; reconstruct again"
@@ -70,7 +70,6 @@ def explain(
             "the cameras are not those of observations.npz; give the cameras of the reconstruction"
         )
     entries = entries_of(people.run)
-    row = _row_of(people, person, frame, time_s)
     names, frame = people.joint_names.tolist(), int(people.frame[row])
     if joint not in names:
         raise InputError(

@@ -18,6 +18,7 @@ import numpy as np
 from shapepose_fg.body.fitting.fitter import BodyFitter, JointTargets
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.detections import Input
+from shapepose_fg.core.hidden_markov import state_probabilities
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.draft import MODEL_SIGMA_M
 from shapepose_fg.estimation.gated_views import MIN_DEPTH_M
@@ -257,14 +258,11 @@ def _own_sides(
         n, s = np.nonzero(possible & np.isfinite(weight))
         at, sigma_m = joints.position[n[:, None], order[s]], joints.sigma_m[n[:, None], order[s]]
         weight[n, s] += _likeness(at, sigma_m, tracker.fitter)
-    change = np.log(np.where(np.eye(len(states), dtype=bool), 1 - _LOST, _LOST))
-    ahead, back = np.zeros_like(weight), np.zeros_like(weight)
-    ahead[0] = change[0] if followed else 0.0
-    for n in range(1, len(checked)):
-        ahead[n] = np.logaddexp.reduce(change + ahead[n - 1] + weight[n - 1], axis=1)
-        back[-n - 1] = np.logaddexp.reduce(change + back[-n] + weight[-n], axis=1)
-    log = ahead + weight + back
-    probability = np.exp(log - np.logaddexp.reduce(log, axis=1, keepdims=True))
+    turn = np.where(np.eye(len(states), dtype=bool), 1 - _LOST, _LOST)
+    likelihood = np.exp(weight - weight.max(axis=1, keepdims=True))[:, None]
+    turns = np.broadcast_to(turn, (len(checked) - 1, *turn.shape))
+    before = turn[0] if followed else np.ones(len(states))
+    probability = state_probabilities(likelihood, before, turns)[0][:, 0]
     best = states[probability.argmax(axis=1)]
     return best, np.einsum("ns,nsk->nk", probability, best[:, None] != states)
 

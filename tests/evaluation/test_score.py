@@ -102,6 +102,12 @@ def test_only_frames_that_both_cover_are_scored(truth):
     assert score(whole, plain(truth), range(2, 10**12)).frames == 10
     with pytest.raises(InputError, match="annotated frames: 0-11"):
         score(part, plain(truth), range(20, 30))
+    nobody = plain(truth)
+    nobody = replace(
+        nobody, frame=nobody.frame[:0], person=nobody.person[:0], joints=nobody.joints[:0]
+    )
+    with pytest.raises(InputError, match="the truth has no people, check --truth"):
+        score(part, replace(nobody, covered=None))
 
 
 def test_alignment_undoes_a_similarity():

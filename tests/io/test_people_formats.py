@@ -380,6 +380,43 @@ def test_what_macos_leaves_beside_a_file_is_no_frame(tmp_path, rig):
     assert len(read_detections(tmp_path, rig)) == 3
 
 
+def test_files_with_a_suffix_in_capitals(tmp_path, rig):
+    """As programs on Windows write them: a file per frame, or one per camera."""
+    openpose(tmp_path, people_of(COCO_18))
+    wanted = read_detections(tmp_path, rig)
+    for file in tmp_path.glob("*/*.json"):
+        file.rename(file.with_suffix(".JSON"))
+    found = read_detections(tmp_path, rig)
+    assert len(found) == len(wanted) and found.notes == wanted.notes
+    np.testing.assert_array_equal(found[0].xy, wanted[0].xy)
+    assert reading.camera_names(tmp_path) == ["left", "right"]
+    (tmp_path / "whole").mkdir()
+    coco(tmp_path / "whole", people_of(COCO_17))
+    for file in (tmp_path / "whole").glob("*.json"):
+        file.rename(file.with_suffix(".JSON"))
+    assert len(read_detections(tmp_path / "whole", rig)) == 3
+
+
+def test_scores_that_are_all_zero_are_noted(tmp_path, rig):
+    people = people_of(COCO_18)
+    for frames in people.values():
+        for each in [one for found in frames for one in found]:
+            each[:, 2] = 0
+    openpose(tmp_path, people)
+    (said,) = [each for each in read_detections(tmp_path, rig).notes if "scores" in each]
+    assert said.startswith("all scores are 0, so that no joint counts as detected")
+
+
+def test_text_as_windows_writes_it(tmp_path, rig):
+    openpose(tmp_path, people_of(COCO_18))
+    file = tmp_path / "left" / "left_000000000001_keypoints.json"
+    text = file.read_text()
+    file.write_text(text, encoding="utf-8-sig")
+    assert len(read_detections(tmp_path, rig)) == 3
+    file.write_text(text, encoding="utf-16")
+    refuses(tmp_path, rig, f"{file.name}: this is UTF-16 text; save it as UTF-8")
+
+
 def test_a_number_that_no_frame_has(tmp_path, rig):
     openpose(tmp_path, people_of(COCO_18))
     for file in (tmp_path / "left").iterdir():

@@ -171,6 +171,8 @@ def test_swap_from_a_frame(people):
 def test_what_cannot_be_done(people, edit, message):
     with pytest.raises(ValueError, match=message):
         apply(people, edit)
+    with pytest.raises(ValueError, match="5 is present in frame 4 only, so cannot be split"):
+        apply(people.rows(people.frame == 4), Edit(Action.SPLIT, 5, 8, 4))
 
 
 @pytest.mark.parametrize(

@@ -272,6 +272,9 @@ def test_the_command_says_the_same(people, scene, tmp_path, capsys):
 def test_who_is_not_there_is_said(people, scene):
     with pytest.raises(InputError, match="person 77: not in the result"):
         explain(people, scene.rig, person=77, joint="LElbow", frame=5)
+    nobody = replace(people.rows(slice(0, 0)), observations=None)
+    with pytest.raises(InputError, match="person 0: not in the result; there are none"):
+        explain(nobody, scene.rig, person=0, joint="LElbow", frame=5)
     with pytest.raises(InputError, match="joint Tail: the result has no joint of this name"):
         explain(
             people,

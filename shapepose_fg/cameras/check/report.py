@@ -338,7 +338,7 @@ def result_check(
         )
     warnings += _speeds(people)
     chance = [*_too_many(people), *_clutter(uses)][:1]
-    warnings += chance or [*_unused(uses), *_unseen(people, detections, rig, frames)]
+    warnings += chance or _mostly_unused(uses, people, detections, rig, frames)
     return ResultCheck(report, uses, tuple(warnings))
 
 
@@ -448,13 +448,56 @@ def _clutter(uses: Sequence[CameraUse]) -> Iterator[str]:
         )
 
 
+def _mostly_unused(
+    uses: Sequence[CameraUse],
+    people: Reconstruction,
+    detections: DetectionSequence,
+    rig: Rig,
+    frames: Sequence[int],
+) -> list[str]:
+    """Warnings on cameras with mostly unused detections, and on people that were not found."""
+    # Share of used detections below which a camera is reported, and minimum number of detections.
+    few = [use for use in uses if use.offered >= 50 and use.used < 0.5 * use.offered]
+    repeated = _repeated(people, detections, rig, frames) if few else np.zeros(len(rig))
+    again = [use for use in few if repeated[rig.names.index(use.camera)] > 0.5]
+    told = list(_unused([use for use in few if use not in again]))
+    if again:
+        told.append(
+            f"{' '.join(use.camera for use in again)}: the detector finds people more than once: "
+            "most of the unused detections are beside a used one of the same joint; use "
+            "non-maximum suppression in the detector"
+        )
+    return told if len(again) > 1 else [*told, *_unseen(people, detections, rig, frames)]
+
+
+def _repeated(
+    people: Reconstruction, detections: DetectionSequence, rig: Rig, frames: Sequence[int]
+) -> Array:
+    """(V,) share of the unassigned detections that are beside an assigned one of the same joint."""
+    table = people.observations
+    rest, beside = np.zeros((2, len(rig)))
+    if table is None:
+        return beside
+    order = np.argsort(people.frame, kind="stable")
+    for at in np.unique(np.linspace(0, len(frames) - 1, min(len(frames), _LOOKED_AT)).astype(int)):
+        found = detections[frames[at]]
+        span = np.searchsorted(people.frame[order], [frames[at], frames[at] + 1])
+        rows = order[slice(*span)]
+        depth = np.moveaxis(rig.project(people.joints[rows])[1], 0, 2)
+        # Two people's same joints are hardly ever nearer than 10 cm in a picture.
+        reach_px = 0.1 * rig.focal_px / depth
+        xy = table.xy[rows].astype(np.float64)[:, found.joint, found.view]
+        far_px = np.linalg.norm(xy - found.xy, axis=-1)  # NaN where no detection is assigned
+        near = (far_px < reach_px[:, found.joint, found.view]).any(axis=0)
+        given = (table.candidate[rows] >= 0).sum(axis=(0, 1))  # an assigned one is beside itself
+        rest += np.bincount(found.view, minlength=len(rig)) - given
+        beside += np.maximum(np.bincount(found.view[near], minlength=len(rig)) - given, 0)
+    return beside / np.maximum(rest, 1)
+
+
 def _unused(uses: Sequence[CameraUse]) -> Iterator[str]:
     """Warnings on cameras with mostly unused detections, with reasons."""
     for use in uses:
-        # Share of used detections below which a camera is reported, and minimum number of
-        # detections.
-        if use.offered < 50 or use.used >= 0.5 * use.offered:
-            continue
         why = [
             f"{count} {words}"
             for words, count in sorted(use.unused.items(), key=lambda each: -each[1])

@@ -191,7 +191,13 @@ def parse_json(text: str, path: Path | str) -> Any:
 
 def not_text(path: Path, byte: int) -> InputError:
     """The error for a file that is not UTF-8 text at `byte`."""
-    return InputError(f"{path}: byte {byte} is not UTF-8 text; check the path")
+    with path.open("rb") as stream:
+        begin = stream.read(2)
+    if begin in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
+        return InputError(f"{path}: this is UTF-16 text; save it as UTF-8")
+    return InputError(
+        f"{path}: byte {byte} is not UTF-8 text; check the path, or save the file as UTF-8"
+    )
 
 
 def has_long_number(text: str, start: int = 0, stop: int | None = None) -> bool:

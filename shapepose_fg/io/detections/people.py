@@ -176,6 +176,7 @@ def score_rule(people: Sequence[KeptPeople]) -> tuple[Scores, str | None]:
     """The mapping of all cameras' scores to 0 to 1, and a note on it; no note if they are already
     between 0 and 1.
 
+    - No score above 0: nothing was detected, although there are people.
     - COCO's visibility flags (only 0, 1 and 2, at least one 2): 2 becomes 1, and 1 (occluded)
       becomes 0.5.
     - Scores that exceed 1.1: divided by their 99 % quantile, if that is above 1, then clipped at 1.
@@ -187,6 +188,11 @@ def score_rule(people: Sequence[KeptPeople]) -> tuple[Scores, str | None]:
         note = "scores are COCO visibilities: 2 (visible) is read as 1, and 1 (hidden) as 0.5"
         # Score of a keypoint that is annotated as occluded (COCO's visibility 1).
         return lambda score: np.where(score == 1, 0.5, score / 2), note
+    if top <= 0 and any(each.keypoint_count for each in people):
+        return lambda score: score, (
+            "all scores are 0, so that no joint counts as detected; write the detector's scores, "
+            "or 1 if it has none"
+        )
     if top <= OVERSHOOT:
         return lambda score: np.minimum(score, 1.0), None
     # Number of scores above which only every second, third ... of them is used to find

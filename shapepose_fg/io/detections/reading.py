@@ -208,12 +208,12 @@ def camera_names(path: Path) -> list[str]:
     for each in entries:
         if _FREEMOCAP_FILES.search(each.name) is not None:
             return cameras_of_freemocap(each)
-        if each.suffix == ".csv" and is_caliscope(each):
+        if each.suffix.lower() == ".csv" and is_caliscope(each):
             return cameras_of_caliscope(each)
     for empty in (False, True):
         for _, places, names in _offered(entries):
             holds = [
-                empty or each.is_file() or any(each.glob("*.json")) or bool(label_files(each))
+                empty or each.is_file() or _has_json(each) or bool(label_files(each))
                 for each in places
             ]
             if any(holds):
@@ -235,13 +235,13 @@ def _offered(entries: list[Path]) -> list[tuple[DetectionFormat, list[Path], lis
     """
     files = [each for each in entries if each.is_file()]
     folders = [each for each in entries if each.is_dir()]
-    tables = [each for each in files if each.suffix == ".csv" and is_deeplabcut(each)]
+    tables = [each for each in files if each.suffix.lower() == ".csv" and is_deeplabcut(each)]
     kinds = (
         (JSON, folders),
-        (TEXT, [each for each in files if each.suffix == ".txt"]),
-        (JSON, [each for each in files if each.suffix == ".json" and each.name != FOOTAGE]),
+        (TEXT, [each for each in files if each.suffix.lower() == ".txt"]),
+        (JSON, [each for each in files if each.suffix.lower() == ".json" and each.name != FOOTAGE]),
         (CSV, _unfiltered(tables)),
-        (HDF5, _unfiltered([each for each in files if each.suffix in (".h5", ".hdf5")])),
+        (HDF5, _unfiltered([each for each in files if each.suffix.lower() in (".h5", ".hdf5")])),
     )
     found = []
     for form, places in kinds:
@@ -258,7 +258,7 @@ def _of_all_cameras(file: Path, names: Sequence[str]) -> DetectionFormat | None:
             (),
             lambda place, camera: read_freemocap(place, names.index(camera.name), len(names)),
         )
-    if file.is_file() and file.suffix == ".csv" and is_caliscope(file):
+    if file.is_file() and file.suffix.lower() == ".csv" and is_caliscope(file):
         return DetectionFormat(
             "", (), lambda place, camera: read_caliscope(place, names.index(camera.name), names)
         )
@@ -273,17 +273,29 @@ def _unfiltered(files: list[Path]) -> list[Path]:
 
 def _read_folder(place: Path, camera: Camera) -> CameraPeople:
     """Read the people in a camera's folder or file: YOLO's labels, or JSON."""
-    if place.is_dir() and not any(place.glob("*.json")) and len(label_files(place)) > 0:
+    if place.is_dir() and not _has_json(place) and len(label_files(place)) > 0:
         return read_yolo(place, camera.image_size)
     return read_json_people(place)
 
 
+def _has_json(folder: Path) -> bool:
+    """Whether a folder has JSON files."""
+    return any(each.suffix.lower() == ".json" for each in folder.iterdir())
+
+
 def _named(folder: Path, name: str, patterns: Sequence[str]) -> Path | None:
-    """The file named after a camera; a folder if the pattern has no suffix."""
+    """The file named after a camera, its suffix in capitals or not; a folder if the pattern has no
+    suffix.
+    """
     for pattern in patterns:
         place = folder / pattern.format(name)
-        if place.is_file() if Path(pattern).suffix else place.is_dir():
-            return place
+        if suffix := Path(pattern).suffix:
+            in_capitals = place.with_name(place.name.removesuffix(suffix) + suffix.upper())
+            there = [each for each in (place, in_capitals) if each.is_file()]
+        else:
+            there = [place] if place.is_dir() else []
+        if there:
+            return there[0]
     return None
 
 

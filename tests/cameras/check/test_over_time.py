@@ -133,6 +133,24 @@ def test_people_who_move_as_nobody_does_are_named_with_the_rate(recording, room,
     assert "people explain only 8" in said and "higher confidence threshold" in said
 
 
+@pytest.mark.parametrize("views", [(0,), (0, 1, 2, 3)])
+def test_people_that_a_detector_finds_twice_are_called_so(recording, room, sound, views):
+    """A detector without non-maximum suppression; no camera is accused, and nobody is missed."""
+    twice = []
+    for found in recording:
+        again = np.flatnonzero(np.isin(found.view, views)).tolist()
+        order = sorted([*range(len(found)), *again], key=lambda n: (found.view[n], found.joint[n]))
+        rng = np.random.default_rng(len(found))
+        xy = found.xy[order] + rng.normal(0.0, 2.0, (len(order), 2))
+        parts = found.view[order], found.joint[order], xy, found.confidence[order]
+        twice.append(Detections(*parts, np.zeros((0, 2), dtype=np.intp), np.zeros(0)))
+    given = Recording(recording.skeleton, twice)
+    people = reconstruct(recording, room, frames=range(20))
+    (said,) = result_check(sound, people, given, room, range(20)).warnings
+    names = " ".join(room.names[view] for view in views)
+    assert said.startswith(f"{names}: the detector finds people more than once")
+
+
 @pytest.mark.slow
 def test_a_camera_that_is_mostly_left_out_is_named_with_the_reason(recording, room):
     """Turned by 25 degrees, it is left out by the check; without that nobody is given what it
