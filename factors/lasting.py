@@ -115,21 +115,25 @@ def lasting_difference_factors(
 
         with R the symmetric root of the information.
     """
-    away, shape = np.asarray(differences, dtype=np.float64), np.shape(keys)
+    difference, shape = np.asarray(differences, dtype=np.float64), np.shape(keys)
     values, vectors = np.linalg.eigh(np.asarray(covariances, dtype=np.float64))
     if not (
-        shape == np.shape(of_keys) == np.shape(offset_keys) == away.shape[:1] == values.shape[:1]
+        shape
+        == np.shape(of_keys)
+        == np.shape(offset_keys)
+        == difference.shape[:1]
+        == values.shape[:1]
     ):
         raise ValueError(
             "keys, of_keys and offset_keys must be (D,), differences (D, 3), covariances (D, 3, 3)"
         )
-    if not (np.isfinite(away).all() and (values > 0).all()):
+    if not (np.isfinite(difference).all() and (values > 0).all()):
         raise ValueError("differences must be finite and covariances positive definite")
     if not 0 < white_share < 1:
         raise ValueError(f"white_share must be between 0 and 1, got {white_share}")
     scaled = (vectors / np.sqrt(white_share * values)[:, None]) @ vectors.mT
     right, every = (
-        (scaled @ away[..., None])[..., 0],
+        (scaled @ difference[..., None])[..., 0],
         [np.asarray(each) for each in (keys, of_keys, offset_keys)],
     )
     reported, of, offsets = (each.tolist() for each in every)

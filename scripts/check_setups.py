@@ -98,7 +98,7 @@ def _of_several(finding: Finding) -> bool:
 
 
 def _words(found: list[Finding] | tuple[Finding, ...]) -> str:
-    return "; ".join(f"{f.kind} {f.cameras} {f.amount:.3g} p {f.sure:.2f}" for f in found)
+    return "; ".join(f"{f.kind} {f.cameras} {f.amount:.3g} p {f.probability:.2f}" for f in found)
 
 
 def _faults(seen: Recording, scene: Scene, rng: np.random.Generator) -> Iterator[Spoiled]:

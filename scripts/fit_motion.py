@@ -22,6 +22,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent))
 
 from shapepose_fg.body.model.body_model import BodyModel, BodyParameters
 from shapepose_fg.core.arrays import Array
+from shapepose_fg.core.hidden_markov import state_probabilities
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.estimation.contact import FootMotion, feet_of
 from shapepose_fg.estimation.motion_densities import FORMAT
@@ -168,19 +169,12 @@ def _expected(log: Array, first: Array, turns: Array) -> tuple[Array, Array]:
     with log-densities `log` (T, C, K).
     """
     seen = np.exp(log - log.max(axis=-1, keepdims=True))
-    forward, backward = np.empty_like(seen), np.ones_like(seen)
-    prediction = np.broadcast_to(first, seen[0].shape)
-    for t, here in enumerate(seen):
-        joint = prediction * here
-        forward[t] = joint / joint.sum(axis=1, keepdims=True)
-        prediction = forward[t] @ turns
-    for t in range(len(seen) - 2, -1, -1):
-        later = (seen[t + 1] * backward[t + 1]) @ turns.T
-        backward[t] = later / later.sum(axis=1, keepdims=True)
-    share = forward * backward
-    step = forward[:-1, :, :, None] * turns * (seen[1:] * backward[1:])[:, :, None]
+    share, forward, later = state_probabilities(
+        seen, first, np.broadcast_to(turns, (len(seen) - 1, *turns.shape))
+    )
+    step = forward[:-1, :, :, None] * turns * (seen[1:] * later[1:])[:, :, None]
     step /= step.sum(axis=(2, 3), keepdims=True)
-    return share / share.sum(axis=2, keepdims=True), step.sum(axis=(0, 1))
+    return share, step.sum(axis=(0, 1))
 
 
 if __name__ == "__main__":

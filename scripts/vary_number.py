@@ -1,6 +1,6 @@
 """Measure what a number of the code is worth: results with other values, on the same recordings.
 
-    python scripts/vary_number.py tracking.track_selection._PRICE 0.2 x2 --mocap cmu_smpl24.npz
+    python scripts/vary_number.py tracking.track_selection._COST 0.2 x2 --mocap cmu_smpl24.npz
     python scripts/vary_number.py estimation.draft.DISAGREE inf --real rig.json detections truth 25
 
 The number is a module-level constant of `shapepose_fg`; `x2` is twice the present value. Each value
@@ -75,7 +75,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("constant", help="module and name, e.g. tracking.track_selection._PRICE")
+    parser.add_argument("constant", help="module and name, e.g. tracking.track_selection._COST")
     parser.add_argument("values", nargs="+", help="other values, or factors such as x0.5")
     parser.add_argument("--mocap", type=Path, help="file of recorded motions")
     parser.add_argument("--real", nargs=4, action="append", default=[],

@@ -264,8 +264,8 @@ def angles_and_slopes(
             for axis in np.eye(3)
             for step in (_STEP, -_STEP)
         ]
-        apart = [a - b for a, b in zip(ends[::2], ends[1::2], strict=True)]
-        change = (np.stack(apart, axis=2) + np.pi) % (2 * np.pi) - np.pi
+        differences = [a - b for a, b in zip(ends[::2], ends[1::2], strict=True)]
+        change = (np.stack(differences, axis=2) + np.pi) % (2 * np.pi) - np.pi
         slope = np.degrees(signs[:, None] * change / (2 * _STEP))
         for joint, through in towards.items():
             slopes[:, rows, joint] = slope @ through

@@ -146,10 +146,10 @@ def _exchanged(order: Index, pairs: Sequence[tuple[int, int]]) -> Index:
 
 def _logs(people: Array, first: Index, second: Index) -> Array:
     """(N, M) logarithms of the distances of M pairs of joints, NaN if either joint is not seen."""
-    apart = np.linalg.norm(people[:, first] - people[:, second], axis=-1)
-    least = np.exp(_mean(np.log(np.where(apart > 0, apart, np.nan))))
+    length = np.linalg.norm(people[:, first] - people[:, second], axis=-1)
+    least = np.exp(_mean(np.log(np.where(length > 0, length, np.nan))))
     # Minimum distance, as a share of the mean distance; limits the effect of joints in one pixel.
-    return np.log(np.maximum(apart, 0.02 * np.nan_to_num(least, nan=1.0)[:, None]))
+    return np.log(np.maximum(length, 0.02 * np.nan_to_num(least, nan=1.0)[:, None]))
 
 
 def _mean(values: Array) -> Array:

@@ -173,10 +173,10 @@ def misfit(people: People, rig: Rig) -> float:
     """Ratio of the median residual to its expectation under the standard deviations: ideally 1."""
     views = people.seen.sum(axis=-1, keepdims=True)
     seen, _ = rig.project(people.points)
-    away = np.linalg.norm(np.moveaxis(seen, 0, 2) - people.xy, axis=-1) / people.sigma_px
+    off_sigma = np.linalg.norm(np.moveaxis(seen, 0, 2) - people.xy, axis=-1) / people.sigma_px
     # A joint seen by n views uses up 3 of its 2 n residuals.
     left = np.sqrt(np.maximum(1 - 1.5 / np.maximum(views, 2), 0.25))
-    return float(np.median((away / left)[people.seen]) / np.sqrt(2 * np.log(2)))
+    return float(np.median((off_sigma / left)[people.seen]) / np.sqrt(2 * np.log(2)))
 
 
 def _lens(camera: Camera, relative_to: Camera) -> gtsam.Cal3DS2:
@@ -252,9 +252,10 @@ def _covariance(
             gtsam.Pose3(camera.wTc).inverse().AdjointMap() for camera in rig.cameras
         ]
         if scaled:
-            away = rig.centres - rig.centres.mean(axis=0)
+            from_centre = rig.centres - rig.centres.mean(axis=0)
             whole[:, 3:6, 6] = [
-                camera.wTc[:3, :3].T @ each for camera, each in zip(rig.cameras, away, strict=True)
+                camera.wTc[:3, :3].T @ each
+                for camera, each in zip(rig.cameras, from_centre, strict=True)
             ]
         G = whole.reshape(V * Q, -1)[used]
         inner = inner - G @ np.linalg.solve(G.T @ (weight[:, None] * G), G.T)
@@ -325,7 +326,7 @@ def settle(
                 )
             adjusted = grown(adjusted, factor)
         before, now = now, adjusted.rig
-        still = apart(before, now)[0].max() < _STILL_DEG
+        still = differences(before, now)[0].max() < _STILL_DEG
         advance(rounds - step if still else 1)
         if still:
             break
@@ -370,7 +371,7 @@ def grown(adjusted: Adjusted, factor: float) -> Adjusted:
     )
 
 
-def apart(one: Rig, other: Rig) -> tuple[Array, Array]:
+def differences(one: Rig, other: Rig) -> tuple[Array, Array]:
     """(V,) degrees and metres between the cameras of two rigs, after alignment by a similarity."""
     near, far = (each.wTc[:, :3, :3] for each in (one, other))
     a, b = (each.centres - each.centres.mean(axis=0) for each in (one, other))

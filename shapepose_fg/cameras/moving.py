@@ -98,11 +98,11 @@ class Placed(Rows):
     ) -> "Placed":
         """People at times (P,), linked between consecutive moments."""
 
-        def away(one: Index, other: Index) -> Array:
+        def distance_of(one: Index, other: Index) -> Array:
             far = np.linalg.norm(points[one][:, None] - points[other], axis=-1)
             return median_of(far, _FEWEST)
 
-        track = follow(moment, away, _SAME_M, 1)
+        track = follow(moment, distance_of, _SAME_M, 1)
         order = np.lexsort((moment, track))
         one, other = (pair[np.diff(track[order]) == 0] for pair in (order[:-1], order[1:]))
         before, after = np.arange(len(moment)), np.arange(len(moment))
@@ -397,15 +397,15 @@ class Filmed:
         depth = median_of(at[..., 2], 5)
         with np.errstate(divide="ignore", invalid="ignore"):
             xy = at[..., :2] / at[..., 2:] * start.focal + start.centre
-            away = np.linalg.norm(self.rays[frame][..., :2] - xy[:, None], axis=-1)
-            away = median_of(away, 5) * depth[:, None] / start.focal
+            distance = np.linalg.norm(self.rays[frame][..., :2] - xy[:, None], axis=-1)
+            distance = median_of(distance, 5) * depth[:, None] / start.focal
             middle = np.stack([median_of(each, 5) for each in np.moveaxis(xy, 2, 0)], axis=-1)
             middle = middle @ self.camera.K[:2, :2].T + self.camera.K[:2, 2]
-        person = away.argmin(axis=1)
-        away = away[np.arange(len(rows)), person]
+        person = distance.argmin(axis=1)
+        distance = distance[np.arange(len(rows)), person]
         inside = (middle > 0).all(axis=1) & (middle < self.camera.image_size).all(axis=1)
         inside &= depth > MIN_DEPTH_M
-        return rows, frame, person, np.where(depth > MIN_DEPTH_M, away, np.inf), inside
+        return rows, frame, person, np.where(depth > MIN_DEPTH_M, distance, np.inf), inside
 
     def _seen(self, start: Start, placed: Placed, rows: Index, frame: Index) -> Array:
         """(N, J, 3) joints of placed people in the camera, at the times of the frames (N,)."""
@@ -415,8 +415,8 @@ class Filmed:
         return (points - wTc[:, None, :3, 3]) @ wTc[:, :3, :3]
 
     def _judged(self, start: Start, placed: Placed, near_m: float) -> Start:
-        *_, away, inside = self._matched(start, placed, near_m)
-        agreeing = np.clip(1 - away / near_m, 0.0, 1.0)
+        *_, distance, inside = self._matched(start, placed, near_m)
+        agreeing = np.clip(1 - distance / near_m, 0.0, 1.0)
         share = float((agreeing[inside] > 0).mean()) if inside.any() else 0.0
         return replace(start, agreeing=float(agreeing.sum()), share=share)
 
@@ -431,8 +431,8 @@ class Filmed:
         clock = [float(most_s > 0)]
         sigmas = [_TILT_RAD, _TILT_RAD, 1.0, *[UNDETERMINED_M] * 3, unit, *[centre] * 2, *clock]
         for near_m in _NEAR_M:
-            rows, frame, person, away, _ = self._matched(start, placed, near_m)
-            used = away < near_m
+            rows, frame, person, distance, _ = self._matched(start, placed, near_m)
+            used = distance < near_m
             if used.sum() < _LEAST_PEOPLE:
                 break
             count = np.ceil((self.own_s[-1] - self.own_s[0]) / _KNOT_S) * (near_m == _NEAR_M[-1])
@@ -563,22 +563,22 @@ class _Fit:
         x = np.zeros(len(kinds))
         count = dilution(np.unique(self.placed.time_s))
         for _ in range(_STEPS):
-            away, J = self._away(x)
-            every = np.abs(away).swapaxes(0, 1).reshape(away.shape[1], -1)
+            residual, J = self._away(x)
+            every = np.abs(residual).swapaxes(0, 1).reshape(residual.shape[1], -1)
             sigma = _TINY + median_of(every, 1)[:, None] / 0.6745
-            away, J = np.nan_to_num(away / sigma), np.nan_to_num(J / sigma[..., None])
-            weighted = J / (count * (1 + (away / _WIDTH) ** 2))[..., None]
+            residual, J = np.nan_to_num(residual / sigma), np.nan_to_num(J / sigma[..., None])
+            weighted = J / (count * (1 + (residual / _WIDTH) ** 2))[..., None]
             information = np.tensordot(weighted, J, ([0, 1, 2], [0, 1, 2]))
             step = np.linalg.solve(
-                information + np.eye(len(x)), np.einsum("njcp,njc->p", weighted, away) + x
+                information + np.eye(len(x)), np.einsum("njcp,njc->p", weighted, residual) + x
             )
             x = x - step
             if np.abs(step).max() < _CONVERGED:
                 break
         ratio, covariance = _with_drift(information, x, kinds)
         x = covariance @ (information @ x + x)
-        root = 1 / np.hypot(1, away / _WIDTH)
-        varied = self._varied(root**2 * away, root[..., None] * J) / count**2
+        root = 1 / np.hypot(1, residual / _WIDTH)
+        varied = self._varied(root**2 * residual, root[..., None] * J) / count**2
         covariance = covariance + covariance @ (varied - information) @ covariance
         slopes = self._poses(x)[1]
         # A random walk deviates from the line between two knots.
@@ -596,11 +596,12 @@ class _Fit:
             within_m=move_most,
         )
 
-    def _varied(self, away: Array, J: Array) -> Array:
+    def _varied(self, residual: Array, J: Array) -> Array:
         """(P, P) covariance of the sum of `J` (N, J, 2, P) times errors of unit variance, which are
-        correlated over time, and between the joints of a person as those of `away` (N, J, 2) are.
+        correlated over time, and between the joints of a person as those of `residual` (N, J, 2)
+        are.
         """
-        correlation = np.einsum("njc,nkc->jk", away, away)
+        correlation = np.einsum("njc,nkc->jk", residual, residual)
         size = np.sqrt(np.diag(correlation)) + _TINY
         J = np.einsum("njcp,jk->nkcp", J, symmetric_root(correlation / size / size[:, None]))
         total = np.zeros((J.shape[-1],) * 2)

@@ -92,8 +92,8 @@ class Together:
             scale = np.minimum(
                 np.linalg.norm(plane, axis=1) * size_b, np.linalg.norm(back, axis=1) * size_a
             )
-            away = np.minimum(np.abs((plane * b).sum(axis=1)) / (scale + 1e-12), GATE)
-            total = np.bincount(self.pair[row], share[row] * away, len(self.tracks))
+            miss = np.minimum(np.abs((plane * b).sum(axis=1)) / (scale + 1e-12), GATE)
+            total = np.bincount(self.pair[row], share[row] * miss, len(self.tracks))
             found[n, enough] = total[enough] / count[enough]
         return found
 

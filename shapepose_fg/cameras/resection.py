@@ -135,11 +135,11 @@ def turned_to(points: Array, xy: Array, camera: Pinhole) -> Pinhole:
     calibration's unit, and pixels `xy` (N, 2).
     """
     centre = -camera.cTw[:, :3].T @ camera.cTw[:, 3]
-    away = points - centre
-    away = away / np.linalg.norm(away, axis=1, keepdims=True)
+    directions = points - centre
+    directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     rays = np.column_stack([xy, np.ones(len(xy))]) @ np.linalg.inv(camera.K).T
     rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-    R = nearest_rotation(rays.T @ away)
+    R = nearest_rotation(rays.T @ directions)
     return Pinhole(camera.K, np.column_stack([R, -R @ centre]))
 
 

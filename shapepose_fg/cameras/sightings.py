@@ -168,8 +168,8 @@ class Pairs:
         cameras.
         """
         first, second = same_frame(sightings.frame, sightings.frame)
-        apart = sightings.view[first] < sightings.view[second]
-        first, second = first[apart], second[apart]
+        ordered = sightings.view[first] < sightings.view[second]
+        first, second = first[ordered], second[ordered]
         error, points = _meeting(sightings, views, first, second)
         keep = error < GATE
         members = np.stack([first[keep], second[keep]], axis=1)
@@ -353,17 +353,19 @@ def median_over(values: Array) -> Array:
     return np.where(count > 0, (middle[0] + middle[1]) / 2, 0.0)
 
 
-def follow(frame: Index, away: Callable[[Index, Index], Array], reach: float, gap: int) -> Index:
+def follow(
+    frame: Index, distance_of: Callable[[Index, Index], Array], reach: float, gap: int
+) -> Index:
     """(N,) identities of rows over frames (N,): rows of a frame and of the `gap` frames before
     are the same if they are nearest to each other, and within `reach`.
 
-    `away` are the distances (A, B) of rows (A,) of earlier frames from rows (B,).
+    `distance_of` are the distances (A, B) of rows (A,) of earlier frames from rows (B,).
     """
     identity, last, count = np.full(len(frame), -1, dtype=np.intp), np.zeros(0, dtype=np.intp), 0
     for now in np.unique(frame).tolist():
         current, last = np.flatnonzero(frame == now), last[frame[last] >= now - gap]
         if len(last) > 0:
-            far = away(last, current)
+            far = distance_of(last, current)
             nearest = far.argmin(axis=1)
             mutual = far.argmin(axis=0)[nearest] == np.arange(len(last))
             mutual &= far.min(axis=1) < reach
@@ -380,14 +382,14 @@ def followed(frame: Index, points: Array) -> Index:
     middle = _middle(points)
     spread = _middle((points - middle[:, None]) ** 2).sum(axis=-1) ** 0.5
 
-    def away(one: Index, other: Index) -> Array:
+    def distance_of(one: Index, other: Index) -> Array:
         far = np.linalg.norm(middle[one, None] - middle[other], axis=-1)
         return far if far.size > 1 else 0 * far  # one person is the same one after a cut
 
     # Maximum distance that a person moves between frames, relative to the spread of the joints (two
     # thirds of a metre), and the number of frames after which a lost person is forgotten.
     reach = 1.4 * float(np.median(spread)) if len(frame) > 0 else 0.0
-    return follow(frame, away, reach, 40)
+    return follow(frame, distance_of, reach, 40)
 
 
 def _middle(points: Array) -> Array:

@@ -51,7 +51,7 @@ class Synchronised:
     """(V,) offset at `middle_s`, seconds; 0 for the first camera."""
     sigma_s: Array
     """(V,) standard deviation of the offset, seconds; 0 for the first camera."""
-    sure: Array
+    prominence: Array
     """(V,) prominence of the offset over all others, in their standard deviations."""
     drift: Array
     """(V,) drift, seconds per second that the camera falls behind; 0 in recordings of under four
@@ -65,16 +65,18 @@ class Synchronised:
 
     def as_dict(self, rig: Rig) -> dict[str, Any]:
         """All figures as plain values; null for an unknown standard deviation."""
-        figures = zip(rig.names, self.offset_s, self.sigma_s, self.sure, self.drift, strict=True)
+        figures = zip(
+            rig.names, self.offset_s, self.sigma_s, self.prominence, self.drift, strict=True
+        )
         cameras = [
             {
                 "camera": name,
                 "offset_s": round(float(offset), 5),
                 "sigma_s": round(float(sigma), 5) if np.isfinite(sigma) else None,
-                "stands_out": round(float(sure), 2),
+                "stands_out": round(float(prominence), 2),
                 "drift_ppm": round(1e6 * float(drift), 2),
             }
-            for name, offset, sigma, sure, drift in figures
+            for name, offset, sigma, prominence, drift in figures
         ]
         return {"cameras": cameras, "undetermined": self.undetermined(rig)}
 
@@ -84,8 +86,10 @@ class Synchronised:
         return [
             f"camera {name}: the motion of the people does not determine its offset, because "
             f"other offsets fit about as well; {cure}"
-            for name, sure, sigma in zip(rig.names, self.sure, self.sigma_s, strict=True)
-            if sure < _SURE or not sigma < _WORST_S
+            for name, prominence, sigma in zip(
+                rig.names, self.prominence, self.sigma_s, strict=True
+            )
+            if prominence < _SURE or not sigma < _WORST_S
         ]
 
 
@@ -108,14 +112,14 @@ def synchronise(
     whole, end = round(WHOLE_S * fps), round(_END_S * fps)
     first = frames if len(frames) <= whole + end else frames[:whole]
     seen = at_regular_times(Sightings.of(detections, first), time_s, fps)
-    offset, sigma, sure = offsets(seen, rig, fps, first, most_s, np.zeros(len(rig)), progress)
+    offset, sigma, prominence = offsets(seen, rig, fps, first, most_s, np.zeros(len(rig)), progress)
     middle, none = (first.start + first.stop) / 2 / fps, np.zeros(len(rig))
     if len(first) == len(frames):
-        return Synchronised(offset, sigma, sure, none, middle)
+        return Synchronised(offset, sigma, prominence, none, middle)
     seen = at_regular_times(Sightings.of(detections, frames[-end:]), time_s, fps)
     later, *_ = offsets(seen, rig, fps, frames[-end:], _DRIFT_S, offset, progress)
     lasts = (frames.stop - end / 2) / fps - middle
-    return Synchronised(offset, sigma, sure, (later - offset) / lasts, middle)
+    return Synchronised(offset, sigma, prominence, (later - offset) / lasts, middle)
 
 
 def offsets(
@@ -150,12 +154,12 @@ def offsets(
     for number, (a, b) in enumerate(pairs):
         curves[a, b] = scan(sightings, views, a, b, lags, common)
         progress(number + 1, len(pairs))
-    coarse, sure = chosen(curves, lags, len(rig), round(_AROUND_S * fps))
+    coarse, prominence = chosen(curves, lags, len(rig), round(_AROUND_S * fps))
     fine = Pairwise(tracks, views, coarse.astype(float), fps)
     shift, covariance = InSpace.of(fine).settled() if len(rig) > 2 else fine.solved()
     offset = -(shift + start)
     offset = offset - offset[0]
-    return offset / fps, _WIDER * np.sqrt(np.diag(covariance)) / fps, sure
+    return offset / fps, _WIDER * np.sqrt(np.diag(covariance)) / fps, prominence
 
 
 def chosen(
@@ -169,18 +173,18 @@ def chosen(
     step = int(lags[1] - lags[0]) if len(lags) > 1 else 1
     half = len(lags) // 2
 
-    def fit(one: int, other: int, apart: Index) -> Array:
-        """Fit of two cameras at offsets `apart`: standard deviations below the median over all
+    def fit(one: int, other: int, lag: Index) -> Array:
+        """Fit of two cameras at offsets `lag`: standard deviations below the median over all
         offsets.
         """
         curve = curves[one, other] if one < other else curves[other, one][::-1]
         known = np.isfinite(curve)
         if known.sum() < 3:
-            return np.zeros(len(apart))
+            return np.zeros(len(lag))
         middle = np.median(curve[known])
         spread = max(1.5 * float(np.median(np.abs(curve[known] - middle))), LEAST_MISS)
-        place = np.clip(apart + half, 0, len(lags) - 1)
-        inside = (np.abs(apart) <= half) & known[place]
+        place = np.clip(lag + half, 0, len(lags) - 1)
+        inside = (np.abs(lag) <= half) & known[place]
         return np.where(inside, (middle - curve[place]) / spread, 0.0)
 
     def best(view: int, placed: dict[int, int]) -> tuple[float, int]:
@@ -203,8 +207,8 @@ def chosen(
     for _ in range(2):
         for view in range(views):
             placed[view] = best(view, {one: at for one, at in placed.items() if one != view})[1]
-    sure = np.array(
+    prominence = np.array(
         [best(view, {o: at for o, at in placed.items() if o != view})[0] for view in range(views)]
     )
     shift = np.array([placed[view] for view in range(views)]) * step
-    return shift - shift[0], sure
+    return shift - shift[0], prominence

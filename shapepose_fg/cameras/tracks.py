@@ -180,11 +180,11 @@ def seen_at(detections: "DetectionSequence | OneClock", frames: Iterable[int]) -
 def _followed(seen: Sightings) -> list[Index]:
     """Rows of each track, ordered by frame; single missing frames are bridged."""
 
-    def away(one: Index, other: Index) -> Array:
+    def distance_of(one: Index, other: Index) -> Array:
         apart_px = np.linalg.norm(seen.xy[one][:, None] - seen.xy[other], axis=-1)
         return median_of(apart_px / seen.size_px[other][:, None], MIN_JOINTS)
 
-    identity = follow(seen.frame, away, _SAME, 2)
+    identity = follow(seen.frame, distance_of, _SAME, 2)
     order = np.lexsort((seen.frame, identity))
     return np.split(order, np.flatnonzero(np.diff(identity[order])) + 1)
 
@@ -205,11 +205,11 @@ def lines(values: Array, width: float) -> tuple[Array, Array]:
     Plain means would be biased in time beside gaps. NaN if too little is known around.
     """
     known = np.isfinite(values[..., :1])
-    apart = np.arange(-np.ceil(3 * width), np.ceil(3 * width) + 1)
-    near = np.exp(-0.5 * (apart / width) ** 2) / (width * np.sqrt(2 * np.pi))
+    lag = np.arange(-np.ceil(3 * width), np.ceil(3 * width) + 1)
+    near = np.exp(-0.5 * (lag / width) ** 2) / (width * np.sqrt(2 * np.pi))
 
     def around(each: Array, power: int) -> Array:
-        return np.asarray(correlate1d(each, near * apart**power, axis=0, mode="constant"))
+        return np.asarray(correlate1d(each, near * lag**power, axis=0, mode="constant"))
 
     known_share, full = known.astype(np.float64), np.where(known, values, 0.0)
     w0, w1, w2, y0, y1 = (

@@ -88,11 +88,11 @@ def from_zero(time_s: "Array") -> "Array":
 def show_clocks(found: "Synchronised", rig: "Rig") -> None:
     """Print the offsets."""
     rows = []
-    for name, offset, sigma, sure in zip(
-        rig.names, found.offset_s, found.sigma_s, found.sure, strict=True
+    for name, offset, sigma, prominence in zip(
+        rig.names, found.offset_s, found.sigma_s, found.prominence, strict=True
     ):
         known = "-" if sigma == 0 else f"{1e3 * sigma:.1f}" if math.isfinite(sigma) else "unknown"
-        rows.append((name, f"{offset:+.4f}", known, f"{sure:.1f}"))
+        rows.append((name, f"{offset:+.4f}", known, f"{prominence:.1f}"))
     caption = (
         "start: time of the camera's frame 0 on the first camera's clock; distinct: how clearly "
         "the best offset differs from all others"

@@ -161,9 +161,9 @@ class Rig:
     """The V cameras; a view is an index into them."""
     up: Axis
     """Which axis of the world points up."""
-    dark: tuple[int, ...] = ()
-    """Views without a picture in the frame for which the rig was made; no detections are expected
-    there."""
+    excluded: tuple[int, ...] = ()
+    """Views without a used picture in the frame for which the rig was made; no detections are
+    expected there."""
     doubted: tuple[int, ...] = ()
     """Views that contradict each other in the frame for which the rig was made; it is unknown which
     is wrong."""
@@ -203,9 +203,9 @@ class Rig:
         names = choose(self.names, only=list(names))
         views = [view for view, name in enumerate(self.names) if name in names]
         cameras = tuple(self.cameras[view] for view in views)
-        dark, doubted = (
+        excluded, doubted = (
             tuple(views.index(view) for view in given if view in views)
-            for given in (self.dark, self.doubted)
+            for given in (self.excluded, self.doubted)
         )
         carriers = {camera.carrier for camera in cameras}
         trajectories = tuple(each for each in self.trajectories if each.name in carriers)
@@ -213,7 +213,7 @@ class Rig:
         return replace(
             self,
             cameras=cameras,
-            dark=dark,
+            excluded=excluded,
             doubted=doubted,
             trajectories=trajectories,
             unwanted=unwanted,
@@ -305,7 +305,7 @@ class Rig:
     def image_sizes(self) -> Array:
         """(V, 2) width and height, pixels; 0 for a view without a picture."""
         sizes = np.array([camera.image_size for camera in self.cameras], dtype=np.float64)
-        sizes[list(self.dark)] = 0.0
+        sizes[list(self.excluded)] = 0.0
         return sizes
 
     @cached_property

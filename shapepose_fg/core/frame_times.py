@@ -16,8 +16,9 @@ ASSUMED_FPS = 30.0
 """Frame rate that is assumed if none is given, Hz."""
 
 
-def exact_rate(rate: float, apart: float) -> float:
-    """The usual frame rate of cameras within `apart` of `rate`, Hz; `rate` itself if there is none.
+def exact_rate(rate: float, within: float) -> float:
+    """The usual frame rate of cameras within `within` of `rate`, Hz; `rate` itself if there is
+    none.
 
     The candidates are the nearest integer, 1000 / 1001 of an integer (NTSC), or a fraction with a
     denominator of up to 10.
@@ -26,7 +27,7 @@ def exact_rate(rate: float, apart: float) -> float:
     nearest = min(whole, ntsc, key=lambda each: abs(each - Fraction(rate)))
     usual = (nearest, Fraction(rate).limit_denominator(10))
     return next(
-        (float(each) for each in usual if each > 0 and abs(float(each) - rate) <= apart), rate
+        (float(each) for each in usual if each > 0 and abs(float(each) - rate) <= within), rate
     )
 
 

@@ -53,21 +53,21 @@ def add_view(camera, u, v, depth, to_u, to_v, weight, information, gradient):
 
 
 @part
-def triangulated(cameras, focal, uv, sure, scale_m, reach_m, least_depth, weight, x):
+def triangulated(cameras, focal, uv, confidence, scale_m, reach_m, least_depth, weight, x):
     """Triangulate pixels `uv` (V, 2) to `x` (3,), metres; returns the number of views with rays
     within `reach_m` of it.
 
-    Linear least squares, weighted by confidence `sure` (V,) (0: no detection) and, in iterations,
-    by a Cauchy kernel of width `scale_m`, metres; `weight` (V,) is scratch space.
+    Linear least squares, weighted by confidence `confidence` (V,) (0: no detection) and, in
+    iterations, by a Cauchy kernel of width `scale_m`, metres; `weight` (V,) is scratch space.
     """
-    for v in range(len(sure)):
-        weight[v] = sure[v]
+    for v in range(len(confidence)):
+        weight[v] = confidence[v]
     agree = 0
     # Number of iterations of reweighted triangulation.
     for _ in range(3):
         xx = xy = xz = yy = yz = zz = right_x = right_y = right_z = 0.0
-        for v in range(len(sure)):
-            if sure[v] > 0:
+        for v in range(len(confidence)):
+            if confidence[v] > 0:
                 for k in range(2):
                     P, at, w = cameras[v], uv[v, k], weight[v] / (focal[v] * focal[v])
                     a, b, c = at * P[2, 0] - P[k, 0], at * P[2, 1] - P[k, 1], at * P[2, 2] - P[k, 2]
@@ -78,13 +78,15 @@ def triangulated(cameras, focal, uv, sure, scale_m, reach_m, least_depth, weight
         damping = 1e-9 * (xx + yy + zz)
         solved(xx + damping, xy, xz, yy + damping, yz, zz + damping, right_x, right_y, right_z, x)
         agree = 0
-        for v in range(len(sure)):
-            if sure[v] > 0:
+        for v in range(len(confidence)):
+            if confidence[v] > 0:
                 u_, v_, depth = project(cameras[v], x)
                 off_m = (
                     math.sqrt((u_ - uv[v, 0]) ** 2 + (v_ - uv[v, 1]) ** 2) * abs(depth) / focal[v]
                 )
-                weight[v] = sure[v] / (1.0 + (off_m / scale_m) ** 2) / max(depth, least_depth) ** 2
+                weight[v] = (
+                    confidence[v] / (1.0 + (off_m / scale_m) ** 2) / max(depth, least_depth) ** 2
+                )
                 if off_m < reach_m and depth > least_depth:
                     agree += 1
     return agree

@@ -190,10 +190,10 @@ class Reconstruction(Table):
         """
         super().check_ranges()
         ok, known = self.status == Status.OK, self.known != Known.UNKNOWN
-        sure = np.isfinite(self.covariance).all(axis=(2, 3)) | ~ok[:, None]
+        determined = np.isfinite(self.covariance).all(axis=(2, 3)) | ~ok[:, None]
         for name, wrong in (
             ("joints", (known & ~np.isfinite(self.joints).all(axis=2)).any(axis=1)),
-            ("covariance", (known & ~sure).any(axis=1)),
+            ("covariance", (known & ~determined).any(axis=1)),
             *((name, ok & ~with_body(getattr(self, name))) for name in BODY),
         ):
             if wrong.any():

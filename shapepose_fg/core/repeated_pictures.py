@@ -41,7 +41,7 @@ class WithoutRepeats(DerivedFrames):
     def __getitem__(self, frame: int, /) -> Detections:
         every, repeated = self._frame(frame)
         gone = repeated.copy()
-        gone[list(self.trust.dark(frame))] = True
+        gone[list(self.trust.excluded(frame))] = True
         return every.only(~gone[every.view]) if gone.any() else every
 
     def repeated(self, frame: int) -> tuple[int, ...]:

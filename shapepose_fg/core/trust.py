@@ -24,7 +24,7 @@ class Trust:
     """Views and intervals that contradict each other, without evidence which are wrong; rows that
     depend on them are not `ok`."""
 
-    def dark(self, frame: int) -> tuple[int, ...]:
+    def excluded(self, frame: int) -> tuple[int, ...]:
         """The views that are left out of a frame."""
         return _there(self.left_out, frame)
 

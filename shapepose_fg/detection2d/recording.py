@@ -182,8 +182,8 @@ def _write_times(run: DetectionRun) -> None:
         file.unlink(missing_ok=True)
         return
     names = [each.camera.name for each in run.cameras]
-    apart = not run.moments.synchronised and nameable(names)
-    write_timestamps(file, names, time_s if apart else np.nanmean(time_s, axis=1))
+    by_camera = not run.moments.synchronised and nameable(names)
+    write_timestamps(file, names, time_s if by_camera else np.nanmean(time_s, axis=1))
 
 
 def _refuse_others(run: DetectionRun, unfinished: Path) -> None:

@@ -127,8 +127,8 @@ def _problems(
     lost = finite & ~np.isfinite(covariance).all(axis=(2, 3))
     reasons[lost] = "undetermined: its system is singular"
     for person in people:
-        away = np.linalg.norm(X[person.rows] - person.first, axis=2)
-        ran = person.touched & (away > RUNAWAY_M)
+        displacement_m = np.linalg.norm(X[person.rows] - person.first, axis=2)
+        ran = person.touched & (displacement_m > RUNAWAY_M)
         reasons[person.rows] = np.where(ran, "diverged from its views", reasons[person.rows])
         if person.failure:
             solved = finite[person.rows]

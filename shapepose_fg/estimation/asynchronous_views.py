@@ -24,8 +24,8 @@ def leads(observations: Observations, views: Views) -> Array:
     the other.
     """
     time_s = observations.time_s
-    apart = np.ptp(time_s, axis=1, keepdims=True) > AT_ONCE_S
-    of_view = np.where(apart, time_s - time_s.mean(axis=1, keepdims=True), 0.0)
+    asynchronous = np.ptp(time_s, axis=1, keepdims=True) > AT_ONCE_S
+    of_view = np.where(asynchronous, time_s - time_s.mean(axis=1, keepdims=True), 0.0)
     lead_s = np.repeat(of_view[:, None], observations.xy.shape[1], axis=1)
     if np.any(views.readout_s):
         height = np.broadcast_to(views.image_sizes, (len(views), 2))[:, 1]
@@ -53,8 +53,10 @@ def carried_to_frames(
     if not lead_s.any():
         return observations
     exposed = points[:, :, None] + lead_s[..., None] * velocity[:, :, None]
-    away = views.project_apart(exposed)[0] - views.project(points)[0]
-    return replace(observations, xy=observations.xy - np.where(np.isfinite(away), away, 0.0))
+    shift_px = views.project_apart(exposed)[0] - views.project(points)[0]
+    return replace(
+        observations, xy=observations.xy - np.where(np.isfinite(shift_px), shift_px, 0.0)
+    )
 
 
 def widened(covariance: Array, observations: Observations, points: Array, views: Views) -> Array:

@@ -74,7 +74,7 @@ class BodyFrames(BodyWindow):
             left = left[~(better & small) & (damping[left] <= 1e3)]
         return state
 
-    def apart(self, marginals: Marginals) -> list[tuple[Index, Marginals]]:
+    def split(self, marginals: Marginals) -> list[tuple[Index, Marginals]]:
         """Each row, and its marginals."""
         found = list[tuple[Index, Marginals]]()
         for at in np.arange(len(self))[:, None]:

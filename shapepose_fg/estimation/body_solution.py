@@ -80,7 +80,7 @@ def solve_bodies(
     people, spread = list[BodyGraph](), list[Array]()
     for rows, solved in _solved(first, sigmas, views, model, config, gates, motion):
         widen = covariance_factors(solved, noisy)
-        for (place, each), factor in zip(solved.window.apart(solved), widen, strict=True):
+        for (place, each), factor in zip(solved.window.split(solved), widen, strict=True):
             people.append(BodyGraph(each.window, each.state, float(factor), rows[place]))
             spread.append(each.of_bodies)
             _put(found, people[-1], each)

@@ -374,8 +374,8 @@ class BodyWindow:
     def _deviation(self, around: Around, bodies: Array) -> Array:
         """X - J that is best for bodies that have moved."""
         seen = np.asarray(around.gain.any(axis=(-1, -2)))
-        away = np.where(seen[..., None], around.target - bodies, 0.0)
-        return (around.gain @ away[..., None])[..., 0]
+        deviation = np.where(seen[..., None], around.target - bodies, 0.0)
+        return (around.gain @ deviation[..., None])[..., 0]
 
     def _faster(self, bodies: Array) -> Array:
         """(T - 1, J) how many times the mean density of acceleration each joint has, at least 1."""
@@ -421,7 +421,7 @@ class BodyWindow:
         put_back(kept, coefficients, pose)
         return coefficients[1:], pose
 
-    def apart(self, marginals: "Marginals") -> "list[tuple[Index, Marginals]]":
+    def split(self, marginals: "Marginals") -> "list[tuple[Index, Marginals]]":
         """The rows of each person, and their marginals."""
         return [(np.arange(len(self)), marginals)]
 

@@ -12,6 +12,7 @@ import numpy as np
 from shapepose_fg.body.fitting.fitter import JointTargets
 from shapepose_fg.core.arrays import Array, Index
 from shapepose_fg.core.decompositions import principal_axes
+from shapepose_fg.core.hidden_markov import state_probabilities
 from shapepose_fg.core.shipped_numbers import shipped_numbers
 from shapepose_fg.core.storage.schema import Column, Table
 from shapepose_fg.estimation.in_time import SPEED_S
@@ -124,13 +125,4 @@ def smoothed(log: Array, times_s: Array) -> Array:
     seen = np.exp(np.maximum(log - log.max(axis=2, keepdims=True), -600.0) * share)
     stays = np.exp(-dt[:, None] / feet.lasts_s)
     turn = stays[..., None] * np.eye(len(feet.first)) + (1 - stays)[..., None] * feet.turns
-    forward, backward = np.empty_like(seen), np.ones_like(seen)
-    forward[0] = feet.first * seen[0]
-    for t in range(1, len(seen)):
-        unnormalised = forward[t - 1] @ turn[t - 1] * seen[t]
-        forward[t] = unnormalised / unnormalised.sum(axis=1, keepdims=True)
-    for t in range(len(seen) - 2, -1, -1):
-        unnormalised = (seen[t + 1] * backward[t + 1]) @ turn[t].T
-        backward[t] = unnormalised / unnormalised.sum(axis=1, keepdims=True)
-    both = forward * backward
-    return both / both.sum(axis=2, keepdims=True)
+    return state_probabilities(seen, feet.first, turn)[0]

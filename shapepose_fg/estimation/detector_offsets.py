@@ -69,10 +69,11 @@ def confident_targets(
     sigmas = observation_sigmas(observations, points, views, config, BODY_25.joints)
     evidence = linearise(observations, sigmas, points, views, config)
     evidence = linearise(observations, sigmas, evidence.target, views, config)
-    sure = (evidence.inlier & (observations.confidence >= _MIN_CONFIDENCE)).sum(
+    confident = (evidence.inlier & (observations.confidence >= _MIN_CONFIDENCE)).sum(
         axis=-1
     ) >= _MIN_VIEWS
-    sure &= evidence.sigma_m <= _MAX_SIGMA_M
+    confident &= evidence.sigma_m <= _MAX_SIGMA_M
     return JointTargets(
-        np.nan_to_num(evidence.target), np.where(sure[..., None, None], evidence.information, 0.0)
+        np.nan_to_num(evidence.target),
+        np.where(confident[..., None, None], evidence.information, 0.0),
     )

@@ -97,24 +97,28 @@ def draft(
         fitted.put(unchanged, last.fitted.rows(previous))
         body.put(unchanged, last.body.rows(previous))
         near[unchanged] = body.ok[unchanged]
-    asked = new = np.flatnonzero(~near)
+    chosen = new = np.flatnonzero(~near)
     evidence = evidence.rows(new)
     for reach_m in (None, *NARROWING_M):  # None: at triangulated joints, as above
         if reach_m is not None:
-            asked = np.arange(N) if reach_m == NARROWING_M[-1] else new
-            given, seen_by, around = observations.rows(asked), views.rows(asked), body.rows(asked)
-            around = np.where(around.ok[:, None, None], around.joints, X[asked])
-            evidence = linearise(
-                given, sigmas[asked], around, seen_by, config.observations, reach_m
+            chosen = np.arange(N) if reach_m == NARROWING_M[-1] else new
+            given, seen_by, around = (
+                observations.rows(chosen),
+                views.rows(chosen),
+                body.rows(chosen),
             )
-        targets = joint_targets(evidence, enough[asked])
-        moved = changed_targets(fitted.rows(asked), targets, MODEL_SIGMA_M, 2.0)
+            around = np.where(around.ok[:, None, None], around.joints, X[chosen])
+            evidence = linearise(
+                given, sigmas[chosen], around, seen_by, config.observations, reach_m
+            )
+        targets = joint_targets(evidence, enough[chosen])
+        moved = changed_targets(fitted.rows(chosen), targets, MODEL_SIGMA_M, 2.0)
         if len(moved) == 0:
             continue
         fit = fitter.fit(targets.rows(moved))
-        fitted.put(asked[moved], targets.rows(moved))
+        fitted.put(chosen[moved], targets.rows(moved))
         placed = np.flatnonzero(fit.ok)
-        body.put(asked[moved[placed]], fit.rows(placed))
+        body.put(chosen[moved[placed]], fit.rows(placed))
     places, covariance = drafted(evidence, body)
     return Draft(observations, X, body, fitted, places, covariance)
 
@@ -169,7 +173,7 @@ def drafted(evidence: ViewEvidence, body: BodyFit) -> tuple[Array, Array]:
     spread, place = np.where(agree[..., None], spread, covariance), np.where(agree, at + step, at)
     # Determined to a metre: by the body itself, or by the sum of all information.
     determined = known & (np.trace(covariance, axis1=2, axis2=3) < 1.0)[..., None]
-    asked = ~determined[..., 0]
-    total = (of_body + np.where(agree[..., None], views, 0.0))[asked]
-    determined[asked, 0] = np.linalg.eigvalsh(total)[..., 0] > 1.0
+    uncertain = ~determined[..., 0]
+    total = (of_body + np.where(agree[..., None], views, 0.0))[uncertain]
+    determined[uncertain, 0] = np.linalg.eigvalsh(total)[..., 0] > 1.0
     return np.where(determined, place, np.nan), np.where(determined[..., None], spread, np.nan)

@@ -65,8 +65,10 @@ def _solved(
             moved = [each.take(values) for each in people]
             _keep_own(ties, values)
             for each in people:
-                away = np.linalg.norm(each.window.joints(each.state) - each.first, axis=-1)
-                if not away[:, each.touched].max(initial=0.0) < RUNAWAY_M:
+                displacement_m = np.linalg.norm(
+                    each.window.joints(each.state) - each.first, axis=-1
+                )
+                if not displacement_m[:, each.touched].max(initial=0.0) < RUNAWAY_M:
                     raise NotFinite("diverged from its views and the body")
             if max(moved) < _SETTLED_M:
                 break

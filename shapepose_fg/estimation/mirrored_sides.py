@@ -24,5 +24,5 @@ def mirrored_spread(joints: Array, mirrored: Array, names: Sequence[str]) -> Arr
     ]
     doubt = mirrored.max(axis=2, initial=0.0)
     doubt = np.maximum(doubt, doubt[:, other])
-    away = np.nan_to_num(joints[:, other] - joints) * np.sqrt(doubt)[..., None]
-    return away[..., None] * away[..., None, :]
+    displacement = np.nan_to_num(joints[:, other] - joints) * np.sqrt(doubt)[..., None]
+    return displacement[..., None] * displacement[..., None, :]

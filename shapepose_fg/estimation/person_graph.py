@@ -221,11 +221,11 @@ class BodyGraph(PersonWindow):
         """
         if not self.temporal or len(self.ties.factors) == 0:
             return []
-        asked = {key for each in self.ties.factors for key in each.keys}
+        tied = {key for each in self.ties.factors for key in each.keys}
         found, x = list[gtsam.NonlinearFactor](), self.keys
         for t, (first, last, lasts) in enumerate(zip(*moments(self.times_s), strict=True)):
             for joint, key in enumerate(self.velocity_keys[t].tolist()):
-                if key in asked:
+                if key in tied:
                     ends = (
                         self.values.atPoint3(x[last, joint]),
                         self.values.atPoint3(x[first, joint]),

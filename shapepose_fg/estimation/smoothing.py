@@ -54,8 +54,8 @@ def smoothed(
         states, spread = np.empty(right.shape), np.empty((C, T, n, n))
         solve_chains(diagonal, below, right, states, spread)
         mean, of_mean = np.moveaxis(states[..., 0], 0, -1), spread[..., 0, 0]
-        apart = ((place - mean) ** 2).sum(axis=-1) / (of_mean + 1.0 / information)
-        weight = information / (1 + apart / KERNEL)
+        squared = ((place - mean) ** 2).sum(axis=-1) / (of_mean + 1.0 / information)
+        weight = information / (1 + squared / KERNEL)
     ever = np.asarray(known.any(axis=2))[row]
     mean, of_mean = (each.reshape(-1, J, *each.shape[1:])[row, :, at] for each in (mean, of_mean))
     isotropic = of_mean[..., None, None] * np.eye(3)

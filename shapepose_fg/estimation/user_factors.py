@@ -46,8 +46,8 @@ class CoupledGraph:
     def tie(self, nodes: Iterable[tuple[int, int]]) -> None:
         """Record that a factor couples these variables (`parts`)."""
         joined = frozenset(nodes)
-        apart = [each for each in self.parts if not each & joined]
-        self.parts = [*apart, joined.union(*(each for each in self.parts if each & joined))]
+        others = [each for each in self.parts if not each & joined]
+        self.parts = [*others, joined.union(*(each for each in self.parts if each & joined))]
 
     def take_in(self, other: "CoupledGraph") -> None:
         """Merge with the coupling of other people, who share this object from now on."""

@@ -348,5 +348,5 @@ def statuses(
 
 def strong_detections(rows: Observations, inlier: Mask) -> Mask:
     """(N, J, V) the used detections, `inlier`, that are not weak."""
-    sure = (rows.confidence >= WEAK_SCORE) & (rows.probability > WEAK_PROBABILITY)
-    return inlier & sure
+    strong = (rows.confidence >= WEAK_SCORE) & (rows.probability > WEAK_PROBABILITY)
+    return inlier & strong

@@ -97,7 +97,7 @@ class CameraWatch:
         has_detections = np.bincount(given.view, minlength=len(rig)) > 0
         out = ~has_detections | np.isin(self.state, (CameraState.FROZEN, CameraState.CONTRADICTS))
         doubted = np.flatnonzero(self.state == CameraState.DOUBTED).tolist()
-        return replace(rig, dark=tuple(np.flatnonzero(out).tolist()), doubted=tuple(doubted))
+        return replace(rig, excluded=tuple(np.flatnonzero(out).tolist()), doubted=tuple(doubted))
 
     def compared(self, given: Detections, places: Array, rig: Rig, lasts_s: float) -> "CameraWatch":
         """Update with the distances of the detections from people at `places` (A, J, 3), metres,
@@ -109,11 +109,11 @@ class CameraWatch:
         sizes = np.array([camera.image_size for camera in rig.cameras])[:, None, None]
         inside = (depth > 0) & (uv >= 0).all(axis=-1) & (uv < sizes).all(axis=-1)
         px_m = np.where(depth > 0, depth, np.nan) / rig.focal_px[:, None, None]
-        away = np.linalg.norm(uv[given.view, :, given.joint] - given.xy[:, None], axis=-1)
-        away = np.nan_to_num(away * px_m[given.view, :, given.joint], nan=_CAP_M)
+        distance = np.linalg.norm(uv[given.view, :, given.joint] - given.xy[:, None], axis=-1)
+        distance = np.nan_to_num(distance * px_m[given.view, :, given.joint], nan=_CAP_M)
         nearest = np.full((len(rig), places.shape[1], len(places)), _CAP_M)
-        np.fmin.at(nearest, (given.view, given.joint), away)
-        metres, of_detections = nearest.swapaxes(1, 2), np.minimum(away.min(axis=1), _CAP_M)
+        np.fmin.at(nearest, (given.view, given.joint), distance)
+        metres, of_detections = nearest.swapaxes(1, 2), np.minimum(distance.min(axis=1), _CAP_M)
         apart_m, fresh = self.apart_m.copy(), min(lasts_s / _OVER_S, 1.0)
         counts = np.bincount(given.view, minlength=len(rig))
         for view in np.flatnonzero(

@@ -153,10 +153,10 @@ class Filter:
             return now, candidate
         places, tracker = self.placed(now), self.tracker
         arrays = FrameArrays.of(given.detections, given.rig, tracker.skeleton)
-        weight, price = weighed(
+        weight, cost = weighed(
             candidate, places, arrays, tracker.skeleton, now.tracks.global_hypothesis
         )
-        running_s = now.running_s + lasts_s * own_evidence(candidate, weight, price)
+        running_s = now.running_s + lasts_s * own_evidence(candidate, weight, cost)
         views = (candidate >= 0).sum(axis=2)
         seen = np.where((views >= 2)[..., None], places, np.nan)
         bones = self._trace(seen).bones

@@ -524,8 +524,8 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
         both = Detections.joined(
             [slot.given.detections, thinned(detections, self.rig, self._config.candidates)[0]]
         )
-        dark = tuple(each for each in slot.given.rig.dark if each != view)
-        rig = replace(self._state.rig.at(at_s), dark=dark, doubted=slot.given.rig.doubted)
+        excluded = tuple(each for each in slot.given.rig.excluded if each != view)
+        rig = replace(self._state.rig.at(at_s), excluded=excluded, doubted=slot.given.rig.doubted)
         slot.given = replace(slot.given, time_s=at_s, detections=both, rig=rig)
         self._state.late += 1
         self._again(at)
@@ -607,7 +607,11 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
 
 
 def _without(detections: Detections, rig: Rig) -> Detections:
-    """Detections without those of dark cameras."""
-    dark = np.zeros(len(rig), dtype=bool)
-    dark[list(rig.dark)] = True
-    return detections.only(~dark[detections.view]) if dark[detections.view].any() else detections
+    """Detections without those of excluded cameras."""
+    excluded = np.zeros(len(rig), dtype=bool)
+    excluded[list(rig.excluded)] = True
+    return (
+        detections.only(~excluded[detections.view])
+        if excluded[detections.view].any()
+        else detections
+    )

@@ -110,9 +110,9 @@ def with_rows_like(
     """
     order = np.lexsort((solved.frame, solved.person))
     tables = (solved.rows(order), rows)
-    known, asked = pair_keys(*((each.person, each.frame) for each in tables))
-    new = np.flatnonzero(~np.isin(asked, known))
-    after = np.searchsorted(known, asked[new])
+    known, wanted = pair_keys(*((each.person, each.frame) for each in tables))
+    new = np.flatnonzero(~np.isin(wanted, known))
+    after = np.searchsorted(known, wanted[new])
     first, second = (order[np.clip(each, 0, len(order) - 1)] for each in (after - 1, after))
     same_person = (solved.person[first] == rows.person[new]) & (
         solved.person[second] == rows.person[new]

@@ -101,16 +101,18 @@ def estimate_offsets(
     return offsets
 
 
-def kept_offsets(kept: KeptArrays, sample: Sample, book: Notebook) -> KeypointOffsets | None:
+def kept_offsets(kept: KeptArrays, sample: Sample, notebook: Notebook) -> KeypointOffsets | None:
     """The offsets stored when the run began; `offsets_of` if there are none yet."""
     columns = [each.name for each in fields(KeypointOffsets)]
-    make = partial(offsets_of, sample, book)
+    make = partial(offsets_of, sample, notebook)
     return _kept(kept, _OFFSETS, columns, make, lambda arrays: KeypointOffsets(**arrays))
 
 
-def kept_noise(kept: KeptArrays, sample: Sample, book: Notebook) -> NoiseLaw:
+def kept_noise(kept: KeptArrays, sample: Sample, notebook: Notebook) -> NoiseLaw:
     """The noise law stored when the run began; `noise_of` if there is none yet."""
-    return _kept(kept, _NOISE, NoiseLaw.COLUMNS, lambda: noise_of(sample, book), NoiseLaw.from_dict)
+    return _kept(
+        kept, _NOISE, NoiseLaw.COLUMNS, lambda: noise_of(sample, notebook), NoiseLaw.from_dict
+    )
 
 
 def _kept(
@@ -132,7 +134,7 @@ def _kept(
     return made
 
 
-def noise_of(sample: Sample, book: Notebook) -> NoiseLaw:
+def noise_of(sample: Sample, notebook: Notebook) -> NoiseLaw:
     """The detector's noise law, from the same source as the offsets.
 
     A recording of fewer than `NOISE_FRAMES` frames uses the shipped law.
@@ -143,7 +145,7 @@ def noise_of(sample: Sample, book: Notebook) -> NoiseLaw:
         return NoiseLaw.load(source)
     if source == "none" or len(sample) < NOISE_FRAMES:
         return NoiseLaw.shipped()
-    with book.stage("noise"):
+    with notebook.stage("noise"):
         every = _enough(
             Observations.of(whole_people(people.candidate, found), found, people.initial)
             for found, people in sample.people(NOISE_FRAMES)
@@ -154,7 +156,7 @@ def noise_of(sample: Sample, book: Notebook) -> NoiseLaw:
         return Residuals.of(rows, whole, views, config, setup.skeleton.joints).law()
 
 
-def offsets_of(sample: Sample, book: Notebook) -> KeypointOffsets | None:
+def offsets_of(sample: Sample, notebook: Notebook) -> KeypointOffsets | None:
     """Offsets of the detector's joints; None without a source. Raises ValueError for an unsuitable
     file.
     """
@@ -168,7 +170,7 @@ def offsets_of(sample: Sample, book: Notebook) -> KeypointOffsets | None:
         raise ValueError(f"offsets of {source} need a fitter with a `model`, and joints of BODY_25")
     if source != "recording":
         return KeypointOffsets.load(source)
-    with book.stage("offsets"):
+    with notebook.stage("offsets"):
         people = _enough(each for _, each in sample.people(config.offsets.frames))
         if len(people) == 0:
             return KeypointOffsets.identity()

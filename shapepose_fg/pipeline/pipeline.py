@@ -178,30 +178,30 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
             f"chunk_frames must be at least batch_frames ({config.batch_frames}), for people "
             f"over time; got {chunk}"
         )
-    book, fitter = Notebook(), task.fitter
+    notebook, fitter = Notebook(), task.fitter
     pictures = WithoutRepeats(with_poses(task.detections, rig, times), len(rig))
     detections = ThinnedFrames(pictures, rig, config.candidates)
-    with book.stage("load"):
+    with notebook.stage("load"):
         if fitter is None:
             fitter = make_fitter(config.body, BodyModel.default().with_keypoints(skeleton.joints))
         check_fitter(fitter)
     report, passes = execution.progress_over(len(frames)), 1 + (unrefined(rig) and config.temporal)
     setup = Setup(rig, skeleton, config, fitter, task.extra_factors)
-    setup = _with_refined(kept, task, setup, book, lambda done: report(done // passes))
+    setup = _with_refined(kept, task, setup, notebook, lambda done: report(done // passes))
     sample = Sample(setup, detections, times)
-    offsets = kept_offsets(kept, sample, book)
+    offsets = kept_offsets(kept, sample, notebook)
     if offsets is not None:
         setup = replace(setup, fitter=fitter.with_keypoint_offsets(offsets))
-    setup = replace(setup, noise=kept_noise(kept, sample, book))
+    setup = replace(setup, noise=kept_noise(kept, sample, notebook))
     parts = Parts(kept)
     parts.check(skeleton.joints, rig.names, frames, times.frame_s)
     done = parts.notes().frames
     windows = SolvedWindows(
-        setup, detections, pictures, times, frames, cuts, task.keyframes(), book
+        setup, detections, pictures, times, frames, cuts, task.keyframes(), notebook
     )
     with execution.pool(setup, len(frames)) as pool:
-        beginning = book.flush()
-        nobody = setup.engine(book).tracker.nobody()
+        beginning = notebook.flush()
+        nobody = setup.engine(notebook).tracker.nobody()
         begin = parts.checkpoint(windows.read, frames, nobody, skeleton)
         for part in windows.after(begin, pool, chunk):
             parts.append(part)
@@ -209,20 +209,20 @@ def reconstruct_parts(kept: KeptArrays, task: Task, execution: Execution | None 
             report((done + (passes - 1) * len(frames)) // passes)
         result = Assembly(parts, skeleton.joints, rig.names)
         if config.temporal and len(parts) > 0:
-            with book.stage("follow"):
+            with notebook.stage("follow"):
                 # half way between frames, to avoid rounding
                 cuts_s = (times.frame_s[cuts] + times.frame_s[[cut - 1 for cut in cuts]]) / 2
                 result = replace(result, names=_names(result, setup, cuts_s.tolist()))
         floor: Floor | str = "frame by frame" if not config.temporal else "not sought"
         model = setup.fitter.model
         if config.temporal and model is not None and len(result) > 0:
-            with book.stage("bodies over time"):
+            with notebook.stage("bodies over time"):
                 if config.motion.floor:
                     floor = result.floor(model, rig.up_vector)
                 ground = floor if isinstance(floor, Floor) else None
                 result = _with_person_shapes(result, task.shapes, model, ground, pool)
     notes = beginning
-    for each in (parts.notes(), book.flush()):
+    for each in (parts.notes(), notebook.flush()):
         notes.add(each)
     entries = {"time": times.as_dict(), "cuts": cuts}
     entries |= {
@@ -248,7 +248,7 @@ def _with_refined(
     kept: KeptArrays,
     task: Task,
     setup: Setup,
-    book: Notebook,
+    notebook: Notebook,
     report: Callable[[int], object] = lambda done: None,
 ) -> Setup:
     """The set-up with refined trajectories for moving cameras; the run stores them. `report` gets
@@ -264,7 +264,7 @@ def _with_refined(
         # Notes on people are made when they are tracked again.
         every = np.arange(frames.start, frames.stop)
         windows = SolvedWindows(setup, thinned, pictures, times, frames, cuts, every, Notebook())
-        with book.stage("trajectories"):
+        with notebook.stage("trajectories"):
             known = refine(windows, task.camera_factors, report)
         keep(kept, known)
     return replace(setup, rig=known)

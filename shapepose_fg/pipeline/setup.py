@@ -124,10 +124,10 @@ class Setup:
             place[of_frame] = np.append(detections[number].place, -1)[candidate[of_frame]]
         return solution.result(place, rig, self.skeleton.joints)
 
-    def engine(self, book: Notebook) -> Engine:
-        """The tracker with its windows; notes are written to `book`."""
+    def engine(self, notebook: Notebook) -> Engine:
+        """The tracker with its windows; notes are written to `notebook`."""
         config, skeleton, tracking = self.config, self.skeleton, self.config.tracking
-        by_evidence = StageOne(skeleton, config.candidates, config.proposals, book)
+        by_evidence = StageOne(skeleton, config.candidates, config.proposals, notebook)
         # Unexplained detections may be people with hips seen by two views; later frames decide.
         from_hips = by_evidence.of_the_rest()
         if by_evidence.proposals.evidence and not config.temporal:
@@ -146,7 +146,7 @@ class Setup:
             longest_bones(skeleton), motion.density(np.full(len(skeleton), FAST_M_S), UNSEEN_S), law
         )
         find = (by_evidence, from_hips) if config.temporal else (by_evidence,)
-        options = {"fitter": self.fitter, "drop": book.drop_in, "search": book.search}
+        options = {"fitter": self.fitter, "drop": notebook.drop_in, "search": notebook.search}
         return Engine(
             Tracker(skeleton, scale, find, tracking, config.observations, **options), config
         )

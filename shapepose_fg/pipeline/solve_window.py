@@ -117,9 +117,9 @@ def _assigned(
     drafted: Draft | None = None
     frames = assigning.frames
     frame_s = np.array([each.time_s.mean() for each in frames])
-    asked = np.ones(len(frames), dtype=bool)
+    to_assign = np.ones(len(frames), dtype=bool)
     for n in range(assigning.rounds):
-        around = near_in_time(asked[:, None], frame_s, _SMOOTHED_S)[:, 0]
+        around = near_in_time(to_assign[:, None], frame_s, _SMOOTHED_S)[:, 0]
         changed_frames = [each.frame for each in compress(frames, around)]
         near = np.flatnonzero(np.isin(observations.frame, changed_frames))
         before, seen_by = observations.rows(near), views.rows(near)
@@ -131,7 +131,7 @@ def _assigned(
             times_s, least = before.time_s.mean(axis=1), None
             places, covariance = smoothed(places, covariance, before.track, times_s, motion)
             covariance = widened(covariance, before, places, seen_by)
-        again = list(compress(frames, asked))
+        again = list(compress(frames, to_assign))
         now = reassociate(again, before, places, covariance, assigning.skeleton, least)
         kept = observations.rows(~np.isin(observations.frame, [each.frame for each in again]))
         new = Observations.concatenate([kept, now])
@@ -143,5 +143,5 @@ def _assigned(
             if other.sum() <= _SETTLED * new.seen.sum():
                 break
             marked = np.isin([each.frame for each in frames], now.frame[other.any(axis=(1, 2))])
-            asked = near_in_time(marked[:, None], frame_s, _CHANGED_S)[:, 0]
+            to_assign = near_in_time(marked[:, None], frame_s, _CHANGED_S)[:, 0]
     return observations, views, drafted

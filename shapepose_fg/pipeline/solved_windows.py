@@ -41,7 +41,7 @@ class SolvedWindows:
     """First frames after cuts."""
     keyframes: Index
     """(K,) keyframes, in which people are searched for, ascending."""
-    book: Notebook
+    notebook: Notebook
     """Collects the notes of this process."""
     _rigs: dict[tuple[tuple[int, ...], ...], Rig] = field(default_factory=dict, init=False)
     """Rigs, by views without a picture and doubted views."""
@@ -54,23 +54,23 @@ class SolvedWindows:
     def read(self, frame: int) -> Input:
         """Input of a frame; it is not thinned between keyframes."""
         key = _among(frame, self.keyframes)
-        with self.book.stage("read"):
+        with self.notebook.stage("read"):
             thinned = self.detections.is_thinned(frame)
             repeated, trust = self.pictures.repeated(frame), self.pictures.trust
             if key:
-                self.book.thin("detections", thinned, frame)
-                self.book.repeat([self.setup.rig.names[view] for view in repeated], frame)
+                self.notebook.thin("detections", thinned, frame)
+                self.notebook.repeat([self.setup.rig.names[view] for view in repeated], frame)
             found = self.detections[frame] if key else self.pictures[frame]
             # With more detections than people could explain, associations are chance.
             doubted = tuple(range(len(self.setup.rig))) if thinned else trust.in_doubt(frame)
-            views = tuple(sorted({*repeated, *trust.dark(frame)})), doubted
+            views = tuple(sorted({*repeated, *trust.excluded(frame)})), doubted
             if self.setup.rig.moves:
                 rig = replace(
-                    self.setup.rig.at(self._time_s[frame]), dark=views[0], doubted=views[1]
+                    self.setup.rig.at(self._time_s[frame]), excluded=views[0], doubted=views[1]
                 )
                 return Input(frame, self._time_s[frame], found, rig, key)
             if views not in self._rigs:
-                self._rigs[views] = replace(self.setup.rig, dark=views[0], doubted=views[1])
+                self._rigs[views] = replace(self.setup.rig, excluded=views[0], doubted=views[1])
             return Input(frame, self._time_s[frame], found, self._rigs[views], key)
 
     def after(
@@ -85,7 +85,7 @@ class SolvedWindows:
 
         def spans() -> Iterator[Span]:
             for span, behind in self._followed(begin):
-                waiting.append((self.book.flush(), behind))
+                waiting.append((self.notebook.flush(), behind))
                 yield span
 
         for part in pool.map(Setup.solve, spans()):
@@ -95,7 +95,7 @@ class SolvedWindows:
 
     def _followed(self, begin: Checkpoint) -> Iterator[tuple[Span, Checkpoint | None]]:
         """Windows with tracked people, some with the state for continuing tracking."""
-        config, engine = self.setup.config, self.setup.engine(self.book)
+        config, engine = self.setup.config, self.setup.engine(self.notebook)
         next_id = begin.next_id
         for segment in segments(self.frames, self.cuts):
             if segment.stop <= begin.frame:
@@ -105,12 +105,12 @@ class SolvedWindows:
             for start in range(max(segment.start, begin.frame), segment.stop, config.batch_frames):
                 batch = range(start, min(start + config.batch_frames, segment.stop))
                 given, last = [self.read(frame) for frame in batch], batch.stop == segment.stop
-                with self.book.stage("follow"):
+                with self.notebook.stage("follow"):
                     if config.temporal:
                         spans, state = engine.follow(state, given, last=last)
                         next_id = state.follow.next_id
                     else:
-                        spans = [engine.isolated_frames(self.book.watched(given))]
+                        spans = [engine.isolated_frames(self.notebook.watched(given))]
                 behind = Checkpoint(
                     batch.stop, next_id, state if config.temporal and not last else None
                 )
@@ -127,7 +127,7 @@ class SolvedWindows:
             for chunk in chunks:
                 if chunk.own.start >= begin.frame:
                     given = tuple(self.read(frame) for frame in range(chunk.first, chunk.until))
-                    waiting.append((chunk, self.book.flush()))
+                    waiting.append((chunk, self.notebook.flush()))
                     yield chunk, given
 
         identities = Identities(begin.next_id, begin.border)
@@ -181,9 +181,9 @@ def solve_chunk(setup: Setup, job: tuple[Chunk, Sequence[Input]]) -> SolvedChunk
     frames are not those of the chunk, each once.
     """
     chunk, given = job
-    book = Notebook()
-    engine = setup.engine(book)
-    with book.stage("follow"):
+    notebook = Notebook()
+    engine = setup.engine(notebook)
+    with notebook.stage("follow"):
         spans = list(windows_of(engine, chunk, lambda frame: given[frame - chunk.first]))
     frames = [each.frame for span in spans for each, _ in span.decided[span.start : span.stop]]
     if frames != list(chunk.own):
@@ -192,7 +192,7 @@ def solve_chunk(setup: Setup, job: tuple[Chunk, Sequence[Input]]) -> SolvedChunk
             "be all of its frames, each once; please report this error"
         )
     parts = tuple(map(setup.solve, spans))
-    notes = book.flush()
+    notes = notebook.flush()
     notes.dropped = {
         why: [each for each in of if each in chunk.own] for why, of in notes.dropped.items()
     }

@@ -155,14 +155,14 @@ class _Pass:
     def graphs(self) -> Iterator[TrajectoryGraph]:
         """Yield the solved graph of people and poses for each window."""
         windows, setup = self.windows, self.windows.setup
-        engine, last = setup.engine(windows.book), None
+        engine, last = setup.engine(windows.notebook), None
         for segment in segments(windows.frames, windows.cuts):
             state = engine.start()
             for start in range(segment.start, segment.stop, setup.config.batch_frames):
                 batch = range(start, min(start + setup.config.batch_frames, segment.stop))
                 reader = replace(windows, setup=replace(setup, rig=self._rig()))
                 given = [reader.read(frame) for frame in batch]
-                with windows.book.stage("trajectories"):
+                with windows.notebook.stage("trajectories"):
                     spans, state = engine.follow(state, given, last=batch.stop == segment.stop)
                     for span in spans:
                         graph = self._solved(span, last)

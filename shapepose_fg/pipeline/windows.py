@@ -180,8 +180,8 @@ def halved(
     # From the keyframe before to the one after each group of nearby new keyframes.
     keys, near_s, spans = np.flatnonzero(key), config.windows.shared_s, list[Span]()
     every = np.flatnonzero(new)
-    apart = np.flatnonzero(np.diff(time_s[every]) > near_s) + 1
-    for part in np.split(every, apart) if len(every) > 0 else ():
+    gaps = np.flatnonzero(np.diff(time_s[every]) > near_s) + 1
+    for part in np.split(every, gaps) if len(every) > 0 else ():
         begin, end = keys[np.searchsorted(keys, part[0]) - 1], keys[np.searchsorted(keys, part[-1])]
         first = int(np.searchsorted(time_s, time_s[begin] - near_s - 1e-6))
         until = int(np.searchsorted(time_s, time_s[end] + near_s + 1e-6))

@@ -105,7 +105,7 @@ class Nearby:
         self,
         nearness: Array,
         lost: Mask,
-        sure: float,
+        least_affinity: float,
         own: Index,
         hypothesis: Index,
         arrays: FrameArrays,
@@ -116,13 +116,15 @@ class Nearby:
 
         The score is `nearness` (N,), 1 on the joint and 0 far from it, plus mean affinity to the
         person's own detections. For `lost` (N,) joints only the affinity is used, which must be at
-        least `sure`.
+        least `least_affinity`.
         """
         N, chosen = len(self.person), np.empty(own.shape, dtype=np.intp)
         claims = Claims(np.empty(N), np.empty(N), np.empty(N, dtype=bool))
         room = np.empty(N), np.empty(N, dtype=np.intp), np.empty(len(arrays.of_view), dtype=np.intp)
         near = self.first, self.person, self.detection
-        claim(*near, nearness, lost, sure, own, hypothesis, arrays, *claims, *room, chosen)
+        claim(
+            *near, nearness, lost, least_affinity, own, hypothesis, arrays, *claims, *room, chosen
+        )
         return chosen, claims
 
     def with_tied(self, own: Index, unplaced: Mask, arrays: FrameArrays) -> "Nearby":
@@ -286,8 +288,8 @@ def tie(person, detection, own, arrays, mean, neighbours):
 
 @kernel("i1 i1 i1 f1 b1 f0 i3 i1", FrameArrays, "f1 f1 b1 f1 i1 i1 i3")
 def claim(
-    first, person, detection, nearness, lost, sure, own, hypothesis, arrays, tied, score, likely,
-    key, queue, taken, chosen,
+    first, person, detection, nearness, lost, least_affinity, own, hypothesis, arrays, tied, score,
+    likely, key, queue, taken, chosen,
 ):  # fmt: skip
     """Fill in the results of `Nearby.claimed`; `key` and `queue` (N,) and `taken` (D,) are
     workspace.
@@ -300,7 +302,7 @@ def claim(
         # Without detected neighbours the affinities are neutral.
         score[e] = nearness[e] + (tied[e] if neighbours > 0 else LEAST_AFFINITY)
         if lost[e]:
-            likely[e] = neighbours > 0 and tied[e] >= sure
+            likely[e] = neighbours > 0 and tied[e] >= least_affinity
         else:
             likely[e] = score[e] >= 2 * LEAST_AFFINITY
         # People grouped by the detector have affinities of exactly 1: ties are broken by rank.

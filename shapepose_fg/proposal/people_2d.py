@@ -93,11 +93,11 @@ def _group(pairs, joint, group, after, last, has, order, stop):
         has[row, joint[row]] = True
     for pair in range(len(pairs)):
         one, other = group[pairs[pair, 0]], group[pairs[pair, 1]]
-        row, apart = other, one != other
-        while apart and row >= 0:
-            apart = not has[one, joint[row]]
+        row, separate = other, one != other
+        while separate and row >= 0:
+            separate = not has[one, joint[row]]
             row = after[row]
-        if apart:
+        if separate:
             row = other
             while row >= 0:
                 group[row], has[one, joint[row]] = one, True

@@ -87,8 +87,8 @@ class Evidence:
         evidence = (self.weight * own).sum(axis=(1, 2))
         seen = (own & self.expected).sum(axis=1) / np.maximum(self.expected.sum(axis=1), 1)
         missed = (self.expected & ~own).sum(axis=1)
-        price = (missed * (_MISSED * seen + _HIDDEN * (1 - seen))).sum(axis=1)
-        return np.asarray(evidence + self.bones - price, dtype=np.float64)
+        cost = (missed * (_MISSED * seen + _HIDDEN * (1 - seen))).sum(axis=1)
+        return np.asarray(evidence + self.bones - cost, dtype=np.float64)
 
 
 def _bones(people: PossiblePeople, frame: Frame) -> Array:
@@ -122,7 +122,7 @@ def choose(points: PairPoints, frame: Frame, least: float) -> tuple[PossiblePeop
     """Select the people of a frame with probability at least `least`; also returns their
     probabilities (P,).
     """
-    people, sure = PossiblePeople.none(frame), np.zeros(0)
+    people, probability = PossiblePeople.none(frame), np.zeros(0)
     # Maximum number of searches, each among what the people found so far leave unexplained.
     for _ in range(8):
         taken = np.zeros(len(frame.detections), dtype=bool)
@@ -131,8 +131,8 @@ def choose(points: PairPoints, frame: Frame, least: float) -> tuple[PossiblePeop
         more = _greedy(pool, people, taken, frame, least)
         if more is None:
             break
-        people, sure = _assigned_once(more, frame, least)
-    return people, sure
+        people, probability = _assigned_once(more, frame, least)
+    return people, probability
 
 
 def _greedy(
@@ -171,10 +171,10 @@ def _assigned_once(
     while True:
         # Number of reassignments of detections around the joints of selected people.
         people = settled(people.places, people.chosen, frame, 2, exclusive=True)
-        sure = existence(people, frame)
-        if len(people) == 0 or sure.min() >= least:
-            return people, sure
-        people = people.rows(np.arange(len(people)) != sure.argmin())
+        probability = existence(people, frame)
+        if len(people) == 0 or probability.min() >= least:
+            return people, probability
+        people = people.rows(np.arange(len(people)) != probability.argmin())
 
 
 def existence(people: PossiblePeople, frame: Frame, prior: float = _PRIOR) -> Array:

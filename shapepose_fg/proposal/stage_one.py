@@ -32,7 +32,7 @@ class StageOne:
     """Settings for 3D joint candidates."""
     proposals: ProposalConfig
     """Settings for people from candidates, and their 2D observations."""
-    book: Notebook
+    notebook: Notebook
     """Collects notes and timings."""
 
     def of_the_rest(self) -> "StageOne":
@@ -50,26 +50,26 @@ class StageOne:
             return self._by_hips(detections, rig)
         once, index = without_repeats(detections)
         points = self._points(once, rig)
-        with self.book.stage("propose"):
+        with self.notebook.stage("propose"):
             frame = Frame(once, rig, self.skeleton, longest_bones(self.skeleton))
             people, _ = choose(points, frame, self.proposals.min_probability)
             most = self.proposals.most_people
-            self.book.thin("people", len(people) > most)
+            self.notebook.thin("people", len(people) > most)
             people = people.rows(np.arange(min(len(people), most)))  # most probable first
         chosen = np.where(people.chosen >= 0, np.append(index, -1)[people.chosen], -1)
         return Observations.of(chosen, detections, people.places)
 
     def _points(self, detections: Detections, rig: Rig) -> PairPoints:
         """Triangulated pairs of detections, thinned."""
-        with self.book.stage("triangulate"):
+        with self.notebook.stage("triangulate"):
             every = triangulate_pairs(detections, rig, self.candidates)
             points = thinned_points(every, self.candidates)
-            self.book.thin("points", len(points.xyz) < len(every.xyz))
+            self.notebook.thin("points", len(points.xyz) < len(every.xyz))
         return points
 
     def _by_hips(self, detections: Detections, rig: Rig) -> Observations:
         """The variant of the paper: votes, hips as anchors, and joints linked to them."""
-        points, skeleton, book = self._points(detections, rig), self.skeleton, self.book
+        points, skeleton, notebook = self._points(detections, rig), self.skeleton, self.notebook
         if (
             not np.isin(points.joint, skeleton.root).any()
             and not np.isin(skeleton.hips, points.joint).all()
@@ -79,13 +79,13 @@ class StageOne:
                 detections,
                 np.zeros((0, len(skeleton), 3)),
             )
-        with book.stage("vote"):
+        with notebook.stage("vote"):
             every = vote(points, detections, len(rig), self.candidates)
             candidates = thinned_candidates(every, detections, self.candidates)
-            book.thin("candidates", len(candidates) < len(every))
-        with book.stage("propose"):
+            notebook.thin("candidates", len(candidates) < len(every))
+        with notebook.stage("propose"):
             proposals = propose(candidates, detections, skeleton, rig.up_vector, self.proposals)
-        with book.stage("associate"):
+        with notebook.stage("associate"):
             observations, phantoms = associate(
                 proposals, candidates, detections, rig, skeleton, self.proposals
             )
@@ -93,5 +93,5 @@ class StageOne:
             *proposals.dropped.items(),
             ("hardly any joint seen by two views", phantoms),
         ):
-            book.drop(reason, count)
+            notebook.drop(reason, count)
         return observations

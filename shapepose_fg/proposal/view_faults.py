@@ -75,11 +75,11 @@ def doubled(found: Detections, rig: Rig) -> Mask:
     one, other = np.triu_indices(len(groups), 1)
     near = np.abs(lowest[one] - lowest[other]).max(axis=1) < size[one]
     one, other = (each[near & (view[one] == view[other])] for each in (one, other))
-    apart = np.sort(np.linalg.norm(xy[one] - xy[other], axis=2), axis=1)
-    common = np.isfinite(apart).sum(axis=1)
+    distance_px = np.sort(np.linalg.norm(xy[one] - xy[other], axis=2), axis=1)
+    common = np.isfinite(distance_px).sum(axis=1)
     has = np.isfinite(xy[..., 0]).sum(axis=1)
     enough = common >= np.maximum(LEAST_COMMON, np.minimum(has[one], has[other]) / 2)
-    median = apart[np.arange(len(one)), np.maximum(common - 1, 0) // 2]
+    median = distance_px[np.arange(len(one)), np.maximum(common - 1, 0) // 2]
     same = enough & (
         median < np.maximum(_SAME * np.minimum(size[one], size[other]), least[view[one]])
     )

@@ -109,10 +109,10 @@ def _row_of(people: Reconstruction, person: int, frame: int | None, time_s: floa
     if (frame is None) == (time_s is None):
         raise InputError("give either a frame or a time")
     if time_s is not None:
-        away = np.abs(people.time_s[rows] - time_s)
-        if not np.isfinite(away).any():
+        lag_s = np.abs(people.time_s[rows] - time_s)
+        if not np.isfinite(lag_s).any():
             raise InputError("the result has no times; give a frame")
-        return int(rows[np.nanargmin(away)])
+        return int(rows[np.nanargmin(lag_s)])
     row = rows[people.frame[rows] == frame]
     if len(row) == 0:
         first, last = people.frame[rows].min(), people.frame[rows].max()
@@ -212,10 +212,10 @@ def _view_reasons(
         if seen[v] and np.isfinite(residual[v]).all() and sigma[v] > 0:
             least = np.eye(3)  # weak prior of 1 m
             without = inverses(raise_eigenvalues(whole - information[v], 0.0) + least)
-            away = residual[v] + slope[v] @ without @ gradient[v]
+            residual_px = residual[v] + slope[v] @ without @ gradient[v]
             spread = sigma[v] ** 2 * np.eye(2) + slope[v] @ without @ slope[v].T
-            off_px = float(np.linalg.norm(away))
-            off_sigma = float(np.sqrt(away @ np.linalg.solve(spread, away)))
+            off_px = float(np.linalg.norm(residual_px))
+            off_sigma = float(np.sqrt(residual_px @ np.linalg.solve(spread, residual_px)))
             if off_sigma > OFF_SIGMA:
                 words = _looks_like(
                     all_of_it, row, joint, v, table.xy[row, joint, v], float(sigma[v]), off_px
@@ -265,12 +265,14 @@ def _looks_like(
     )
     points, covariance = people.joints[rows][:, alike], people.covariance[rows][:, alike]
     xy, _, slope = (each[:, :, view] for each in all_of_it.views.rows(rows).project(points))
-    away, spread = (xy - at)[..., None], sigma**2 * np.eye(2) + slope @ covariance @ slope.mT
-    known = np.isfinite(away).all(axis=(-1, -2)) & np.isfinite(spread).all(axis=(-1, -2))
+    offset_px, spread = (xy - at)[..., None], sigma**2 * np.eye(2) + slope @ covariance @ slope.mT
+    known = np.isfinite(offset_px).all(axis=(-1, -2)) & np.isfinite(spread).all(axis=(-1, -2))
     known &= ~((rows == row)[:, None] & (alike == joint))
     squared = np.full(known.shape, np.inf)
-    squared[known] = (away[known].mT @ np.linalg.solve(spread[known], away[known]))[..., 0, 0]
-    squared[np.linalg.norm(away[..., 0], axis=-1) >= _APART * off] = np.inf
+    squared[known] = (offset_px[known].mT @ np.linalg.solve(spread[known], offset_px[known]))[
+        ..., 0, 0
+    ]
+    squared[np.linalg.norm(offset_px[..., 0], axis=-1) >= _APART * off] = np.inf
     n, j = np.unravel_index(squared.argmin(), squared.shape)
     return (
         f"person {people.person[rows[n]]}'s {names[alike[j]]}"

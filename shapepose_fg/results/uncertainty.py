@@ -117,10 +117,10 @@ class Distance:
     chi-square or moment fits.
     """
 
-    apart: Array
+    displacement: Array
     """(..., 3) mean displacement from the first to the second point, metres."""
     covariance: Array
-    """(..., 3, 3) covariance of the Gaussian with the same 95 % region as `apart`, m²."""
+    """(..., 3, 3) covariance of the Gaussian with the same 95 % region as `displacement`, m²."""
     tails: float = np.inf
     """Degrees of freedom of Student's t (`error_tails` for joints); infinite for a Gaussian."""
 
@@ -138,7 +138,7 @@ class Distance:
         limit = np.asarray(limit_m, dtype=np.float64)
         values, axes = principal_axes(self.covariance)
         sigma = np.sqrt(np.maximum(scale * values, 1e-12))
-        mean = np.einsum("...ij,...i->...j", axes, self.apart)
+        mean = np.einsum("...ij,...i->...j", axes, self.displacement)
         shape = np.broadcast_shapes(limit.shape, mean.shape[:-1])
         r = np.broadcast_to(np.maximum(limit, 0.0), shape)
         (m0, m1, m2), (s0, s1, s2) = (
@@ -164,14 +164,16 @@ class Distance:
         three dimensions can only increase a distance. If the measured distance is shorter than
         errors allow, the interval would be nearly empty: the upper end is at least the quantile.
         """
-        away = np.linalg.norm(self.apart, axis=-1)
+        distance_m = np.linalg.norm(self.displacement, axis=-1)
         way = np.where(
-            away[..., None] > 0, self.apart / np.maximum(away, 1e-12)[..., None], [1.0, 0.0, 0.0]
+            distance_m[..., None] > 0,
+            self.displacement / np.maximum(distance_m, 1e-12)[..., None],
+            [1.0, 0.0, 0.0],
         )
         limits = self._span()
         shorter = np.stack(
             [
-                Distance(each[..., None] * way, self.covariance, self.tails).below(away)
+                Distance(each[..., None] * way, self.covariance, self.tails).below(distance_m)
                 for each in limits
             ]
         )
@@ -192,15 +194,17 @@ class Distance:
         if np.isfinite(tails):
             ratio = _shape(tails) * tails / (tails - 2)
         variance = ratio * np.trace(self.covariance, axis1=-2, axis2=-1)
-        square = (self.apart**2).sum(axis=-1) + variance
+        square = (self.displacement**2).sum(axis=-1) + variance
         return np.sqrt(np.maximum(square - self.mean_m**2, 0.0))
 
     def _span(self) -> Array:
         """Limits (S, ...) that cover the range of the distances."""
-        away = np.linalg.norm(self.apart, axis=-1)
+        distance_m = np.linalg.norm(self.displacement, axis=-1)
         wide = 5.0 * np.sqrt(np.maximum(np.linalg.eigvalsh(self.covariance)[..., -1], 1e-12))
-        first, last = np.maximum(away - wide, 0.0), away + wide
-        return first + (last - first) * np.linspace(0, 1, _STEPS).reshape(-1, *(1,) * away.ndim)
+        first, last = np.maximum(distance_m - wide, 0.0), distance_m + wide
+        return first + (last - first) * np.linspace(0, 1, _STEPS).reshape(
+            -1, *(1,) * distance_m.ndim
+        )
 
     def _table(self) -> tuple[Array, Array]:
         """Limits (S, ...) and the probabilities of distances below them."""
@@ -227,8 +231,8 @@ class SurfaceDistance:
 
     def interval(self) -> tuple[float, float]:
         """95 % interval of the distance, metres; 0 inside the body."""
-        away = 1.959964 * self.sigma_m
-        return max(self.signed_m - away, 0.0), max(self.signed_m + away, 0.0)
+        half_width_m = 1.959964 * self.sigma_m
+        return max(self.signed_m - half_width_m, 0.0), max(self.signed_m + half_width_m, 0.0)
 
 
 def marginal(
@@ -278,21 +282,21 @@ def _of_graphs(
     for graph in {id(each.window.ties): each for each in graphs}.values():
         members = {each.person: each for each in graph.together or [graph]}
         keys = dict[int, int]()
-        for n, asked in enumerate(joints):
-            person = members.get(asked.person)
-            if person is not None and asked.frame in person.frames:
-                key = int(person.keys[np.flatnonzero(person.frames == asked.frame)[0], numbers[n]])
+        for n, wanted in enumerate(joints):
+            person = members.get(wanted.person)
+            if person is not None and wanted.frame in person.frames:
+                key = int(person.keys[np.flatnonzero(person.frames == wanted.frame)[0], numbers[n]])
                 keys |= {n: key} if graph.values.exists(key) else {}
         nodes = {n: (joints[n].person, int(numbers[n]), joints[n].frame) for n in keys}
         pairs = [(a, b) for a in keys for b in keys if a < b and keys[a] != keys[b]]
         pairs = [(a, b) for a, b in pairs if graph.coupled(nodes[a], nodes[b])]
-        asked = sorted({keys[n] for pair in pairs for n in pair})
-        if len(asked) == 0:
+        wanted = sorted({keys[n] for pair in pairs for n in pair})
+        if len(wanted) == 0:
             continue
         joint = gtsam.Marginals(graph.graph, graph.values).jointMarginalCovariance(
-            gtsam.KeyVector(asked)
+            gtsam.KeyVector(wanted)
         )
-        white = {key: np.linalg.inv(symmetric_root(joint.at(key, key)[None])[0]) for key in asked}
+        white = {key: np.linalg.inv(symmetric_root(joint.at(key, key)[None])[0]) for key in wanted}
         tied = True
         for a, b in pairs:
             across = white[keys[a]] @ joint.at(keys[a], keys[b]) @ white[keys[b]].T
@@ -306,9 +310,9 @@ def _definite(correlations: Array) -> Array:
     """Correlations (N, N) from several sources, scaled so that the whole is positive
     semi-definite.
     """
-    apart = correlations - np.eye(len(correlations))
-    least = np.linalg.eigvalsh(apart).min(initial=0.0)
-    return np.eye(len(correlations)) + apart / max(1.0, -least)
+    off_diagonal = correlations - np.eye(len(correlations))
+    least = np.linalg.eigvalsh(off_diagonal).min(initial=0.0)
+    return np.eye(len(correlations)) + off_diagonal / max(1.0, -least)
 
 
 def _of_poses(
@@ -353,9 +357,9 @@ def distance(
         covariance = both.block(0, 0) + both.block(1, 1) - across - across.T
         return Distance(both.mean[1] - both.mean[0], covariance, error_tails())
     joint_marginal, points = marginal(people, one), np.asarray(other, dtype=np.float64)
-    apart = points - joint_marginal.mean[0]
-    covariance = np.broadcast_to(joint_marginal.covariance, (*apart.shape, 3))
-    return Distance(apart, covariance, error_tails())
+    displacement = points - joint_marginal.mean[0]
+    covariance = np.broadcast_to(joint_marginal.covariance, (*displacement.shape, 3))
+    return Distance(displacement, covariance, error_tails())
 
 
 def distances(people: Reconstruction, point: ArrayLike) -> Distance:
@@ -387,15 +391,15 @@ def surface_distance(
     around = vertices[body.faces[(body.faces == near).any(axis=1)]]
     normals = np.cross(around[:, 1] - around[:, 0], around[:, 2] - around[:, 0])
     normal = normals.sum(axis=0) / max(np.linalg.norm(normals.sum(axis=0)), 1e-12)
-    nearest, away = vertices[near], where - vertices[near]
-    signed, length = float(away @ normal), float(np.linalg.norm(away))
+    nearest, displacement = vertices[near], where - vertices[near]
+    signed, length = float(displacement @ normal), float(np.linalg.norm(displacement))
     # Within the triangles around the vertex the distance is to the plane, else to the vertex.
     beside = np.sqrt(max(length**2 - signed**2, 0.0)) > np.sqrt(
         ((around - nearest) ** 2).sum(axis=-1).max()
     )
     if beside and length > 0:
         normal, signed = (
-            away / length * (1.0 if signed >= 0 else -1.0),
+            displacement / length * (1.0 if signed >= 0 else -1.0),
             length * (1.0 if signed >= 0 else -1.0),
         )
     names = people.joint_names.tolist()
@@ -478,22 +482,22 @@ def _row(people: Reconstruction, person: int, frame: int) -> int:
     return int(row[0])
 
 
-def _place(people: Reconstruction, asked: JointAt) -> tuple[int, int]:
+def _place(people: Reconstruction, joint_at: JointAt) -> tuple[int, int]:
     """Row and index of a joint with a position."""
-    row, names = _row(people, asked.person, asked.frame), people.joint_names.tolist()
-    if asked.joint not in names:
+    row, names = _row(people, joint_at.person, joint_at.frame), people.joint_names.tolist()
+    if joint_at.joint not in names:
         raise ValueError(
-            f"joint {asked.joint}: there is no joint of this name; there are {' '.join(names)}"
+            f"joint {joint_at.joint}: there is no joint of this name; there are {' '.join(names)}"
         )
-    joint = names.index(asked.joint)
+    joint = names.index(joint_at.joint)
     if not (
         np.isfinite(people.joints[row, joint]).all()
         and np.isfinite(people.covariance[row, joint]).all()
     ):
         raise NotDetermined(
-            asked.person,
-            asked.joint,
-            asked.frame,
+            joint_at.person,
+            joint_at.joint,
+            joint_at.frame,
             float(people.time_s[row]),
             _missing(people, row, joint),
         )

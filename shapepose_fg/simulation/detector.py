@@ -234,8 +234,8 @@ class Detector:
             true_xy[view, person, joint] - true_xy[view, person, _MIRROR[joint]], axis=-1
         )
         # Minimum distance between left and right joint, projected, for a swap, m.
-        apart = gap_px > 0.12 * px_a_metre
-        swap_rank = np.where(apart, ndtr(noise[NoiseProcess.SWAP, reported]), 1.0)
+        visibly_apart = gap_px > 0.12 * px_a_metre
+        swap_rank = np.where(visibly_apart, ndtr(noise[NoiseProcess.SWAP, reported]), 1.0)
         swapped = swap_rank < config.swaps * table.swap
         owner[swapped] = False
         found = Candidates(

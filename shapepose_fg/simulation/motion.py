@@ -114,9 +114,9 @@ def dance(
 
     def path_of(sign: float) -> Path:
         def path(t: Array) -> tuple[Array, Array]:
-            away = along(angle(t)) * sign
+            outward = along(angle(t)) * sign
             facing = angle(t) + (np.pi if sign > 0 else 0.0)
-            return middle(t) + away * half_distance(t)[:, None], facing + 0.15 * np.sin(
+            return middle(t) + outward * half_distance(t)[:, None], facing + 0.15 * np.sin(
                 np.pi * t / beat
             )
 
@@ -132,13 +132,13 @@ def dance(
         held.append(_at(xy, z))
     puppets = []
     for sign, build, other in ((1.0, pair[0], pair[1]), (-1.0, pair[1], pair[0])):
-        away = (
+        outward = (
             np.stack([np.cos(angle(time)), np.sin(angle(time)), np.zeros_like(time)], axis=1) * sign
         )
         # For the person at the far end, facing the centre, `across` is to the right; for the other
         # to the left.
         hands = held if sign < 0 else held[::-1]
-        wrists = np.stack([hand + 0.07 * away for hand in hands], axis=1)
+        wrists = np.stack([hand + 0.07 * outward for hand in hands], axis=1)
         xy, _ = path_of(-sign)(time)
         gaze = _at(xy, other.shoulder_m + 0.12)
         puppets.append(

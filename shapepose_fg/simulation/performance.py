@@ -191,10 +191,10 @@ def hold_hands(
     pull = _pull(lead, follow, fps)
     for _ in range(2):  # the second pass corrects the rotated hand
         hands = [person.joints[:, [22, 23]] for person in (lead, follow)]
-        apart = hands[1][:, None] - hands[0][:, :, None]  # (T, 2, 2, 3) lead's hands to follow's
-        gap = np.linalg.norm(apart, axis=-1)
+        between = hands[1][:, None] - hands[0][:, :, None]  # (T, 2, 2, 3) lead's hands to follow's
+        gap = np.linalg.norm(between, axis=-1)
         # Distance between the knuckles of two held hands, m.
-        step = (pull * np.maximum(1.0 - 0.07 / np.maximum(gap, 1e-6), 0.0) / 2)[..., None] * apart
+        step = (pull * np.maximum(1.0 - 0.07 / np.maximum(gap, 1e-6), 0.0) / 2)[..., None] * between
         lead = _reach(lead, step.sum(axis=2))
         follow = _reach(follow, -step.sum(axis=1))
     return lead, follow

@@ -60,8 +60,8 @@ class Hypotheses:
     """(H, T, J, 3) positions of the joints, metres; NaN where uncertain."""
     weight: NDArray[np.float32]
     """(H, T, J, V) weight of each detection as evidence (`weighed`)."""
-    price: NDArray[np.float32]
-    """(H, T) price of presence (`weighed`)."""
+    cost: NDArray[np.float32]
+    """(H, T) cost of presence (`weighed`)."""
     joints: JointStates
     """(H, J) states of the joints in the frame from which tracking continues."""
     counts: NDArray[np.intp]
@@ -73,7 +73,7 @@ class Hypotheses:
     def account(self) -> EvidenceTable:
         """The hypotheses as weighted detections for the selection."""
         return EvidenceTable.of(
-            self.candidate, self.weight, self.price, self.there, self.counts, self.lasts_s
+            self.candidate, self.weight, self.cost, self.there, self.counts, self.lasts_s
         )
 
     def __len__(self) -> int:
@@ -82,7 +82,7 @@ class Hypotheses:
     @classmethod
     def concatenate(cls, parts: Sequence["Hypotheses"]) -> "Hypotheses":
         """Concatenate hypotheses; their global hypotheses are renumbered and stay separate."""
-        names = ("carried", "there", "candidate", "places", "weight", "price")
+        names = ("carried", "there", "candidate", "places", "weight", "cost")
         columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
         first = np.cumsum([0, *(int(part.global_hypothesis.max(initial=-1)) + 1 for part in parts)])
         columns["global_hypothesis"] = np.concatenate(
@@ -149,7 +149,7 @@ def _plain(found: Hypotheses, times: Array) -> NDArray[np.bool_]:
     """(H,) hypotheses that span all frames with high evidence throughout; all, of one frame."""
     if len(times) == 1:
         return np.ones(len(found), dtype=bool)
-    evidence = found.weight.sum(axis=(2, 3)) - found.price
+    evidence = found.weight.sum(axis=(2, 3)) - found.cost
     frames = min(len(times), max(1, round(SEARCH_S / float(np.median(np.diff(times))))))
     high = sliding_window_view(evidence, frames, axis=1).mean(axis=-1) >= _PLAIN
     return np.asarray(found.there.all(axis=1) & high.all(axis=1))
@@ -390,10 +390,10 @@ def _duplicates(
         names = [candidate[row].tobytes() for row in rows.tolist()]
         rows = rows[sorted(range(len(names)), key=names.__getitem__)]
         other = kept.setdefault(tuple(sorted(names)), rows)
-        apart = np.linalg.norm(
+        distance_m = np.linalg.norm(
             tracks.joints.position[rows] - tracks.joints.position[other], axis=-1
         )
-        if other is not rows and (apart[known[rows] & known[other]] < _SAME_M).all():
+        if other is not rows and (distance_m[known[rows] & known[other]] < _SAME_M).all():
             duplicates, same = np.append(duplicates, rows), np.append(same, other)
     return duplicates, same
 
@@ -433,14 +433,14 @@ class _Log:
         hypotheses = (
             np.unique(tracks.global_hypothesis) if len(others) > 0 else tracks.global_hypothesis[:0]
         )
-        weight, price = weighed(
+        weight, cost = weighed(
             np.concatenate([candidate, np.full((len(hypotheses) * len(others), *self.shape), -1)]),
             np.concatenate([places, *[others] * len(hypotheses)]),
             arrays,
             self.tracker.skeleton,
             np.concatenate([tracks.global_hypothesis, hypotheses.repeat(len(others))]),
         )
-        self.parts.append((t, tracks.ids, candidate, places, weight[:A], price[:A]))
+        self.parts.append((t, tracks.ids, candidate, places, weight[:A], cost[:A]))
         if t == self.keep:
             self.kept.append((tracks.ids, joints))
 
@@ -448,20 +448,20 @@ class _Log:
         """All recorded tracks, as hypotheses."""
         H, T, (J, V) = len(self.carried), len(self.frames), self.shape
         present = np.zeros((H, T), dtype=bool)
-        candidate, price = (
+        candidate, cost = (
             np.full((H, T, J, V), -1, dtype=np.int32),
             np.zeros((H, T), dtype=np.float32),
         )
         places, weight = np.full((H, T, J, 3), np.nan), np.zeros((H, T, J, V), dtype=np.float32)
         for t, ids, own, at, counts, costs in self.parts:
             present[ids, t], candidate[ids, t], places[ids, t] = True, own, at
-            weight[ids, t], price[ids, t] = counts, costs
+            weight[ids, t], cost[ids, t] = counts, costs
         size = 3 * self.tracker.scale.motion.order
         mean, covariance = np.zeros((H, J, size)), np.zeros((H, J, size, size))
         for ids, joints in self.kept:
             mean[ids], covariance[ids] = joints.mean, joints.covariance
         for span, ids, others in reversed(self.duplicates):
-            for each in (present, candidate, price, places, weight):
+            for each in (present, candidate, cost, places, weight):
                 each[ids, span] = each[others, span]
             if self.keep in range(T)[span]:
                 mean[ids], covariance[ids] = mean[others], covariance[others]
@@ -478,7 +478,7 @@ class _Log:
             candidate,
             places,
             weight,
-            price,
+            cost,
             joints,
             counts,
             lasts_s,

@@ -164,7 +164,7 @@ def _rows(
     index = np.flatnonzero(chosen.during(t) & (identity >= 0))
     hypothesis = chosen.hypothesis[index]
     own = found.candidate[hypothesis, t].astype(np.intp)
-    evidence = own_evidence(own, found.weight[hypothesis, t], found.price[hypothesis, t])
+    evidence = own_evidence(own, found.weight[hypothesis, t], found.cost[hypothesis, t])
     return observed(given, own, found.places[hypothesis, t], identity[index], evidence)
 
 
@@ -194,11 +194,11 @@ def _identities(
     identity = np.full(len(chosen), -1, dtype=np.intp)
     early = np.flatnonzero(chosen.start == 0)
     carried = np.flatnonzero((found.carried >= 0) & found.there[:, 0])
-    apart = core_distance(
+    distance_m = core_distance(
         found.places[chosen.hypothesis[early], 0], found.places[carried, 0], skeleton
     )
-    for row, column in zip(*least_cost_pairs(np.minimum(apart, 2 * _SAME_M)), strict=True):
-        if apart[row, column] < _SAME_M:
+    for row, column in zip(*least_cost_pairs(np.minimum(distance_m, 2 * _SAME_M)), strict=True):
+        if distance_m[row, column] < _SAME_M:
             identity[early[row]] = found.carried[carried[column]]
     new = np.argsort(chosen.start, kind="stable")
     new = new[(chosen.start[new] < own) & (identity[new] < 0)]

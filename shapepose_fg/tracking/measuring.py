@@ -83,7 +83,7 @@ def _measure(mean, covariance, lost, candidate, confident, arrays, trust, bones,
     `candidate` to -1, and fill in `evident` (A,).
     """
     people, joints, views = candidate.shape
-    sigma_px, depths, sure, room = (
+    sigma_px, depths, confidence, room = (
         np.empty(views),
         np.empty(views),
         np.empty(views),
@@ -128,11 +128,13 @@ def _measure(mean, covariance, lost, candidate, confident, arrays, trust, bones,
             if seen >= 2 and (lost[a, j] or swings):
                 for v in range(views):
                     d = candidate[a, j, v]
-                    sure[v] = arrays.confidence[d] if d >= 0 else 0.0
+                    confidence[v] = arrays.confidence[d] if d >= 0 else 0.0
                     uv[v, 0], uv[v, 1] = xy[d, 0], xy[d, 1]
                 scale_m, reach_m = 2.0 * trust.sigma_m, trust.rho_2d_m
                 if (
-                    triangulated(cameras, focal, uv, sure, scale_m, reach_m, MIN_DEPTH_M, room, at)
+                    triangulated(
+                        cameras, focal, uv, confidence, scale_m, reach_m, MIN_DEPTH_M, room, at
+                    )
                     < 2
                 ):
                     at[0], at[1], at[2] = mean[a, j, 0], mean[a, j, 1], mean[a, j, 2]

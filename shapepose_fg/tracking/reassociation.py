@@ -53,8 +53,10 @@ def reassociate(
             index, evidence = index[~removed], evidence[~removed]
             candidate, probability = _reassigned(frame, joints[index], sigma_m[index], skeleton)
         columns = {name: getattr(rows, name)[index] for name in ("track", "frame", "time_s")}
-        sure = {"probability": probability, "evidence": evidence}
-        parts.append(Observations.of(candidate, frame.detections, joints[index], **columns, **sure))
+        existence = {"probability": probability, "evidence": evidence}
+        parts.append(
+            Observations.of(candidate, frame.detections, joints[index], **columns, **existence)
+        )
     return Observations.concatenate(parts)
 
 
@@ -84,14 +86,16 @@ def probabilities_of(frame: Input, candidate: Index, joints: Array, skeleton: Sk
 
 
 def people_to_remove(
-    sure: Array, joints: Array, skeleton: Skeleton, least: float, double_m: float = SAME_M
+    probability: Array, joints: Array, skeleton: Skeleton, least: float, double_m: float = SAME_M
 ) -> Mask:
     """(P,) whether to remove: the least probable person below `least`, and the less probable of
     duplicates.
     """
-    doubles = ((core_distance(joints, joints, skeleton) < double_m) & _smaller(sure)).any(axis=1)
+    doubles = ((core_distance(joints, joints, skeleton) < double_m) & _smaller(probability)).any(
+        axis=1
+    )
     # Detections that one person releases may help another.
-    return doubles | ((sure < least) & (sure == sure.min()))
+    return doubles | ((probability < least) & (probability == probability.min()))
 
 
 def _smaller(value: Array) -> Mask:

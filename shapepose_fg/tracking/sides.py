@@ -18,6 +18,7 @@ import numpy as np
 from shapepose_fg.body.fitting.fitter import BodyFitter, JointTargets
 from shapepose_fg.core.arrays import Array, Index, Mask
 from shapepose_fg.core.detections import Input
+from shapepose_fg.core.hidden_markov import state_probabilities
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.estimation.draft import MODEL_SIGMA_M
 from shapepose_fg.estimation.gated_views import MIN_DEPTH_M
@@ -86,10 +87,10 @@ class _Compared:
         # Sums over the joints of each part (G, parts, A), with the sides as they are, or exchanged.
         same, turned = np.zeros((2, len(groups), states.shape[1] + 1, len(ids)))
         for total, each in ((same, joint), (turned, mirror[joint])):
-            apart = (xy[view, :, each] - found.xy[rows, None]) / unit_px[view, :, each][..., None]
-            apart = np.square(apart).sum(axis=-1)
-            apart = np.minimum(np.nan_to_num(apart, nan=_FARTHEST), _FARTHEST)
-            np.add.at(total, (np.repeat(np.arange(len(groups)), count), part[joint]), apart)
+            squared = (xy[view, :, each] - found.xy[rows, None]) / unit_px[view, :, each][..., None]
+            squared = np.square(squared).sum(axis=-1)
+            squared = np.minimum(np.nan_to_num(squared, nan=_FARTHEST), _FARTHEST)
+            np.add.at(total, (np.repeat(np.arange(len(groups)), count), part[joint]), squared)
         apart_of = np.minimum(same, turned).sum(axis=1) / count[:, None]
         number, best = np.arange(len(groups)), apart_of.argmin(axis=1)
         fits = apart_of[number, best] < _FITS
@@ -105,8 +106,8 @@ class _Compared:
         states = exchanges(skeleton)
         right = np.exp(self.log) @ ~states > _AGREES
         same = (self.who[:, None] == self.who) & (self.who >= 0)
-        sure = self.log.max(axis=1) > self.log[:, 0] + _SURE
-        found = states[np.where(sure, self.log.argmax(axis=1), 0)]
+        certain = self.log.max(axis=1) > self.log[:, 0] + _SURE
+        found = states[np.where(certain, self.log.argmax(axis=1), 0)]
         return found & ((same @ right) | ~(same @ ~found) & (same.sum(axis=1, keepdims=True) > 1))
 
     def of_person(self, number: int) -> Array:
@@ -252,19 +253,16 @@ def _own_sides(
     )
     # A body can only lower a weight: none is fitted in states that are impossible anyway.
     first = number == weight.argmax(axis=1)[:, None]
-    for asked in (first, ~first):
+    for possible in (first, ~first):
         weight[weight < weight[first][:, None] + np.log(_NEVER)] = -np.inf
-        n, s = np.nonzero(asked & np.isfinite(weight))
+        n, s = np.nonzero(possible & np.isfinite(weight))
         at, sigma_m = joints.position[n[:, None], order[s]], joints.sigma_m[n[:, None], order[s]]
         weight[n, s] += _likeness(at, sigma_m, tracker.fitter)
-    change = np.log(np.where(np.eye(len(states), dtype=bool), 1 - _LOST, _LOST))
-    ahead, back = np.zeros_like(weight), np.zeros_like(weight)
-    ahead[0] = change[0] if followed else 0.0
-    for n in range(1, len(checked)):
-        ahead[n] = np.logaddexp.reduce(change + ahead[n - 1] + weight[n - 1], axis=1)
-        back[-n - 1] = np.logaddexp.reduce(change + back[-n] + weight[-n], axis=1)
-    log = ahead + weight + back
-    probability = np.exp(log - np.logaddexp.reduce(log, axis=1, keepdims=True))
+    turn = np.where(np.eye(len(states), dtype=bool), 1 - _LOST, _LOST)
+    likelihood = np.exp(weight - weight.max(axis=1, keepdims=True))[:, None]
+    turns = np.broadcast_to(turn, (len(checked) - 1, *turn.shape))
+    before = turn[0] if followed else np.ones(len(states))
+    probability = state_probabilities(likelihood, before, turns)[0][:, 0]
     best = states[probability.argmax(axis=1)]
     return best, np.einsum("ns,nsk->nk", probability, best[:, None] != states)
 

@@ -16,11 +16,11 @@ from shapepose_fg.core.rows import Rows
 from shapepose_fg.core.skeleton import Skeleton
 from shapepose_fg.proposal.nearby import LEAST_AFFINITY, FrameArrays, limbs_of, tie
 
-_PRICE = 0.4
-"""Cost of an expected but missing detection, relative to a present one. The price of a person's
+_COST = 0.4
+"""Cost of an expected but missing detection, relative to a present one. The cost of a person's
 presence is the mean over all expected detections, in seconds in which every view sees every
 joint."""
-_PRICE_HIDDEN = 0.05
+_COST_HIDDEN = 0.05
 """Cost where the joint is occluded by another person, or its position unknown. With these costs a
 person is accepted if a quarter of the unoccluded joints have detections of their own. In simulated
 crowds of eight with three cameras (seeds 6101, 6104), 76 % of unoccluded joints have a detection,
@@ -66,7 +66,7 @@ class SelectedTracks(Rows):
     stop: Index
     """(K,) index after the last frame."""
     evidence_s: Array
-    """(K,) evidence less the price of presence, in seconds in which all views see all
+    """(K,) evidence less the cost of presence, in seconds in which all views see all
     of a person."""
 
     def during(self, frame: int) -> Mask:
@@ -81,7 +81,7 @@ def weighed(
     skeleton: Skeleton,
     hypothesis: Index,
 ) -> tuple[Array, Array]:
-    """Weight of each detection of A people (A, J, V), and price of their presence (A,), as shares
+    """Weight of each detection of A people (A, J, V), and cost of their presence (A,), as shares
     of expected detections.
 
     `candidate` (A, J, V) are detections of one frame, -1 for none, `places` (A, J, 3) the joints,
@@ -91,7 +91,7 @@ def weighed(
     is assumed at the mean of the others.
     """
     (A, J), known = candidate.shape[:2], np.asarray(np.isfinite(places).all(axis=-1))
-    weight, price, limbs = np.zeros(candidate.shape), np.zeros(A), limbs_of(skeleton)
+    weight, cost, limbs = np.zeros(candidate.shape), np.zeros(A), limbs_of(skeleton)
     lists, tied = np.empty((3, candidate.size), dtype=np.intp), np.empty(candidate.size)
     room = np.empty((A, J, 3)), np.empty((3, A, J)), np.empty((A, 3)), np.zeros(A)
     _weigh(
@@ -105,15 +105,15 @@ def weighed(
         tied,
         *room,
         weight,
-        price,
+        cost,
     )
-    return weight, price
+    return weight, cost
 
 
 @kernel("i3 f3 b2 i1", FrameArrays, "i2 i2 f1 f3 f3 f2 f1 f3 f1")
 def _weigh(
     candidate, places, known, hypothesis, arrays, limbs, lists, tied, at, seen, box, expected,
-    weight, price
+    weight, cost
 ):  # fmt: skip
     """Fill in the results of `weighed`, zero before; `expected` (A,) counts the expected
     detections.
@@ -150,12 +150,12 @@ def _weigh(
                 hidden = not known[a, j] or _behind(
                     place, known, hypothesis, limbs, seen, box, focal
                 )
-                cost = _PRICE_HIDDEN if hidden else _PRICE
-                weight[a, j, v] *= 1 + cost
-                price[a] += cost
+                missing = _COST_HIDDEN if hidden else _COST
+                weight[a, j, v] *= 1 + missing
+                cost[a] += missing
                 expected[a] += 1
     for a in range(people):
-        price[a] /= max(expected[a], 1.0)
+        cost[a] /= max(expected[a], 1.0)
         for j in range(joints):
             for v in range(views):
                 weight[a, j, v] /= max(expected[a], 1.0)
@@ -218,15 +218,15 @@ def _behind(place, known, hypothesis, limbs, seen, box, focal):
     return False
 
 
-def own_evidence(candidate: Whole, weight: Real, price: Real) -> Array:
+def own_evidence(candidate: Whole, weight: Real, cost: Real) -> Array:
     """(A,) evidence of A people in a frame, per second; 1 if all of a person is seen.
 
-    Computed from detections `candidate` (A, J, V) with `weight` (A, J, V) and `price` (A,) of
+    Computed from detections `candidate` (A, J, V) with `weight` (A, J, V) and `cost` (A,) of
     `weighed`; detections that several people share are not evidence.
     """
     owners = np.bincount(candidate[candidate >= 0], minlength=1)
     own = (candidate >= 0) & (owners[np.maximum(candidate, 0)] == 1)
-    return np.where(own, weight, 0.0).sum(axis=(1, 2)) - price
+    return np.where(own, weight, 0.0).sum(axis=(1, 2)) - cost
 
 
 def probability(evidence: float) -> float:
@@ -246,8 +246,8 @@ class EvidenceTable:
     """(H, T, J V) index of each detection among those of all frames; one past the last for none."""
     weight: NDArray[np.float32]
     """(H, T, J V) weight of each detection."""
-    price: Array
-    """(H, T) price of presence."""
+    cost: Array
+    """(H, T) cost of presence."""
     there: Mask
     """(H, T) frames in which the hypothesis is followed."""
     lasts_s: Array
@@ -263,10 +263,10 @@ class EvidenceTable:
 
     @classmethod
     def of(
-        cls, candidate: Whole, weight: Real, price: Real, there: Mask, counts: Index, lasts_s: Array
+        cls, candidate: Whole, weight: Real, cost: Real, there: Mask, counts: Index, lasts_s: Array
     ) -> "EvidenceTable":
         """Build it from detections `candidate` (H, T, J, V), the number of detections per frame
-        `counts` (T,), and `weight` (H, T, J, V) and `price` (H, T) of `weighed`.
+        `counts` (T,), and `weight` (H, T, J, V) and `cost` (H, T) of `weighed`.
         """
         shape = (*there.shape, candidate[0, 0].size if there.size > 0 else 0)
         first, count = (np.cumsum(counts) - counts).astype(np.int32), int(counts.sum())
@@ -280,7 +280,7 @@ class EvidenceTable:
         return cls(
             place,
             weights,
-            np.asarray(price, dtype=np.float64),
+            np.asarray(cost, dtype=np.float64),
             there,
             lasts_s,
             count,
@@ -303,15 +303,15 @@ class EvidenceTable:
         person to another, always to the better visible one, beats either of the two, and leaves too
         little for the others.
         """
-        first, asked = np.zeros(len(hypothesis), dtype=bool), _ON_TRIAL if on_trial else 1.0
+        first, factor = np.zeros(len(hypothesis), dtype=bool), _ON_TRIAL if on_trial else 1.0
         if len(hypothesis) == 0:
             return [self.in_turn(first)]
-        segment, costs = np.zeros(3, dtype=np.intp), (asked * APPEARS_S, self.begins, self.ends)
+        segment, costs = np.zeros(3, dtype=np.intp), (factor * APPEARS_S, self.begins, self.ends)
         best_s = np.array([_best_segment(gains, *costs, 0, segment) for gains in self.unshared_s])
         bound = np.bincount(hypothesis, np.maximum(best_s, 0.0))
         tried = np.argsort(-bound, kind="stable")[:_MOST_HYPOTHESES]
         found = [
-            self.in_turn(each, asked) for each in (first, *(hypothesis == each for each in tried))
+            self.in_turn(each, factor) for each in (first, *(hypothesis == each for each in tried))
         ]
         return sorted(found, key=lambda each: -float(each.evidence_s.sum()))
 
@@ -339,7 +339,7 @@ class EvidenceTable:
     def unshared_s(self) -> Array:
         """(H, T) evidence of each hypothesis, seconds, as if there were no other."""
         share = self.weight.sum(axis=2, dtype=np.float64)
-        return np.where(self.there, (share - self.price) * self.lasts_s, -np.inf)
+        return np.where(self.there, (share - self.cost) * self.lasts_s, -np.inf)
 
     @cached_property
     def holders(self) -> tuple[Index, NDArray[np.int32], NDArray[np.float32]]:
@@ -356,10 +356,10 @@ class EvidenceTable:
         return begin[:-1], hypotheses, weights
 
     def in_turn(
-        self, first: Mask, asked: float = 1.0, besides: SelectedTracks | None = None
+        self, first: Mask, factor: float = 1.0, besides: SelectedTracks | None = None
     ) -> SelectedTracks:
         """Select tracks greedily, those in `first` (H,) with priority, while they have the minimum
-        evidence times `asked`.
+        evidence times `factor`.
 
         The tracks `besides` are selected before all and not returned; with them, births and deaths
         cost nothing.
@@ -367,9 +367,9 @@ class EvidenceTable:
         before = np.zeros((0, 3), dtype=np.intp)
         if besides is not None:
             before = np.column_stack([besides.hypothesis, besides.start, besides.stop])
-        appears_s = asked * APPEARS_S if besides is None else 0.0
+        appears_s = factor * APPEARS_S if besides is None else 0.0
         given = self.unshared_s.copy(), self.place, *self.holders, self.lasts_s, first, before
-        costs, (H, T) = (appears_s, self.begins, self.ends, asked * self.least_s), self.there.shape
+        costs, (H, T) = (appears_s, self.begins, self.ends, factor * self.least_s), self.there.shape
         free, changed = np.ones(self.detections, dtype=bool), np.ones(H, dtype=bool)
         room = np.empty((H, 3), dtype=np.intp), np.empty(H)
         chosen, evidence = np.empty((H * T, 3), dtype=np.intp), np.empty(H * T)

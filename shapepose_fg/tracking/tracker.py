@@ -200,8 +200,8 @@ class Tracker:
             people = find(detections.only(free), rig)
             own = np.where(people.candidate >= 0, np.append(rest, -1)[people.candidate], -1)
             twice = (own >= 0).sum(axis=2)[:, core] >= 2
-            apart = (mean_distance(people.initial, places) > _APART_M).all(axis=1)
-            new = apart & (twice.sum(axis=1) >= self.config.min_new_joints)
+            separate = (mean_distance(people.initial, places) > _APART_M).all(axis=1)
+            new = separate & (twice.sum(axis=1) >= self.config.min_new_joints)
             found.append(people.initial[new])
             detections_of.append(own[new])
             places = np.concatenate([places, people.initial[new]])

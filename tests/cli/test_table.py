@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from shapepose_fg.cli.batch.table import asked, read_table
+from shapepose_fg.cli.batch.table import options_of, read_table
 from shapepose_fg.core.errors import InputError
 
 
@@ -58,7 +58,7 @@ def test_defaults_hold_for_all_and_own_words_go_first(tmp_path):
         jump.request.skeleton == str(tmp_path / "ours.toml")
         and jump.request.project == tmp_path / "jump"
     )
-    assert asked(walk.request) == {
+    assert options_of(walk.request) == {
         "calibration": str(tmp_path / "cameras.toml"),
         "detections": str(tmp_path / "walk"),
         "fps": 25.0,

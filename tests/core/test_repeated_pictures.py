@@ -152,6 +152,6 @@ def test_a_camera_that_stands_still_from_the_first_frame_is_not_said_to_see_nobo
 
 
 def test_nobody_is_expected_where_there_is_no_picture(five_cameras):
-    dark = replace(five_cameras, dark=(1, 4))
+    dark = replace(five_cameras, excluded=(1, 4))
     assert (dark.image_sizes[[1, 4]] == 0).all()
     np.testing.assert_array_equal(dark.image_sizes[[0, 2, 3]], five_cameras.image_sizes[[0, 2, 3]])

@@ -71,7 +71,7 @@ def test_marginals_are_those_of_each_row_s_graph() -> None:
     window, _, start = frames()
     state = solved(window, start)
     marginals = window.covariances(state)
-    for at, one in window.apart(marginals)[::5]:
+    for at, one in window.split(marginals)[::5]:
         built = BodyGraph(one.window, one.state, widen=2.0).build()
         found = gtsam.Marginals(built.graph, built.values)
         for joint in range(0, 25, 6):

@@ -211,7 +211,7 @@ def test_joints_that_err_together_are_nearer_known_apart(people):
     together = distance(people, *hips)
     alone = sum(marginal(people, each).covariance for each in hips)
     assert np.trace(together.covariance) < 0.5 * np.trace(alone)
-    assert float(together.mean_m) == pytest.approx(np.linalg.norm(together.apart), rel=0.05)
+    assert float(together.mean_m) == pytest.approx(np.linalg.norm(together.displacement), rel=0.05)
 
 
 def test_every_joint_has_its_distance_to_a_point(people):

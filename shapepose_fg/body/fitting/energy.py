@@ -165,26 +165,26 @@ class BodyEnergy:
 
     def linearise(
         self, free: Array, targets: EnergyTargets, scale: Array | float, held: Held,
-        asked: Index | None = None, *, slope_only: bool = False,
+        keypoints: Index | None = None, *, slope_only: bool = False,
     ) -> Linear:  # fmt: skip
         """Linearise the energy at free parameters (B, P), with a scale of the robust kernel for all
         rows or each row (B,).
 
-        Systems include the Jacobian of the keypoints `asked` (B, N); None: of all.
+        Systems include the Jacobian of the keypoints `keypoints` (B, N); None: of all.
         """
         (B, P), K = free.shape, len(self.model.keypoint_names)
-        asked = np.broadcast_to(np.arange(K), (B, K)) if asked is None else asked
-        size = (0 if slope_only else B, P + 1 + 3 * asked.shape[1] + 10, P)
+        keypoints = np.broadcast_to(np.arange(K), (B, K)) if keypoints is None else keypoints
+        size = (0 if slope_only else B, P + 1 + 3 * keypoints.shape[1] + 10, P)
         linear = Linear(*map(np.empty, ((B,), (B, K, 3), (B, K), (B, P), size)))
         scales, work = _plain(np.broadcast_to(scale, (B,))), Work.of(self._limbs, P)
-        asked = np.require(asked, np.intp, ["C", "W"])
+        keypoints = np.require(keypoints, np.intp, ["C", "W"])
         linearised(
             self._limbs,
             self.priors,
             _plain(free),
             _rows(targets, held),
             scales,
-            asked,
+            keypoints,
             linear,
             work,
         )
@@ -196,10 +196,10 @@ class BodyEnergy:
         targets: EnergyTargets,
         scale: float,
         held: Held,
-        asked: Index | None = None,
+        keypoints: Index | None = None,
     ) -> Evaluated:
-        """Bodies at free parameters (B, P) with energy and step; `asked` as in `linearise`."""
-        linear = self.linearise(free, targets, scale, held, asked)
+        """Bodies at free parameters (B, P) with energy and step; `keypoints` as in `linearise`."""
+        linear = self.linearise(free, targets, scale, held, keypoints)
         step, left = np.empty(free.shape), np.empty(len(free))
         solved(linear.system, np.zeros(len(free)), step, left)
         return Evaluated(_plain(free).copy(), *linear, step, left)

@@ -87,13 +87,13 @@ class PosePrior:
         precision = np.linalg.inv(self.covariance[angles[:, None], angles])
         return np.asarray((precision + precision.T) / 2, dtype=np.float64)
 
-    def regression(self, given: Index, asked: Index) -> Array:
-        """Matrix G (M, A) that predicts angles `asked` (M,) from `given` ones (A,).
+    def regression(self, given: Index, predicted: Index) -> Array:
+        """Matrix G (M, A) that predicts angles `predicted` (M,) from `given` ones (A,).
 
         E[asked | given] = mean[asked] + G (given - mean[given]).
         """
         S = self.covariance
-        G = np.linalg.solve(S[given[:, None], given], S[given[:, None], asked])
+        G = np.linalg.solve(S[given[:, None], given], S[given[:, None], predicted])
         return np.asarray(G.T, dtype=np.float64)
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:

@@ -257,11 +257,11 @@ def _turned(priors, free, w):
 
 
 @part
-def _normal(priors, rows, b, asked, H, w):
+def _normal(priors, rows, b, keypoints, H, w):
     """Lower triangle of half the Gauss-Newton Hessian at the last `_slopes`, followed by the
-    gradient, the Jacobian of the points `asked`, and the unit vectors of the betas.
+    gradient, the Jacobian of the points `keypoints`, and the unit vectors of the betas.
     """
-    M, P, A, K, N = w.entry, len(w.gradient), len(priors.mean), len(w.squared), len(asked)
+    M, P, A, K, N = w.entry, len(w.gradient), len(priors.mean), len(w.squared), len(keypoints)
     for i in range(len(H)):
         for j in range(P):
             H[i, j] = 0.0
@@ -273,8 +273,8 @@ def _normal(priors, rows, b, asked, H, w):
             H[13 + i, 13 + j] = priors.precision[i, j]
     _copied(w.gradient, H[P])
     for n in range(N):
-        J, column = w.J[asked[n]], w.column[asked[n]]
-        for i in range(w.count[asked[n]]):
+        J, column = w.J[keypoints[n]], w.column[keypoints[n]]
+        for i in range(w.count[keypoints[n]]):
             for j in range(3):
                 H[P + 1 + 3 * n + j, column[i]] = J[j, i]
     for k in range(K):
@@ -297,9 +297,9 @@ def _normal(priors, rows, b, asked, H, w):
 
 
 @kernel(Limbs, Priors, "f2", Rows, "f1 i2", Linear, Work)
-def linearised(limbs, priors, free, rows, scale, asked, linear, w):
+def linearised(limbs, priors, free, rows, scale, keypoints, linear, w):
     """Linearise the energy of B rows at `free` (B, P), with a scale of the robust kernel per row,
-    `scale` (B,); systems include the points `asked` (B, N).
+    `scale` (B,); systems include the points `keypoints` (B, N).
     """
     A, g, pose = len(priors.mean), w.gradient, w.entry[0]
     for b in range(len(free)):
@@ -317,9 +317,9 @@ def linearised(limbs, priors, free, rows, scale, asked, linear, w):
             g[13 + i] = pull
             energy += pull * pose[i]
         for n in range(len(limbs.by_shape)):
-            away = x[n] - rows.betas[b, n]
-            g[n] = rows.stiffness[b] * away
-            energy += g[n] * away
+            deviation = x[n] - rows.betas[b, n]
+            g[n] = rows.stiffness[b] * deviation
+            energy += g[n] * deviation
         for k in range(len(w.squared)):
             M, r0, r1, r2 = rows.information[b, k], w.xyz[3 * k], w.xyz[3 * k + 1], w.xyz[3 * k + 2]
             r0, r1, r2 = r0 - rows.xyz[b, k, 0], r1 - rows.xyz[b, k, 1], r2 - rows.xyz[b, k, 2]
@@ -340,7 +340,7 @@ def linearised(limbs, priors, free, rows, scale, asked, linear, w):
             linear.xyz[b, i // 3, i % 3] = w.xyz[i]
         if len(linear.system) > 0:
             _slopes(limbs, w)
-            _normal(priors, rows, b, asked[b], linear.system[b], w)
+            _normal(priors, rows, b, keypoints[b], linear.system[b], w)
 
 
 @kernel(Limbs, "f4 f2 f2 f3 f4", Work)

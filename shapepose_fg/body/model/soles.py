@@ -62,10 +62,10 @@ def above_floor(model: BodyModel, bodies: Bodies, normal: Array, height_m: float
     # Bodies that stand upright and are not bent are lowest at the feet that were found.
     height = joints @ normal - height_m
     height[:, np.concatenate(_BONES)] = np.inf
-    asked = bends.any(axis=(1, 2)) | (height < _SKIN_M).any(axis=1)
+    uncertain = bends.any(axis=(1, 2)) | (height < _SKIN_M).any(axis=1)
     lowest = (low @ normal).min(axis=1)
-    lowest[asked] = _lowest(
-        model, (betas[asked], orient[asked], pose[asked], transl[asked]), normal
+    lowest[uncertain] = _lowest(
+        model, (betas[uncertain], orient[uncertain], pose[uncertain], transl[uncertain]), normal
     )
     sunk = np.maximum(height_m - SINK_M - lowest, 0.0)
     return betas, orient, pose, transl + sunk[:, None] * normal

@@ -19,7 +19,7 @@ from shapepose_fg.cameras.bundle import (
     Freedom,
     Steps,
     Undetermined,
-    apart,
+    differences,
     grown,
     halves,
     settle,
@@ -253,7 +253,7 @@ def _judged(
 ) -> Calibrated:
     """The validated result; raises Undetermined with the problems."""
     rig, people = adjusted.rig, adjusted.people
-    apart_deg, apart_m = apart(*rigs)
+    apart_deg, apart_m = differences(*rigs)
     counts = people.seen.any(axis=1).sum(axis=0)
     seen = np.bincount(footage.sightings.view, minlength=len(rig))
     held = float(np.nanmedian(missed)) if np.isfinite(missed).any() else np.nan

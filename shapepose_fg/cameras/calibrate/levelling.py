@@ -47,9 +47,9 @@ class Measured:
         """A note if the distance of the two cameras that are farthest apart would determine the
         scale clearly better than `sigma`.
         """
-        apart = np.linalg.norm(adjusted.rig.centres[:, None] - adjusted.rig.centres, axis=-1)
-        a, b = sorted(int(each) for each in np.unravel_index(apart.argmax(), apart.shape))
-        other = Measured(None, ((a, b, float(apart[a, b])),)).size_of(adjusted)[1]
+        distance_m = np.linalg.norm(adjusted.rig.centres[:, None] - adjusted.rig.centres, axis=-1)
+        a, b = sorted(int(each) for each in np.unravel_index(distance_m.argmax(), distance_m.shape))
+        other = Measured(None, ((a, b, float(distance_m[a, b])),)).size_of(adjusted)[1]
         if _CLEARLY * other > sigma:
             return ()
         one, two = (adjusted.rig.names[each] for each in (a, b))
@@ -70,11 +70,11 @@ class Measured:
         )
         sigma = np.empty(len(self.distances))
         for n, (a, b, _) in enumerate(self.distances):
-            away = rig.centres[a] - rig.centres[b]
-            length[n] = np.linalg.norm(away)
+            baseline = rig.centres[a] - rig.centres[b]
+            length[n] = np.linalg.norm(baseline)
             change = np.zeros((V, adjusted.covariance.shape[1]))
             for view, sign in ((a, 1.0), (b, -1.0)):
-                change[view, MOVE] = sign * rig.cameras[view].wTc[:3, :3].T @ away / length[n]
+                change[view, MOVE] = sign * rig.cameras[view].wTc[:3, :3].T @ baseline / length[n]
             variance = np.einsum("vq,vqwr,wr->", change, adjusted.covariance, change)
             sigma[n] = np.hypot(np.sqrt(max(variance, 0.0)) / length[n], _TAPE_M / metres[n])
         weight, logs = 1 / sigma**2, np.log(metres / length)
@@ -137,8 +137,8 @@ def levelled(rig: Rig, people: People, skeleton: Skeleton, sigma_scale: float) -
     names = [skeleton.joints[joint] for joint in skeleton.core]
     feet = [n for n, name in enumerate(names) if name.endswith("Ankle")]
     # With two views only, one ankle in fifty is 10 cm below the floor.
-    sure = (people.seen[:, feet].sum(axis=-1) >= min(3, len(rig))).all(axis=1)
-    ankles = people.points[sure][:, feet]
+    well_seen = (people.seen[:, feet].sum(axis=-1) >= min(3, len(rig))).all(axis=1)
+    ankles = people.points[well_seen][:, feet]
     floor: Floor | None = None
     for _ in range(2):
         height = ankles @ up

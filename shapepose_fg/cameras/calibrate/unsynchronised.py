@@ -73,7 +73,7 @@ def calibrate_unsynchronised(
             if refused.found is None:
                 raise
             found, problems = refused.found, refused.problems
-        offset, sigma, sure = offsets(
+        offset, sigma, prominence = offsets(
             sightings, found.rig, fps, frames, most_s, np.zeros(V), lambda *_: None
         )
         before, shift = shift, -offset * fps
@@ -82,7 +82,7 @@ def calibrate_unsynchronised(
     assert found is not None
     progress(total, total)
     none, middle = np.zeros(V), (frames.start + frames.stop) / 2 / fps
-    clocks = Synchronised(offset, sigma, sure, none, middle)
+    clocks = Synchronised(offset, sigma, prominence, none, middle)
     if problems := (*problems, *clocks.undetermined(rig)):
         raise Undetermined(problems, found)
     return found, clocks

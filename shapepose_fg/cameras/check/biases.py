@@ -73,8 +73,8 @@ class BiasedResiduals:
         """Build residuals from the arrays of `observed`. Robust weights use each residual's
         deviation from its median over the person's frames.
         """
-        structure, away = _with_biases(seen, views, person)
-        used = np.isfinite(away[..., 0])
+        structure, residual = _with_biases(seen, views, person)
+        used = np.isfinite(residual[..., 0])
         used &= used.sum(axis=-1, keepdims=True) >= 2
         weight = _INDEPENDENT * np.where(used, structure.weight, 0.0)
         points = np.where(used.any(axis=-1)[..., None], structure.points, 0.0)
@@ -233,12 +233,12 @@ def _with_biases(
     for _ in range(4):
         structure = triangulate(xy - lasting, confidence, size, views, 4)
         used = (structure.weight > 0) & np.isfinite(structure.miss_px) & (structure.depth > 0)
-        away = (xy - seen_by(structure.points, views)[0]) / scale
-        away[~used] = np.nan
+        residual = (xy - seen_by(structure.points, views)[0]) / scale
+        residual[~used] = np.nan
         for each in range(_count(person)):
             rows = person == each
-            lasting[rows] = median_over(away[rows]) * scale[rows]
-    return structure, away
+            lasting[rows] = median_over(residual[rows]) * scale[rows]
+    return structure, residual
 
 
 def without_biases(setup: SetupHypothesis) -> SetupHypothesis:

@@ -35,10 +35,10 @@ def duplicates(rig: Rig, evidence: Evidence) -> list[Finding]:
     spread = np.linalg.norm(rig.centres - rig.centres.mean(axis=0), axis=1).mean()
     findings = []
     for first, second in combinations(range(len(rig)), 2):
-        angle_deg, away = difference(rig.cTw[first], rig.cTw[second])
+        angle_deg, distance_m = difference(rig.cTw[first], rig.cTw[second])
         # Maximum differences of two equal poses, as a share of the cameras' mean distance and in
         # degrees; no two stands agree so well.
-        pose = away <= 0.002 * spread and angle_deg < 0.05 and len(rig) > 2
+        pose = distance_m <= 0.002 * spread and angle_deg < 0.05 and len(rig) > 2
         seen = _same_detections(evidence, rig, first, second)
         if pose or seen:
             same = "" if pose and seen else "pose" if pose else "detections"
@@ -197,7 +197,7 @@ def _without_mistakes(
     refined = replace(setup, views=problem.relaxed())
     remaining = lags(without_biases(refined))
     build = build_of(refined.structure()[1].points, detections.skeleton)
-    unlikely = sum(each.finding.sure for each in problem.causes if each.finding is not None)
+    unlikely = sum(each.finding.probability for each in problem.causes if each.finding is not None)
     odd = unlikely > _UNLIKELY or any(lag.exceeds(_NEARLY) for lag in remaining)
     if (
         odd
@@ -333,15 +333,17 @@ def _small_findings(problem: SmallErrors, known: set[int]) -> tuple[list[Finding
             (each.person, each.finding) for each in problem.causes if each.finding is not None
         ]
         of_cameras = [finding for person, finding in causes if person < 0]
-        p_camera = sum(each.sure for each in of_cameras)
-        p_none = 1 - sum(finding.sure for _, finding in causes)
+        p_camera = sum(each.probability for each in of_cameras)
+        p_none = 1 - sum(finding.probability for _, finding in causes)
         if p_camera > SURE * (1 - p_none) or p_none > 1 - SURE or len(biased) == _MOST_BIASED:
             break
         (person, bias), camera = next(each for each in causes if each[0] >= 0), one_of(of_cameras)
         instead = tuple(
-            each for each in (replace(camera, instead=()), *camera.instead) if each.sure > 1 - SURE
+            each
+            for each in (replace(camera, instead=()), *camera.instead)
+            if each.probability > 1 - SURE
         )
-        biased.append(replace(bias, sure=1 - p_camera - p_none, instead=instead))
+        biased.append(replace(bias, probability=1 - p_camera - p_none, instead=instead))
         problem = replace(problem, biased=(*problem.biased, (person, *bias.cameras)))
     of_cameras = [each for each in of_cameras if known.isdisjoint(each.cameras)]
     if p_camera <= max(SURE * (1 - p_none), p_none) or len(of_cameras) == 0:

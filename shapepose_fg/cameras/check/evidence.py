@@ -220,12 +220,12 @@ class SetupHypothesis:
         near = least_of_each(person, error)
         near = near[error[near] < 2 * GATE]
         person, sighting = person[near], sighting[near]
-        away = seen.xy[sighting] - camera.project(others.points[person])[0]
-        away /= seen.size_px[sighting][:, None, None]
+        residual = seen.xy[sighting] - camera.project(others.points[person])[0]
+        residual /= seen.size_px[sighting][:, None, None]
         identity = followed(others.frame, others.points)[person]
         for each in np.unique(identity).tolist():
-            away[identity == each] -= median_over(away[identity == each])
-        miss = np.linalg.norm(away, axis=-1)
+            residual[identity == each] -= median_over(residual[identity == each])
+        miss = np.linalg.norm(residual, axis=-1)
         left = np.maximum(1 - median_of(miss) / GATE, 0.0)
         return float(left.sum() / max(possible_matches(others.frame, seen.frame), 1))
 

@@ -45,9 +45,9 @@ def trust_of(
         )
         if given.cameras_used == 2 or len(views) >= given.cameras_used:  # the culprit is unknown
             return Trust(doubted=tuple((view, first, last) for view in range(given.view_count)))
-        sure = each.kind in (Kind.UNFIT, Kind.DUPLICATE)
+        always = each.kind in (Kind.UNFIT, Kind.DUPLICATE)
         wrong += [
-            (v, first, last) for v in views if sure or _worse(given, right, v, range(first, last))
+            (v, first, last) for v in views if always or _worse(given, right, v, range(first, last))
         ]
     seeing = set(np.unique(given.sightings.view).tolist())
     if doubted or (len(wrong) > 0 and len(seeing - {view for view, _, _ in wrong}) < 2):

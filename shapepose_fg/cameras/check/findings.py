@@ -59,7 +59,7 @@ class Finding:
     frames: tuple[int | None, int | None] = (None, None)
     """First affected frame, and the one after the last; None for the recording's
     beginning or end."""
-    sure: float = 1.0
+    probability: float = 1.0
     """Probability of this finding, against other mistakes and none."""
     joints: tuple[str, ...] = ()
     """The layout that fits people and the one used for reading; or the exchanged joints only, "" if
@@ -67,7 +67,7 @@ class Finding:
     same: str = ""
     """Which of "pose" and "detections" two cameras have in common; empty if both."""
     instead: "tuple[Finding, ...]" = ()
-    """Alternative findings, most probable first, with their probabilities as `sure`."""
+    """Alternative findings, most probable first, with their values of `probability`."""
 
 
 SURE = 0.95
@@ -78,24 +78,27 @@ def one_of(found: Sequence[Finding]) -> Finding:
     """The most probable of mutually exclusive findings; others that are not improbable become its
     alternatives.
     """
-    sure: dict[tuple[Kind, tuple[int, ...]], float] = {}
+    probability: dict[tuple[Kind, tuple[int, ...]], float] = {}
     first: dict[tuple[Kind, tuple[int, ...]], Finding] = {}
-    for each in sorted(found, key=lambda each: -each.sure):
+    for each in sorted(found, key=lambda each: -each.probability):
         what = each.kind, each.cameras
-        sure[what] = sure.get(what, 0.0) + each.sure
+        probability[what] = probability.get(what, 0.0) + each.probability
         first.setdefault(what, each)
     ranked = sorted(
-        (replace(first[what], sure=p) for what, p in sure.items()), key=lambda each: -each.sure
+        (replace(first[what], probability=p) for what, p in probability.items()),
+        key=lambda each: -each.probability,
     )
-    return replace(ranked[0], instead=tuple(each for each in ranked[1:] if each.sure >= 1 - SURE))
+    return replace(
+        ranked[0], instead=tuple(each for each in ranked[1:] if each.probability >= 1 - SURE)
+    )
 
 
 def sentence(finding: Finding, rig: Rig) -> str:
     """The finding as a sentence, with its alternatives."""
     text = _words(finding, rig)
-    text += f" (probability {finding.sure:.2f})" if finding.sure < SURE else ""
+    text += f" (probability {finding.probability:.2f})" if finding.probability < SURE else ""
     for each in finding.instead:
-        text += f"; or {_words(each, rig).split(';')[0]} ({each.sure:.2f})"
+        text += f"; or {_words(each, rig).split(';')[0]} ({each.probability:.2f})"
     return text if text.startswith(rig.names) else f"{text[0].upper()}{text[1:]}"
 
 

@@ -137,7 +137,7 @@ def _likeliest(setup: SetupHypothesis, found: list[tuple[float, Change]]) -> Cha
     )
     weights = np.exp(gains - gains.max()) / np.exp(gains - gains.max()).sum()
     changes = [
-        replace(change, finding=replace(change.finding, sure=float(weight)))
+        replace(change, finding=replace(change.finding, probability=float(weight)))
         for weight, (_, change) in sorted(
             zip(weights, found, strict=True), key=lambda each: -each[0]
         )
@@ -166,16 +166,18 @@ def _likeliest(setup: SetupHypothesis, found: list[tuple[float, Change]]) -> Cha
         for each in causes
         if each.finding is not None and each.person < 0
     ]
-    p_mistake = sum(finding.sure for finding, _ in mistakes)
+    p_mistake = sum(finding.probability for finding, _ in mistakes)
     if p_mistake < SURE:
         return _likeliest(
             setup, [each for each in found if each[1].finding.cameras != best.finding.cameras]
         )
     if best.fitted is not None:
-        share = sum(each.finding.sure for each in rivals) / p_mistake
+        share = sum(each.finding.probability for each in rivals) / p_mistake
         fitted = [
             replace(
-                best, finding=replace(f, sure=f.sure * share), setup=replace(setup, views=views)
+                best,
+                finding=replace(f, probability=f.probability * share),
+                setup=replace(setup, views=views),
             )
             for f, views in mistakes
         ]

@@ -137,8 +137,8 @@ def _other_layout(people: Array, skeleton: Skeleton) -> str | None:
         if each.keypoint_count == len(own) and keypoint_names(each) != own:
             more = fit_of_order(people, keypoint_names(each)) - found
             more = more[np.isfinite(more)]
-            sure = len(more) >= MIN_SIGHTINGS and (more > 0).mean() > _SHARE
-            if sure and more.mean() > gain and np.nanmean(found) + more.mean() > LIKE_A_BODY:
+            significant = len(more) >= MIN_SIGHTINGS and (more > 0).mean() > _SHARE
+            if significant and more.mean() > gain and np.nanmean(found) + more.mean() > LIKE_A_BODY:
                 best, gain = each.name, float(more.mean())
     return best
 

@@ -350,11 +350,11 @@ def camera_use(
     if table is None:
         return []
     trust = trust_in(detections)
-    offered, dark = (np.zeros(len(rig), dtype=np.int64) for _ in range(2))
+    offered, excluded = (np.zeros(len(rig), dtype=np.int64) for _ in range(2))
     for frame in frames:
         count = np.bincount(detections[frame].view, minlength=len(rig))
         offered += count
-        dark[list(trust.dark(frame))] += count[list(trust.dark(frame))]
+        excluded[list(trust.excluded(frame))] += count[list(trust.excluded(frame))]
     depth = np.moveaxis(rig.project(people.joints)[1], 0, 2)
     px = np.linalg.norm(table.residual_px.astype(np.float64), axis=-1)
     mm = 1e3 * px * depth / rig.focal_px
@@ -368,7 +368,7 @@ def camera_use(
             Distances.of(px[..., view], mm[..., view]),
             Distances.of(px[..., view][used[..., view]], mm[..., view][used[..., view]]),
             Distances.of(out_px[..., view], out_mm[..., view]),
-            _reasons(table.gate[..., view], int(offered[view]), int(dark[view])),
+            _reasons(table.gate[..., view], int(offered[view]), int(excluded[view])),
         )
         for view, name in enumerate(rig.names)
     ]
@@ -378,10 +378,10 @@ LEFT_OUT, NOBODY = "are left out with the camera", "are not assigned to any pers
 """Reasons why detections were not assigned."""
 
 
-def _reasons(gate: NDArray[np.uint8], offered: int, dark: int) -> dict[str, int]:
+def _reasons(gate: NDArray[np.uint8], offered: int, excluded: int) -> dict[str, int]:
     """Numbers of a camera's unused detections by reason, without zeros."""
     given = int((gate != Gate.NOT_SEEN).sum())
-    counts = {LEFT_OUT: dark, NOBODY: max(offered - given - dark, 0)}
+    counts = {LEFT_OUT: excluded, NOBODY: max(offered - given - excluded, 0)}
     counts |= {words: int((gate == each).sum()) for each, words in _REASONS.items()}
     return {words: count for words, count in counts.items() if count > 0}
 

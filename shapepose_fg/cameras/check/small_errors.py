@@ -280,10 +280,13 @@ def probable(causes: list[ErrorCause]) -> list[ErrorCause]:
     total = np.logaddexp.reduce([each.log for each in causes])
     ranked = list[ErrorCause]()
     for each in sorted(causes, key=lambda each: -each.log):
-        sure = float(np.exp(each.log - total))
+        probability = float(np.exp(each.log - total))
         ranked.append(
             replace(
-                each, finding=None if each.finding is None else replace(each.finding, sure=sure)
+                each,
+                finding=None
+                if each.finding is None
+                else replace(each.finding, probability=probability),
             )
         )
     return ranked

@@ -63,39 +63,39 @@ def offsets_without_poses(
             curves[b, a] = curves[a, b][::-1]
     fits = dict[tuple[int, int, int], float]()
 
-    def fit(a: int, b: int, apart: int) -> float:
-        """Score of the relative pose of two cameras, one of them `apart` steps later."""
-        if (a, b, apart) not in fits:
-            moved = replace(tracks[b], frame=tracks[b].frame - apart * step)
+    def fit(a: int, b: int, lag: int) -> float:
+        """Score of the relative pose of two cameras, one of them `lag` steps later."""
+        if (a, b, lag) not in fits:
+            moved = replace(tracks[b], frame=tracks[b].frame - lag * step)
             found = relative(tracks[a], moved, fps)
-            fits[a, b, apart] = (
+            fits[a, b, lag] = (
                 0.0 if found is None else found.score * min(1.0, found.seconds / _FITS_S)
             )
-        return fits[a, b, apart]
+        return fits[a, b, lag]
 
     groups = [{view: 0} for view in range(len(tracks))]
     while len(groups) > 1:
         offers = [
-            (prominence, one, other, apart)
+            (prominence, one, other, lag)
             for one, other in combinations(range(len(groups)), 2)
-            for prominence, apart in _peaks(
+            for prominence, lag in _peaks(
                 groups[one], groups[other], curves, most, round(_AROUND_S * fps / step)
             )
         ]
         best = (-1.0, 0, 1, 0)
-        for prominence, one, other, apart in sorted(offers, reverse=True):
+        for prominence, one, other, lag in sorted(offers, reverse=True):
             pairs = [
-                (a, b, apart + groups[other][b] - groups[one][a])
+                (a, b, lag + groups[other][b] - groups[one][a])
                 for a in groups[one]
                 for b in groups[other]
             ]
             pairs.sort(key=lambda pair: -curves[pair[:2]][np.clip(pair[2] + most, 0, 2 * most)])
             merit = prominence * float(np.mean([fit(*pair) for pair in pairs[:_PAIRS]]))
-            best = max(best, (merit, one, other, apart))
+            best = max(best, (merit, one, other, lag))
             if merit > _SURE:
                 break
-        _, one, other, apart = best
-        groups[one] |= {view: at + apart for view, at in groups[other].items()}
+        _, one, other, lag = best
+        groups[one] |= {view: at + lag for view, at in groups[other].items()}
         del groups[other]
         advance()
     shift = np.array([groups[0][view] for view in range(len(tracks))])
@@ -149,19 +149,19 @@ def _add_likeness(
     """
     for begin_one, one in a:
         for begin_other, other in b:
-            apart = np.arange(1 - len(one), len(other))
-            size = next_fast_len(len(apart), real=True)
+            lag = np.arange(1 - len(one), len(other))
+            size = next_fast_len(len(lag), real=True)
             waves = np.fft.rfft(other, size, axis=0) * np.fft.rfft(one[::-1], size, axis=0)
-            dots = np.fft.irfft(waves.sum(axis=1), size)[: len(apart)]
-            start, stop = np.maximum(0, -apart), np.minimum(len(one), len(other) - apart)
+            dots = np.fft.irfft(waves.sum(axis=1), size)[: len(lag)]
+            start, stop = np.maximum(0, -lag), np.minimum(len(one), len(other) - lag)
             power, power_other = (
                 np.append(0.0, np.cumsum((each**2).sum(axis=1))) for each in (one, other)
             )
             energy = (power[stop] - power[start]) * (
-                power_other[stop + apart] - power_other[start + apart]
+                power_other[stop + lag] - power_other[start + lag]
             )
             square = dots**2 / np.maximum(energy, 1e-12)
-            place = begin_other - begin_one + apart + len(significance) // 2
+            place = begin_other - begin_one + lag + len(significance) // 2
             significant = (stop - start >= least) & (dots > 0) & (square > _LEAST_ALIKE**2)
             significant &= (place >= 0) & (place < len(significance))
             significance[place[significant]] -= (stop - start)[significant] * np.log(

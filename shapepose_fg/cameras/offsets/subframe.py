@@ -181,9 +181,9 @@ class InSpace:
             shift[1:] -= np.clip(inverse @ (late - late[0])[1:], -1.0, 1.0)
             late, errors = self.all_late(shift)
         known = np.isfinite(errors[0]) & np.isfinite(errors[0, 0])
-        apart = inverse @ np.where(known, errors - errors[:, :1], 0.0)[:, 1:].T
+        relative = inverse @ np.where(known, errors - errors[:, :1], 0.0)[:, 1:].T
         covariance = np.zeros((V, V))
-        covariance[1:, 1:] = apart @ apart.T + np.diag(np.where(known[1:], 0.0, np.inf))
+        covariance[1:, 1:] = relative @ relative.T + np.diag(np.where(known[1:], 0.0, np.inf))
         return shift - shift[0], covariance
 
     def all_late(self, shift: Array) -> tuple[Array, Array]:
@@ -208,11 +208,11 @@ class InSpace:
         """(P, J, 3) velocities of joints at `points`, metres per frame, from changes of directions
         (P, J, V, 3).
         """
-        away = points[:, :, None] - centres_of(self.views)
-        far = np.linalg.norm(away, axis=-1)[..., None]
-        across = (np.eye(3) - (away / far)[..., :, None] * (away / far)[..., None, :]) / far[
-            ..., None
-        ] ** 2
+        from_camera = points[:, :, None] - centres_of(self.views)
+        far = np.linalg.norm(from_camera, axis=-1)[..., None]
+        across = (
+            np.eye(3) - (from_camera / far)[..., :, None] * (from_camera / far)[..., None, :]
+        ) / far[..., None] ** 2
         known = np.isfinite(speed) & np.isfinite(far)
         A = np.where(known[..., :1, None], across, 0.0).sum(axis=2)
         b = np.where(known, speed / far, 0.0).sum(axis=2)
@@ -236,10 +236,12 @@ class InSpace:
         xy[:, :, view] = np.nan
         seen = np.isfinite(xy[..., 0])
         placed = triangulate(xy, seen.astype(float), size * self.views.focal_px, self.views, 3)
-        away = placed.points - centres_of(self.views)[view]
+        from_camera = placed.points - centres_of(self.views)[view]
         miss = np.where(seen, placed.miss_px / (size * self.views.focal_px)[:, None], 0.0)
         good = ((seen.sum(axis=-1) >= 2) & (miss.max(axis=-1) < GATE / 2))[..., None]
-        directions = np.where(good, away / np.linalg.norm(away, axis=-1, keepdims=True), np.nan)
+        directions = np.where(
+            good, from_camera / np.linalg.norm(from_camera, axis=-1, keepdims=True), np.nan
+        )
         moving = self._moving(placed.points, np.where(seen[..., None], speed, np.nan))
         predicted = _across(placed.points, moving, centres_of(self.views)[view])
         order = np.lexsort((self.time, self.member[:, view]))
@@ -268,8 +270,10 @@ class InSpace:
         score, gains = np.bincount(each.reshape(-1), score), np.bincount(each.reshape(-1), gains)
         late, trust = score.sum() / gain, np.ones(len(score))
         for _ in range(10):  # reweighted mean
-            away = np.abs(score - late * gains) / np.sqrt(np.maximum(gains, 1e-12))
-            trust = 1 / (1 + (away / (2.0 * max(1.5 * float(np.median(away)), 1e-12))) ** 2)
+            from_camera = np.abs(score - late * gains) / np.sqrt(np.maximum(gains, 1e-12))
+            trust = 1 / (
+                1 + (from_camera / (2.0 * max(1.5 * float(np.median(from_camera)), 1e-12))) ** 2
+            )
             late = (trust * score).sum() / (trust * gains).sum()
         gains *= trust
         part = np.bincount(when, gains, blocks) / gains.sum()
@@ -280,9 +284,11 @@ class InSpace:
 
 def _across(points: Array, moving: Array, centre: Array) -> Array:
     """(..., 3) change of the directions from `centre` to points that move with `moving`."""
-    away = points - centre
-    far = np.linalg.norm(away, axis=-1, keepdims=True)
-    return (moving - (moving * away).sum(axis=-1, keepdims=True) * away / far**2) / far
+    from_camera = points - centre
+    far = np.linalg.norm(from_camera, axis=-1, keepdims=True)
+    return (
+        moving - (moving * from_camera).sum(axis=-1, keepdims=True) * from_camera / far**2
+    ) / far
 
 
 def _pixels(rays: Array, camera: Array) -> Array:

@@ -73,7 +73,7 @@ def _run(
     of = status_of(entries, output, resume=running.resume, restart=running.restart)
     batch_status = BatchStatus(output / BATCH, str(table), of)
     todo = [entry for entry in entries if batch_status.of[entry.name].status == "waiting"]
-    sizes = look_at_all(table, todo, output, begun=running.resume or running.restart)
+    sizes = look_at_all(table, todo, output, continued=running.resume or running.restart)
     if len(todo) > 0:
         with ExitStack() as opened:
             is_local = running.cluster in (None, "local")
@@ -120,7 +120,7 @@ def status_of(
     restarted from the beginning.
     """
     from shapepose_fg.cli.batch.status import RecordingStatus, read_status
-    from shapepose_fg.cli.batch.table import asked
+    from shapepose_fg.cli.batch.table import options_of
 
     file = output / BATCH
     if file.exists() and not (resume or restart):
@@ -133,7 +133,7 @@ def status_of(
     before = read_status(file) if resume and file.exists() else {}
     found: dict[str, RecordingStatus] = {}
     for entry in entries:
-        wanted = asked(entry.request)
+        wanted = options_of(entry.request)
         old = before.get(entry.name, RecordingStatus(wanted, anew=restart))
         finished = all((output / entry.name / name).is_file() for name in (PEOPLE, RUN_FILE))
         changed = old.asked != wanted

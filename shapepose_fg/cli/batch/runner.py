@@ -253,19 +253,19 @@ def _lead(assignment: Assignment) -> Ended | str:
 
 
 def look_at_all(
-    table: Path, entries: Sequence[Entry], output: Path, *, begun: bool
+    table: Path, entries: Sequence[Entry], output: Path, *, continued: bool
 ) -> dict[str, int]:
     """Check the inputs and output folders of all recordings; returns the size of each one's
     detections, bytes.
 
-    `begun` means that interrupted runs in the folders will be continued or removed. InputError if
-    an input is missing or wrong, if existing results are in the way (it describes the first such
+    `continued` means that interrupted runs in the folders will be continued or removed. InputError
+    if an input is missing or wrong, if existing results are in the way (it describes the first such
     recording and names others), or if the disk of `output` has too little space.
     """
     sizes, problems = {}, []
     for entry in entries:
         try:
-            sizes[entry.name] = _look_at(entry, output / entry.name, begun)
+            sizes[entry.name] = _look_at(entry, output / entry.name, continued)
         except InputError as error:
             problems.append(f"recording {entry.name}: {error}")
     if len(problems) > 0:
@@ -289,30 +289,30 @@ def look_at_all(
     return sizes
 
 
-def _look_at(entry: Entry, folder: Path, begun: bool) -> int:
+def _look_at(entry: Entry, folder: Path, continued: bool) -> int:
     """Check one recording; returns the size of its detections, bytes."""
     known = prepare(entry.request, folder, notify=lambda *_: None)
-    asked = known.request
-    _, places, _ = find_places(known.detections, asked.rig())
-    find_skeleton(asked.skeleton)
+    request = known.request
+    _, places, _ = find_places(known.detections, request.rig())
+    find_skeleton(request.skeleton)
     source = known.settings().offsets.source
     for file in (
-        asked.body,
-        asked.timestamps,
+        request.body,
+        request.timestamps,
         None if source in ("recording", "none") else Path(source),
     ):
         if file is not None:
             open_regular(file).close()
-    if asked.shapes is not None:
-        prepare_output(asked.shapes.parent, [asked.shapes.name])
+    if request.shapes is not None:
+        prepare_output(request.shapes.parent, [request.shapes.name])
     prepare_output(folder, (*OUTPUTS, LOG))
     refuse_corrected(folder)
-    if (folder / PARTS).exists() and not begun:
+    if (folder / PARTS).exists() and not continued:
         raise InputError(
             f"{folder / PARTS}: there is an interrupted run; continue with --resume, or start "
             "again with --restart"
         )
-    if (folder / PEOPLE).exists() and not begun:
+    if (folder / PEOPLE).exists() and not continued:
         raise InputError(f"{folder}: there is a finished result; move it, or give another --output")
     files = (file for path in places for file in (files_below(path) if path.is_dir() else (path,)))
     return sum(file.stat().st_size for file in files if file.is_file())

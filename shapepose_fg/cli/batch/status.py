@@ -28,7 +28,7 @@ class RecordingStatus:
     """The status of one recording."""
 
     asked: dict[str, Any]
-    """The options that differ from the defaults (`table.asked`)."""
+    """The options that differ from the defaults (`table.options_of`)."""
     status: Literal["waiting", "done", "failed"] = "waiting"
     """`failed`: it failed twice, or a recording on which it depends failed."""
     attempts: int = 0

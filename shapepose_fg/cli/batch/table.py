@@ -147,7 +147,7 @@ def _in_turn(entries: list[Entry], path: Path) -> list[Entry]:
     return found
 
 
-def asked(request: Request) -> dict[str, Any]:
+def options_of(request: Request) -> dict[str, Any]:
     """The options as plain values, which are equal for equal requests."""
     usual = vars(Request())
     given = {name: value for name, value in vars(request).items() if value != usual[name]}

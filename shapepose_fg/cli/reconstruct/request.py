@@ -134,30 +134,32 @@ class Prepared:
         from shapepose_fg.io.config import read_config
         from shapepose_fg.pipeline.config import PipelineConfig
 
-        asked = self.request
-        if asked.config is not None and asked.preset is not None:
+        request = self.request
+        if request.config is not None and request.preset is not None:
             cure = (
-                f"`shapepose-fg config --preset {asked.preset}` writes its settings into a file "
+                f"`shapepose-fg config --preset {request.preset}` writes its settings into a file "
                 "to edit"
             )
             raise InputError(
-                f"--preset {asked.preset} and --config {asked.config}: settings come from one of "
-                f"them; {cure}"
+                f"--preset {request.preset} and --config {request.config}: settings come from one "
+                f"of them; {cure}"
             )
-        preset = Preset.ACCURATE if asked.preset is None else asked.preset
+        preset = Preset.ACCURATE if request.preset is None else request.preset
         found = (
-            preset.settings() if asked.config is None else read_config(asked.config, PipelineConfig)
+            preset.settings()
+            if request.config is None
+            else read_config(request.config, PipelineConfig)
         )
-        found = found if asked.temporal is None else replace(found, temporal=asked.temporal)
-        if asked.shapes is not None and not found.temporal:
+        found = found if request.temporal is None else replace(found, temporal=request.temporal)
+        if request.shapes is not None and not found.temporal:
             raise InputError(
                 "--shapes: shapes need people over time; leave out --no-temporal, or --shapes"
             )
-        if asked.chunk_frames is not None and not (
-            found.temporal and asked.chunk_frames >= found.batch_frames
+        if request.chunk_frames is not None and not (
+            found.temporal and request.chunk_frames >= found.batch_frames
         ):
             raise InputError(
-                f"--chunk-frames {asked.chunk_frames}: must be {found.batch_frames} "
+                f"--chunk-frames {request.chunk_frames}: must be {found.batch_frames} "
                 "(batch_frames) or more, and people over time are needed"
             )
         if self.project is not None and not found.temporal:

@@ -86,30 +86,34 @@ def carry_out(
     settings = known.settings()  # report wrong settings before the whole recording is read
     with only_run_in(output, OUTPUTS), _recording_folder(inside(output, ".detections")) as kept:
         known = _synchronised(known, kept=resume and (output / manifest.PARTS).is_dir())
-        asked = known.request
-        poses = [Path(each.partition("=")[2]) for each in asked.trajectory or ()]
-        files = (known.calibration, asked.config, asked.body, asked.timestamps, *poses)
+        request = known.request
+        poses = [Path(each.partition("=")[2]) for each in request.trajectory or ()]
+        files = (known.calibration, request.config, request.body, request.timestamps, *poses)
         reading = ReadInputs((*files, known.detections))
-        rig, own = asked.rig(), output / CAMERAS
-        if (asked.cameras or asked.without) and own.exists() and own.samefile(known.calibration):
+        rig, own = request.rig(), output / CAMERAS
+        if (
+            (request.cameras or request.without)
+            and own.exists()
+            and own.samefile(known.calibration)
+        ):
             raise InputError(
                 f"{own}: the result would replace this file by fewer cameras; copy it first"
             )
         recording, times = read_recording(
-            known.detections, rig, known.skeleton, kept, asked.fps, asked.timestamps
+            known.detections, rig, known.skeleton, kept, request.fps, request.timestamps
         )
         note_of_reading(*recording.notes)
         count = len(recording)
         span, cuts = known.span(count, recording.first), known.cuts(count)
-        execution = replace(execution, chunk_frames=asked.chunk_frames).with_workers(len(span))
+        execution = replace(execution, chunk_frames=request.chunk_frames).with_workers(len(span))
         fitter = None
-        if asked.body is not None:
-            model = BodyModel.load(asked.body).with_keypoints(recording.skeleton.joints)
+        if request.body is not None:
+            model = BodyModel.load(request.body).with_keypoints(recording.skeleton.joints)
             fitter = make_fitter(settings.body, model)
             if fitter.weights is None and settings.body.method != "plain":
-                cure = f"shapepose-fg train-fitter {shlex.join(['--body', str(asked.body)])}"
+                cure = f"shapepose-fg train-fitter {shlex.join(['--body', str(request.body)])}"
                 note(
-                    f"{asked.body}: bodies are fitted by the plain optimiser; {cure} trains a "
+                    f"{request.body}: bodies are fitted by the plain optimiser; {cure} trains a "
                     "better fitter, once"
                 )
         task = Task(recording, rig, settings, span, times, cuts, fitter=fitter)
@@ -122,7 +126,7 @@ def carry_out(
             inputs |= checksums([fitter.weights.file])
         del reading  # it is large for half a million files
         note(*_about_moving(task))
-        report = check_setup(known, task) if asked.check and not rig.moves else None
+        report = check_setup(known, task) if request.check and not rig.moves else None
         task = (
             task if report is None else replace(task, detections=Trusted(recording, report.trust))
         )
@@ -135,17 +139,17 @@ def _synchronised(known: Prepared, *, kept: bool) -> Prepared:
     """The request with synchronised.csv as its times: start times of cameras that were started by
     hand, estimated from people. With `kept`, for a resumed run, an existing file is used.
     """
-    asked, file = known.request, known.output / CLOCKS
-    if not asked.synchronise:
+    request, file = known.request, known.output / CLOCKS
+    if not request.synchronise:
         return known
     if not (kept and file.is_file()):
-        rig = asked.still_rig("--synchronise")
-        found, taken_s = found_clocks(known.detections, rig, known.skeleton, asked.fps, MOST_S)
+        rig = request.still_rig("--synchronise")
+        found, taken_s = found_clocks(known.detections, rig, known.skeleton, request.fps, MOST_S)
         show_clocks(found, rig)
         if problems := found.undetermined(rig):
             raise InputError(f"--synchronise: {'; '.join(problems)}")
         write_timestamps(file, rig.names, taken_s)
-    return replace(known, request=replace(asked, fps=None, timestamps=file))
+    return replace(known, request=replace(request, fps=None, timestamps=file))
 
 
 def _about_moving(task: Task) -> list[str]:
@@ -213,11 +217,11 @@ class _Run:
     report: SetupReport | None
     """Problems of cameras and detections; None if they were not checked."""
 
-    def begun(self) -> dict[str, Any]:
+    def run_inputs(self) -> dict[str, Any]:
         """Everything on which the result depends, as plain values, which are equal in a resumed
         run.
         """
-        task, asked, skeleton = self.task, self.known.request, self.recording.skeleton
+        task, request, skeleton = self.task, self.known.request, self.recording.skeleton
         frames, times, cuts = task.whole()
         return {
             "cameras": _digest(asdict(replace(task.rig, notes=()))),
@@ -228,8 +232,8 @@ class _Run:
             "cuts": cuts,
             "trust": asdict(trust_in(task.detections)),
             "chunk_frames": self.execution.chunk_frames,
-            "body": None if asked.body is None else str(asked.body),
-            "shapes": None if asked.shapes is None else str(asked.shapes),
+            "body": None if request.body is None else str(request.body),
+            "shapes": None if request.shapes is None else str(request.shapes),
             "skeleton": {"name": skeleton.name, "sha256": _digest(asdict(skeleton))},
             "versions": versions(),
             "program": program_digest(),
@@ -246,7 +250,7 @@ class _Run:
             manifest.check_room(output, needed)
             if resume:
                 note(f"{output}: there is no run to resume; a new one is started")
-        kept = manifest.open_run(output, self.begun(), resume=resume, restart=restart)
+        kept = manifest.open_run(output, self.run_inputs(), resume=resume, restart=restart)
         try:
             # All saved parts may be intact and still be inconsistent with each other.
             with naming(kept.folder, ANEW) if resume else nullcontext():
@@ -260,16 +264,16 @@ class _Run:
 
     def _finished(self, kept: InFolder) -> Ended:
         """Assemble the reconstruction, write its files, and return its summary."""
-        asked, output, rig, frames = (
+        request, output, rig, frames = (
             self.known.request,
             self.known.output,
             self.task.rig,
             self.task.keyframes().tolist(),
         )
-        file, inputs = asked.shapes, dict(self.inputs)
+        file, inputs = request.shapes, dict(self.inputs)
         known = None
         if file is not None:
-            known = manifest.people_at_start(kept, file, lambda: _known_people(file, asked.body))
+            known = manifest.people_at_start(kept, file, lambda: _known_people(file, request.body))
         start = time.perf_counter()
         callback = self.execution.progress
         task = replace(self.task, shapes=known)
@@ -279,7 +283,7 @@ class _Run:
         if file is not None and known is not None and len(known) > 0:
             inputs[str(file)] = manifest.checksum_at_start(kept)
         about = {"inputs": inputs, "notes": [*rig.notes, *self.recording.notes]}
-        about |= {"body": None if asked.body is None else asked.body.resolve()}
+        about |= {"body": None if request.body is None else request.body.resolve()}
         about |= {} if self.recording.first == 0 else {"numbered_from": self.recording.first}
         about |= {} if self.known.project is None else {"project": self.known.project.name}
         result = result.with_run(**about)

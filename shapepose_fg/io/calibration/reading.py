@@ -73,9 +73,9 @@ def read_rig(
     unwanted = [camera.name for camera in written.cameras if camera.name not in wanted]
     one = len(unwanted) == 1
     which = f"camera {listing(unwanted)} is" if one else f"cameras {listing(unwanted)} are"
-    asked = [f"{which} left out as requested"] if unwanted else []
+    requested = [f"{which} left out as requested"] if unwanted else []
     kept = [camera for camera in written.cameras if camera.name in wanted]
-    written = replace(written, cameras=kept, notes=[*written.notes, *asked])
+    written = replace(written, cameras=kept, notes=[*written.notes, *requested])
     up, unit = up or written.up, unit or written.unit
     sizes_missing = any(camera.image_size is None for camera in written.cameras)
     if image_size is not None and not sizes_missing:

@@ -126,10 +126,10 @@ def motion_of(take: Take, person: int, arrays: SmplArrays, axes: Array) -> Skinn
     motion = SkinnedMotion(RestBody(arrays, betas.mean(axis=0)), index, quaternions, pelvis)
     if (betas == betas[0]).all():
         return motion
-    apart = np.linalg.norm(
+    change_m = np.linalg.norm(
         pose_joints(_offsets(own), quaternions, pelvis) - motion.joints(), axis=-1
     )
-    return replace(motion, spread_m=float(apart.max()))
+    return replace(motion, spread_m=float(change_m.max()))
 
 
 def everybody(

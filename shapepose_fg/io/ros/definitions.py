@@ -88,9 +88,9 @@ def definition(name: str) -> str:
         inner = (field.split()[0].partition("[")[0] for field in FIELDS[each].split(";"))
         order += [other for other in inner if other in FIELDS and other not in order]
     texts = ["\n".join(field.strip() for field in FIELDS[each].split(";")) + "\n" for each in order]
-    apart = "=" * 80 + "\n"
+    separator = "=" * 80 + "\n"
     return texts[0] + "".join(
-        f"{apart}MSG: {each}\n{text}" for each, text in zip(order[1:], texts[1:], strict=True)
+        f"{separator}MSG: {each}\n{text}" for each, text in zip(order[1:], texts[1:], strict=True)
     )
 
 

@@ -152,9 +152,13 @@ def _alike(a: Border, b: Border) -> float:
     if count > 0:
         share = int(((detections_a == detections_b) & (detections_a >= 0)).sum()) / count
         return 1.0 + share if share >= _SAME else 0.0
-    apart = np.linalg.norm(a.place[first] - b.place[second], axis=-1)
-    apart = apart[np.isfinite(apart)]
-    return 1.0 - float(apart.mean()) / _NEAR_M if len(apart) > 0 and apart.mean() < _NEAR_M else 0.0
+    distance_m = np.linalg.norm(a.place[first] - b.place[second], axis=-1)
+    distance_m = distance_m[np.isfinite(distance_m)]
+    return (
+        1.0 - float(distance_m.mean()) / _NEAR_M
+        if len(distance_m) > 0 and distance_m.mean() < _NEAR_M
+        else 0.0
+    )
 
 
 class Identities:

@@ -35,11 +35,11 @@ _WORDS = {"program": "version of this program", "cameras": "set of cameras", "sk
 
 
 def open_run(
-    output: Path, begun: dict[str, Any], *, resume: bool = False, restart: bool = False
+    output: Path, inputs: dict[str, Any], *, resume: bool = False, restart: bool = False
 ) -> InFolder:
     """Open the folder of a run that writes its results into `output`.
 
-    `begun` are the inputs of the run, plain values. With `resume` it is the folder of the
+    `inputs` are the inputs of the run, plain values. With `resume` it is the folder of the
     interrupted run; with `restart`, the files of an interrupted run are removed. Raises InputError
     if there are such files and neither is given, and if the interrupted run had other inputs: the
     first difference is named. The caller must be the only run in `output`.
@@ -47,18 +47,18 @@ def open_run(
     folder = inside(output, PARTS)
     manifest = inside(folder, _MANIFEST)
     shutil.rmtree(inside(output, _GONE), ignore_errors=True)  # left by an interrupted removal
-    begun = json.loads(json.dumps({"format": _FORMAT, **begun}))
+    inputs = json.loads(json.dumps({"format": _FORMAT, **inputs}))
     # A run killed at its start leaves only the manifest's temporary file.
     left = [folder] if folder.is_file() else folder.iterdir() if folder.is_dir() else ()
     if not manifest.is_file() and any(not file.name.startswith(f".{_MANIFEST}.") for file in left):
         raise InputError(
             f"{folder}: this is not a run of this program; move it, or give another --output"
         )
-    kept = InFolder(folder, _digest(begun))
+    kept = InFolder(folder, _digest(inputs))
     if manifest.is_file() and not restart:
         sweep(folder)
         if resume:
-            _refuse_other(folder, read_json(manifest), begun)
+            _refuse_other(folder, read_json(manifest), inputs)
             return kept
         if (done := frames_done(output)) > 0:
             raise InputError(
@@ -66,7 +66,7 @@ def open_run(
                 "--resume, or start again with --restart"
             )
     end_run(output)
-    write_content(manifest, json.dumps(begun, indent=1))
+    write_content(manifest, json.dumps(inputs, indent=1))
     return kept
 
 
@@ -76,9 +76,9 @@ def frames_done(output: Path) -> int:
     return Parts(InFolder(folder, _digest(read_json(inside(folder, _MANIFEST))))).notes().frames
 
 
-def _digest(begun: Any) -> str:
+def _digest(inputs: Any) -> str:
     """Digest of a run's inputs."""
-    return hashlib.sha256(json.dumps(begun, sort_keys=True).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()
 
 
 def end_run(output: Path) -> None:

@@ -162,9 +162,9 @@ def _view(joints: Array, centres: Array) -> dict[str, Any]:
     low, high = np.minimum(low, high - 1.0), np.maximum(high, low + 1.0)
     middle = (low + high) / 2
     reach = float(np.linalg.norm(high - low)) / 2
-    away = np.linalg.norm((centres - middle)[:, :2], axis=1).max(initial=0.0)
+    farthest_m = np.linalg.norm((centres - middle)[:, :2], axis=1).max(initial=0.0)
     box = {"low": low.tolist(), "high": high.tolist(), "middle": middle.tolist()}
-    return box | {"reach": max(reach, 1.0), "cameras": float(away)}
+    return box | {"reach": max(reach, 1.0), "cameras": float(farthest_m)}
 
 
 def scene_camera(camera: Camera, axes: Array) -> dict[str, Any]:

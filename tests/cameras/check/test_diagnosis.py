@@ -187,16 +187,16 @@ def test_a_small_turn_and_a_shift_are_both_said_with_their_probabilities(recordi
         else shifted(room, 2, 10.0, 0.0)
     )
     found = only_finding(recording, rig)
-    told = {each.kind: each.sure for each in (found, *found.instead) if each.cameras == (2,)}
+    told = {each.kind: each.probability for each in (found, *found.instead) if each.cameras == (2,)}
     assert {Kind.TURNED, Kind.PRINCIPAL_POINT} <= set(told)
     assert (
-        max(told.values()) == found.sure
+        max(told.values()) == found.probability
         and min(told.values()) > 0.05
         and sum(told.values()) <= 1 + 1e-9
     )
     words = sentence(found, rig)
     for each in found.instead:
-        assert f"({each.sure:.2f})" in words and "; or " in words
+        assert f"({each.probability:.2f})" in words and "; or " in words
 
 
 @pytest.mark.slow
@@ -207,9 +207,9 @@ def test_of_one_person_alone_a_camera_is_not_accused_but_said_beside_the_detecto
     assert diagnosis.findings == ()
     (noted,) = diagnosis.biased
     assert (noted.kind, noted.cameras) == (Kind.BIASED, (2,))
-    camera = {each.kind: each.sure for each in noted.instead}
+    camera = {each.kind: each.probability for each in noted.instead}
     assert Kind.PRINCIPAL_POINT in camera
-    assert noted.sure + sum(camera.values()) == pytest.approx(
+    assert noted.probability + sum(camera.values()) == pytest.approx(
         1, abs=0.06
     )  # those under 0.05 are not said
 

@@ -51,13 +51,13 @@ def test_a_camera_that_drifts_is_named(recording, room):
     found = only_finding(report)
     assert (found.kind, found.cameras) == (Kind.DRIFTING, (3,))
     assert found.amount == pytest.approx(8, abs=0.8)
-    assert report.trust.dark(30) == (3,)
+    assert report.trust.excluded(30) == (3,)
 
 
 @pytest.mark.slow
 def test_a_small_drift_is_told_from_a_turn_that_lasts(recording, room, degrees=0.8):
     found = only_finding(check_setup(turning(recording, room, 1, lambda t: degrees * t / 59), room))
-    assert (found.kind, found.cameras) == (Kind.DRIFTING, (1,)) and found.sure > 0.5
+    assert (found.kind, found.cameras) == (Kind.DRIFTING, (1,)) and found.probability > 0.5
     assert found.amount == pytest.approx(degrees, rel=0.3)  # the usual size of a turn pulls it to 0
 
 
