@@ -72,13 +72,18 @@ class NetworkOptions:
 
     def load(self) -> "Network":
         """The network, downloaded if requested; InputError if options contradict each other."""
-        from shapepose_fg.detection2d.download import named_file
+        from shapepose_fg.detection2d.download import named_file, named_networks
         from shapepose_fg.detection2d.opening import open_network
 
         if self.network is None and self.download is None:
             raise InputError(
                 "--network, --download: missing; give --download rtmpose-m the first time, or "
                 "--network FILE"
+            )
+        if self.download is not None and self.download not in (names := named_networks()):
+            raise InputError(
+                f"--download {self.download}: there is no network of this name; give one of "
+                f"{' '.join(names)}"
             )
         if self.network is not None and self.download not in (None, self.network, self.boxes):
             raise InputError(

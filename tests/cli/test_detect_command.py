@@ -207,6 +207,8 @@ def test_one_camera_is_enough_to_detect(kitchen):
     (["--videos", "shots", "--backend", "abacus"],
      "'abacus' is not one of 'opencv', 'onnxruntime'"),
     (["--videos", "shots", "--network", "clever"], "no network of this name"),
+    (["--videos", "shots", "--download", "clever"],
+     "--download clever: there is no network of this name; give one of rtmpose-s"),
 ])  # fmt: skip
 def test_what_cannot_be_detected_in_is_said_before_any_work(kitchen, capsys, words, problem):
     rig = read_rig("calibration.json")
