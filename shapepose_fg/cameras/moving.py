@@ -33,10 +33,10 @@ from shapepose_fg.estimation.gated_views import MIN_DEPTH_M
 from shapepose_fg.estimation.trajectory_graph import correlated
 
 _LEAST_S, _LEAST_WAY_M = 4.0, 0.4
-"""Minimum common duration of two tracks, s, and standard deviation of the person's position in it,
-m."""
+"""Minimum duration that two tracks have in common, s, and minimum standard deviation of the
+person's position during it, m."""
 _SAME_M = 0.7
-"""Maximum motion of a person between moments, m."""
+"""Maximum motion of a person between sampled times, m."""
 _AGREE_M, _NEAR_M = 0.5, (0.6, 0.3, 0.2)
 """Distance, m, between positions from a person's size and those of the other cameras that agree;
 and maximum median distance of a person's joints from their detections, m, by round."""
@@ -76,7 +76,7 @@ _QUARTERS = rigid(
 
 @dataclass(frozen=True)
 class Placed(Rows):
-    """People at regular moments, in three dimensions, with their tracks."""
+    """People at regular times, in three dimensions, with their tracks."""
 
     time_s: Array
     """(P,) time of each person, seconds."""
@@ -134,7 +134,7 @@ class Placed(Rows):
         return cls.of(moments[people.frame], people.frame, people.points, spread)
 
     def grid(self, track: int, length: int) -> Array:
-        """(length, J, 3) positions of a track by moment; NaN where unknown."""
+        """(length, J, 3) positions of a track by sampled time; NaN where unknown."""
         rows = np.flatnonzero(self.track == track)
         found = np.full((length, *self.points.shape[1:]), np.nan)
         found[self.moment[rows]] = self.points[rows]
@@ -166,12 +166,12 @@ def _moved_by(people: People, found: Adjusted) -> Array:
 
 @dataclass(frozen=True)
 class Start:
-    """The start of the odometry of a moving camera."""
+    """Where and when the odometry of a moving camera starts, relative to the fixed cameras."""
 
     wTo: Array
     """(4, 4) world from odometry."""
     bTc: Array
-    """(4, 4) the camera on the carrier: a quarter turn of the picture."""
+    """(4, 4) carrier from camera: a rotation of the picture by a multiple of 90 degrees."""
     offset_s: float
     """Time of the fixed cameras' clock at time 0 of the camera's own, s."""
     focal: float = 1.0
@@ -456,7 +456,7 @@ class _Fit:
 
     filmed: Filmed
     start: Start
-    """The start before the adjustment."""
+    """Start of the odometry (pose, time, lens) before the adjustment."""
     placed: Placed
     """(N,) people."""
     frame: Index
@@ -651,7 +651,7 @@ def _with_drift(information: Array, x: Array, kinds: Index) -> tuple[Array, Arra
 
 @dataclass(frozen=True)
 class _Spectrum:
-    """Fourier transforms of a track's moments, for its registration at all lags."""
+    """Fourier transforms of a track, for its registration at all lags."""
 
     known: NDArray[np.complex128]
     """(L, J) mask of joints."""
@@ -713,8 +713,8 @@ def _lasts(grid: Array) -> bool:
 
 
 def _nearest(own: Array, times: Array) -> Index:
-    """(M,) frame, of those at `own` (T,), ascending or NaN, nearest to each time; -1 if half a
-    moment lies between.
+    """(M,) frame, of those at `own` (T,), ascending or NaN, nearest to each time; -1 if it is
+    farther than half a sampling interval.
     """
     finite = np.flatnonzero(np.isfinite(own))
     after = np.searchsorted(own[finite], times).clip(1, len(finite) - 1)

@@ -92,7 +92,7 @@ class TopDownNetwork:
     form: KeypointForm
     """Description of the network."""
     skeleton: Skeleton
-    """Skeleton of its joints."""
+    """Skeleton to which the network's joints are assigned."""
     place: Index
     """(N,) index of each of the network's joints among the skeleton's K keypoints, -1 for none."""
     boxes: BoxNetwork | None

@@ -122,7 +122,7 @@ class WindowSolution(Rows):
 
 @dataclass(frozen=True)
 class Sources:
-    """What a joint's estimate consists of, for explaining it."""
+    """Sources of the information about a joint, for explaining its estimate."""
 
     place: Array
     """(3,) the joint, metres."""
@@ -200,7 +200,7 @@ class PersonGraph:
         return one[2] == other[2] or any({one[:2], other[:2]} <= p for p in self.window.ties.parts)
 
     def sources(self, t: int, joint: int) -> Sources | None:
-        """What a joint in row `t` is known from; None if it is unknown."""
+        """Sources of the information about a joint in row `t`; None if its position is unknown."""
         if not np.isfinite(self.covariance[t, joint]).all():
             return None
         whole = np.asarray(np.linalg.inv(self.covariance[t, joint]), dtype=np.float64)

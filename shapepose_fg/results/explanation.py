@@ -127,13 +127,13 @@ class Explanation:
         when = f"frame {self.frame}" + (
             f" ({self.time_s:.3f} s)" if self.time_s is not None else ""
         )
-        who = f"{self.joint} of person {self.person} in {when}"
+        joint = f"{self.joint} of person {self.person} in {when}"
         if self.position_m is None or self.sigma_m is None:
-            where = f"{who} has no position."
+            where = f"{joint} has no position."
         else:
             x, y, z = self.position_m
             where = (
-                f"{who} is at ({x:.3f}, {y:.3f}, {z:.3f}) m, within {1e3 * self.sigma_m:.0f} mm "
+                f"{joint} is at ({x:.3f}, {y:.3f}, {z:.3f}) m, within {1e3 * self.sigma_m:.0f} mm "
                 "(one sigma)."
             )
         used = [view for view in self.views if view.gate == GATES[Gate.USED]]

@@ -49,7 +49,7 @@ class Column:
 
     @property
     def has_rows(self) -> bool:
-        """Whether the first axis is the rows."""
+        """Whether the first axis of the array counts the rows of the table."""
         return self._lengths[0] == "N"
 
     @cached_property
