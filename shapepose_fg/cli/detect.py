@@ -28,6 +28,7 @@ from shapepose_fg.cli.pictures import PictureOptions
 from shapepose_fg.cli.stopping import Stopped
 from shapepose_fg.cli.terminal import note, progress, show, table
 from shapepose_fg.core.errors import InputError
+from shapepose_fg.core.storage.output_folder import only_run_in
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -72,13 +73,18 @@ class NetworkOptions:
 
     def load(self) -> "Network":
         """The network, downloaded if requested; InputError if options contradict each other."""
-        from shapepose_fg.detection2d.download import named_file
+        from shapepose_fg.detection2d.download import named_file, named_networks
         from shapepose_fg.detection2d.opening import open_network
 
         if self.network is None and self.download is None:
             raise InputError(
                 "--network, --download: missing; give --download rtmpose-m the first time, or "
                 "--network FILE"
+            )
+        if self.download is not None and self.download not in (names := named_networks()):
+            raise InputError(
+                f"--download {self.download}: there is no network of this name; give one of "
+                f"{' '.join(names)}"
             )
         if self.network is not None and self.download not in (None, self.network, self.boxes):
             raise InputError(
@@ -144,7 +150,7 @@ def detect(
     from shapepose_fg.core.frame_sets import align, own_frames
     from shapepose_fg.detection2d.recording import CameraDetector, DetectionRun, run_detection
     from shapepose_fg.io.footage.clocks import clocks_of
-    from shapepose_fg.io.footage.placement import placements_of
+    from shapepose_fg.io.footage.placement import FOOTAGE, placements_of
     from shapepose_fg.io.lenses import pictures_only
 
     known = cameras.rig() if cameras.calibration is not None else None
@@ -172,8 +178,9 @@ def detect(
         for camera, each in zip(rig.cameras, footage, strict=True)
     ]
     run = DetectionRun(detectors, moments, output)
+    files = [f"{name}{suffix}" for name in rig.names for suffix in (".txt", ".json")]
     begin = time.perf_counter()
-    with progress("detecting", "pictures") as done:
+    with only_run_in(output, (*files, FOOTAGE)), progress("detecting", "pictures") as done:
         try:
             joints, unreadable = run_detection(run, done)
         except Stopped as stop:

@@ -35,7 +35,9 @@ def stoppable() -> Iterator[None]:
 
     Signals that the parent process ignores stay ignored; outside the main thread nothing changes.
     If Python cannot propagate the exception (because a finaliser is running), the signal is sent
-    again a moment later, or the exception is raised at the end of the block.
+    again a moment later, or the exception is raised at the end of the block. If a library made
+    another exception of it (such as an ImportError while its compiled module begins), that one is
+    replaced by it.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -87,8 +89,21 @@ def stoppable() -> Iterator[None]:
         settle()
         if missed:
             raise Stopped(missed[0])
+    except Exception as error:
+        if (cause := _stop_behind(error)) is not None:
+            raise cause from None
+        raise
     finally:
         settle()
         for number in heard:
             signal.signal(number, before[number])
         sys.unraisablehook = report
+
+
+def _stop_behind(error: BaseException) -> Stopped | None:
+    """The `Stopped` from which an exception was made; None if there is none."""
+    behind, seen = error, set[int]()
+    while behind is not None and not isinstance(behind, Stopped) and id(behind) not in seen:
+        seen.add(id(behind))
+        behind = behind.__cause__ or behind.__context__
+    return behind if isinstance(behind, Stopped) else None

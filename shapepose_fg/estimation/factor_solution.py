@@ -79,7 +79,9 @@ def _solved(
         singular = "the solver failed: its system is singular"
         for each, (state, last) in zip(people, before, strict=True):
             each.state, each.window.last = state, last
-            each.failure = str(error) if isinstance(error, NotFinite) else singular
+            each.failure = ties.problem or (
+                str(error) if isinstance(error, NotFinite) else singular
+            )
         return []
     finally:  # whoever asks for a graph gets the one with all joints
         for each in people:

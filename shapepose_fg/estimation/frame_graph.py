@@ -112,7 +112,7 @@ class FrameGraph(PersonWindow):
             try:
                 values = self._minimum(graph, values)
             except NotFinite as error:
-                failure = str(error)
+                failure = self.ties.problem or str(error)
             except RuntimeError as error:
                 where = _where(error, people, self._names)
                 failure = f"the solver failed: its system is singular{where}"

@@ -23,6 +23,19 @@ class UserFactor:
     name: str
     """Name of the function that created the factor."""
 
+    def problem(self, values: gtsam.Values) -> str:
+        """Compute the error at `values`, and describe it if it is not finite; empty if it is.
+
+        ValueError if it cannot be computed: a solver reports that as a singular system, without the
+        name of the factor.
+        """
+        what = f"{_called(self.name)} on {', '.join(map(format_key, self.keys))}"
+        try:
+            error = self.factor.error(values)
+        except (ValueError, RuntimeError) as reason:
+            raise ValueError(f"{what} cannot be computed: {reason}") from reason
+        return "" if np.isfinite(error) else f"the error of {what} is not finite"
+
 
 @dataclass
 class CoupledGraph:
@@ -42,6 +55,10 @@ class CoupledGraph:
     """Disjoint sets of coupled variables: (track, joint), or (-1, key) for user variables."""
     active: list[UserFactor] = field(default_factory=list)
     """Factors with all variables in the last problem; the others were inactive."""
+    computed: set[int] = field(default_factory=set)
+    """Identities of the factors whose error has been computed."""
+    problem: str = ""
+    """First of these factors whose error is not finite; empty if there is none."""
 
     def tie(self, nodes: Iterable[tuple[int, int]]) -> None:
         """Record that a factor couples these variables (`parts`)."""
@@ -67,6 +84,8 @@ class CoupledGraph:
     def joined(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
         """The factors and values of all people, the active user factors, which are last, and the
         user variables in them.
+
+        ValueError for a factor that cannot be computed.
         """
         if len(self.people) == 1 and len(self.factors) == 0:
             return self.people[0].graph, self.people[0].values
@@ -86,6 +105,10 @@ class CoupledGraph:
             if all(key not in each.keys for each in self.active):
                 idle.erase(key)
         values.insert(idle)
+        for each in self.active:
+            if id(each) not in self.computed:
+                self.problem = self.problem or each.problem(values)
+                self.computed.add(id(each))
         return graph, values
 
 
@@ -217,13 +240,24 @@ class PersonWindow:
         are then solved jointly, and on user variables with initial values given before. It is
         inactive while one of its variables is not in the problem, because neither views nor body
         nor motion determine it, and `run` counts it under `name`, the function that created it.
-        Raises ValueError for any other key, and for initial values of a joint.
+        Raises ValueError for any other key, for initial values of a joint, for a sigma of 0, and
+        for an `item` of any other type.
         """
         if isinstance(item, gtsam.Values):
             self._add_start(item)
             return
+        if not isinstance(item, gtsam.NonlinearFactor):
+            raise ValueError(
+                f"{_called(name)} is a {type(item).__name__}: yield factors of GTSAM, or "
+                "gtsam.Values with initial values of your variables"
+            )
         nodes, touched = list[tuple[int, int]](), list[tuple[PersonWindow, int]]()
-        what = f"your factor{f' ({name})' if name else ''}"
+        what = _called(name)
+        if _is_constrained(item):
+            raise ValueError(
+                f"{what} has a sigma of 0, which the solver does not meet: give it a small one, "
+                "for example isotropic(3, 0.001)"
+            )
         for key in item.keys():  # noqa: SIM118 - GTSAM's, not a dictionary's
             person = next((each for each in (self, *self.people) if key in each._own), None)
             if person is not None:
@@ -299,15 +333,42 @@ def add_factors(people: Sequence[PersonWindow], functions: Sequence[FactorFuncti
         person.people = together[int(person.frames[0]) if single_frames else 0]
     for function in functions:
         for person in people:
-            for item in function(person, person.keys):
+            items = function(person, person.keys)
+            if not isinstance(items, Iterable):
+                raise ValueError(
+                    f"{name_of(function)} returned a {type(items).__name__} instead of factors: "
+                    "yield them one by one, or return a list of them"
+                )
+            for item in items:
                 person.add(item, name_of(function))
 
 
 def functions_of(given: ExtraFactors | None) -> tuple[FactorFunction, ...]:
-    """User functions as a tuple."""
+    """User functions as a tuple; ValueError if they are not functions."""
     if given is None:
         return ()
-    return (given,) if callable(given) else tuple(given)
+    functions = (given,) if callable(given) else tuple(given)
+    for each in functions:
+        if not callable(each):
+            raise ValueError(
+                f"extra_factors must be a function (window, keys), or a list of them, got {each!r}"
+            )
+    return functions
+
+
+def _called(name: str) -> str:
+    """A factor in messages, by the name of the function that created it."""
+    return f"your factor ({name})" if name else "your factor"
+
+
+def _is_constrained(factor: gtsam.NonlinearFactor) -> bool:
+    """Whether a sigma of the factor is 0. Levenberg-Marquardt weighs such a factor by a number of
+    its own when it compares errors, rejects the steps that meet it, and stays where it is.
+    """
+    noise = factor.noiseModel() if hasattr(factor, "noiseModel") else None
+    while isinstance(noise, gtsam.noiseModel.Robust):
+        noise = noise.noise()
+    return noise is not None and noise.isConstrained()
 
 
 def name_of(function: FactorFunction) -> str:

@@ -14,6 +14,7 @@ import pytest
 
 from shapepose_fg.cli.main import main
 from shapepose_fg.core.reconstruction import Reconstruction
+from shapepose_fg.core.storage.output_folder import only_run_in
 from shapepose_fg.detection2d.heat_maps import HeatMapNetwork, layouts
 from shapepose_fg.detection2d.onnx_network import OnnxNetwork
 from shapepose_fg.io.calibration import read_rig, write_rig
@@ -207,6 +208,8 @@ def test_one_camera_is_enough_to_detect(kitchen):
     (["--videos", "shots", "--backend", "abacus"],
      "'abacus' is not one of 'opencv', 'onnxruntime'"),
     (["--videos", "shots", "--network", "clever"], "no network of this name"),
+    (["--videos", "shots", "--download", "clever"],
+     "--download clever: there is no network of this name; give one of rtmpose-s"),
 ])  # fmt: skip
 def test_what_cannot_be_detected_in_is_said_before_any_work(kitchen, capsys, words, problem):
     rig = read_rig("calibration.json")
@@ -219,6 +222,16 @@ def test_what_cannot_be_detected_in_is_said_before_any_work(kitchen, capsys, wor
     assert run(*COMMON, *words) == 2
     assert problem in " ".join(capsys.readouterr().err.split())
     assert not Path("out").exists() or list(Path("out").iterdir()) == []
+
+
+def test_a_second_run_into_the_same_folder_is_refused(kitchen, capsys):
+    Path("shots").mkdir()
+    for name in read_rig("calibration.json").names:
+        cv2.imwrite(f"shots/{name}.png", np.zeros((720, 1280, 3), np.uint8))
+    with only_run_in(Path("out"), ()):
+        assert run(*COMMON, "--videos", "shots") == 2
+    assert "out: another run writes its results here" in capsys.readouterr().err
+    assert run(*COMMON, "--videos", "shots") == 0
 
 
 @pytest.fixture(scope="session")

@@ -20,6 +20,7 @@ from shapepose_fg.io.footage.placement import (
 )
 from shapepose_fg.pipeline.pipeline import reconstruct
 from shapepose_fg.simulation import built_in_scene, simulate
+from shapepose_fg.viz.overlay import drawing
 
 FRAMES = 3
 
@@ -80,6 +81,22 @@ def test_a_grid_of_all_cameras_that_plays(solved, tmp_path, capsys):
     np.testing.assert_allclose(corner, [40, 80, 120], atol=8)
     first = [int(np.median(frame[40:52, :20])) for frame in frames]
     np.testing.assert_allclose(first, [80, 120, 160], atol=8)
+
+
+def test_two_runs_may_write_the_same_video(solved, tmp_path, monkeypatch):
+    """The one that ends last stays."""
+    write, runs = drawing.draw_label, list[int]()
+
+    def second_run(*arguments: object, **options: object) -> object:
+        if not runs:
+            runs.append(-1)
+            runs.append(run(solved / "results", "--output", tmp_path, "--width", 640))
+        return write(*arguments, **options)
+
+    monkeypatch.setattr(drawing, "draw_label", second_run)
+    assert run(solved / "results", "--output", tmp_path, "--width", 960) == 0 and runs == [-1, 0]
+    assert [path.name for path in tmp_path.iterdir()] == ["grid.mp4"]
+    assert frames_of(tmp_path / "grid.mp4")[0].shape[1] == 960
 
 
 def test_a_video_that_does_not_fit_on_the_disk_is_an_error(solved, tmp_path, capfd):

@@ -8,6 +8,7 @@ import time
 import pytest
 
 from shapepose_fg.cli.stopping import Stopped, stoppable
+from shapepose_fg.core.errors import InputError
 
 
 class SignalsAsItGoes:
@@ -80,3 +81,31 @@ def test_other_errors_of_finalisers_are_reported_as_before(monkeypatch):
     with stoppable():
         Breaks()
     assert reported == [ValueError]
+
+
+def importing() -> None:
+    """As pybind11 does where a compiled module is stopped while it begins."""
+    try:
+        signal.raise_signal(signal.SIGTERM)
+    except BaseException as stop:
+        raise ImportError("initialization failed") from stop
+
+
+def asking_for_a_package() -> None:
+    """And as a command does that misses the package of an extra."""
+    try:
+        importing()
+    except ImportError:
+        raise InputError("the package is missing; install it") from None
+
+
+@pytest.mark.parametrize("work", [importing, asking_for_a_package])
+def test_a_signal_that_a_library_makes_another_error_of_is_obeyed(work):
+    with pytest.raises(Stopped) as stopped, stoppable():
+        work()
+    assert stopped.value.exit_code == 128 + signal.SIGTERM
+
+
+def test_errors_after_a_signal_that_was_obeyed_stay_as_they_are():
+    with pytest.raises(ImportError, match="another"), stoppable():
+        raise ImportError("another")

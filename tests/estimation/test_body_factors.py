@@ -12,6 +12,7 @@ from shapepose_fg.estimation.condensed_graph import gtsam_step
 from shapepose_fg.estimation.estimator_config import WindowGraphConfig
 from shapepose_fg.estimation.factor_solution import solve_with_factors
 from shapepose_fg.estimation.person_graph import BodyGraph, graph_covariances, ordering
+from shapepose_fg.estimation.user_factors import add_factors, functions_of
 from tests.estimation.test_body_window import _person
 
 WRIST, ELBOW, NECK = (BODY_25.index(name) for name in ("RWrist", "RElbow", "Neck"))
@@ -150,6 +151,43 @@ def test_factors_that_cannot_be_met_leave_people_as_they_were() -> None:
     assert solve_with_factors([one], CONFIG) == [] and "diverged" in one.failure
     np.testing.assert_array_equal(one.window.joints(one.state), before)
     assert one.graph.size() == factors, "all joints, and not the factor"
+
+
+def test_a_sigma_of_zero_is_refused() -> None:
+    """Levenberg-Marquardt would leave such a factor unmet, and the person as solved."""
+    one = person(0)
+    right, left = one.keys[5, [WRIST, NECK]].tolist()
+    robust = gtsam.noiseModel.Robust.Create(
+        gtsam.noiseModel.mEstimator.Huber.Create(1.0), gtsam.noiseModel.Constrained.All(1)
+    )
+    for noise in (gtsam.noiseModel.Constrained.All(1), robust):
+        with pytest.raises(ValueError, match=r"your factor \(box\) has a sigma of 0"):
+            one.add(gtsam.RangeFactor3(right, left, 0.4, noise), "box")
+
+
+def test_a_factor_that_cannot_be_computed_is_named() -> None:
+    one = person(0)
+    wrist = int(one.keys[5, WRIST])
+    one.add(gtsam.PriorFactorPose3(wrist, gtsam.Pose3(), isotropic(6, 0.1)), "pose")
+    with pytest.raises(ValueError, match=r"your factor \(pose\) on .* cannot be computed: .*Pose3"):
+        solve_with_factors([one], CONFIG)
+    one = person(0)
+    one.add(gtsam.PriorFactorPoint3(wrist, np.full(3, np.nan), isotropic(3, 0.1)), "gap")
+    assert solve_with_factors([one], CONFIG) == []
+    assert "the error of your factor (gap) on" in one.failure and "frame 5" in one.failure
+
+
+def test_what_is_no_factor_is_named() -> None:
+    people = [person(0)]
+    for wrong, words in (
+        (lambda window, keys: None, "<lambda> returned a NoneType instead of factors"),
+        (lambda window, keys: gtsam.NonlinearFactorGraph(), "returned a NonlinearFactorGraph"),
+        (lambda window, keys: [3], "is a int: yield factors"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            add_factors(people, [wrong])
+    with pytest.raises(ValueError, match=r"must be a function \(window, keys\), or a list of them"):
+        functions_of("box")
 
 
 def test_an_inactive_factor_leaves_the_whole_graph() -> None:

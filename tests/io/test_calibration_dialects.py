@@ -255,5 +255,5 @@ def test_a_file_is_never_written_under_another_format_s_name(tmp_path, rig_file)
 def test_cameras_that_are_not_wanted_are_named(rig_file):
     rig, file = rig_file
     (note,) = read_rig(file, without=rig.names[:2]).notes
-    assert note == f"{file}: camera {rig.names[0]} {rig.names[1]} is left out as requested"
+    assert note == f"{file}: cameras {rig.names[0]} {rig.names[1]} are left out as requested"
     assert read_rig(file).notes == ()

@@ -14,7 +14,7 @@ from shapepose_fg.core.trust import Spell, Trust
 _WORSE = 0.2
 """Drop of a camera's score, against the corrected camera, above which it is excluded: it sees
 people 3 % of their size, 5 cm, from where it should, on average."""
-_OF_PEOPLE = (Kind.UNIT, Kind.UP, Kind.PICTURE_SIZE, Kind.STOPPED, Kind.CROWDED)
+_OF_PEOPLE = (Kind.UNIT, Kind.UP, Kind.PICTURE_SIZE, Kind.STOPPED, Kind.CROWDED, Kind.SIDES)
 """Kinds of findings that exclude no camera: they affect all alike, matter little, or are handled
 elsewhere."""
 

@@ -19,6 +19,8 @@ class Kind(StrEnum):
     TRANSPOSED = "transposed rotation"
     AXES = "other camera axes"
     MIRRORED = "mirrored"
+    SIDES = "exchanged sides"
+    """Left and right joints are exchanged in the detections of a camera, in most frames."""
     BUMPED = "bumped"
     DRIFTING = "drifting"
     FOCAL = "focal length"
@@ -293,6 +295,10 @@ _WORDS: dict[Kind, str | Callable[[Finding], str]] = {
         "reverse y and z"
     ),
     Kind.MIRRORED: "the pictures of {who} appear to be mirrored; mirror them back",
+    Kind.SIDES: (
+        "left and right joints are exchanged in most detections of {who}; its calibration is not "
+        "the cause; reconstruct exchanges them back where other cameras agree"
+    ),
     Kind.BUMPED: (
         "{who} appears to be rotated by {degrees} degrees {when}: it was moved; calibrate it for "
         "each part, or leave it out of one"

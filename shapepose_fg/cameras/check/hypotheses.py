@@ -214,6 +214,7 @@ def _of_one(setup: SetupHypothesis, view: int, rng: np.random.Generator) -> Iter
     for kind in _MISREAD:
         yield _misread(setup, kind, (view,))
     yield from _in_mirror(setup, view)
+    yield _with_other_sides(setup, view)
     lag = lag_of(setup, view).frames
     yield Change(Finding(Kind.LATE, (view,), lag), setup.later(view, lag), 1)
     pairs = list(resection.tries(others, seen, rng))
@@ -249,6 +250,17 @@ def _in_mirror(setup: SetupHypothesis, view: int) -> list[Change]:
         setup.seeing(view, partial(mirrored, joints=each)) for each in (side, np.arange(len(side)))
     ]
     return [Change(Finding(Kind.MIRRORED, (view,)), each) for each in changed]
+
+
+def _with_other_sides(setup: SetupHypothesis, view: int) -> Change:
+    """The left and right joints of one camera's people exchanged, as a detector does that takes
+    backs for fronts.
+    """
+    side = setup.evidence.other_side
+    changed = setup.seeing(
+        view, lambda seen: replace(seen, xy=seen.xy[:, side], confidence=seen.confidence[:, side])
+    )
+    return Change(Finding(Kind.SIDES, (view,)), changed)
 
 
 def _of_all(setup: SetupHypothesis) -> Iterator[Change]:

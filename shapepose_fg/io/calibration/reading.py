@@ -71,7 +71,9 @@ def read_rig(
     with naming(path):
         wanted = choose([camera.name for camera in written.cameras], cameras, without)
     unwanted = [camera.name for camera in written.cameras if camera.name not in wanted]
-    requested = [f"camera {listing(unwanted)} is left out as requested"] if unwanted else []
+    one = len(unwanted) == 1
+    which = f"camera {listing(unwanted)} is" if one else f"cameras {listing(unwanted)} are"
+    requested = [f"{which} left out as requested"] if unwanted else []
     kept = [camera for camera in written.cameras if camera.name in wanted]
     written = replace(written, cameras=kept, notes=[*written.notes, *requested])
     up, unit = up or written.up, unit or written.unit

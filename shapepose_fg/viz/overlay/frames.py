@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from secrets import token_hex
 from typing import TYPE_CHECKING
 
 import cv2
@@ -124,9 +125,10 @@ def _video(path: Path, size: Sequence[int], fps: float) -> Iterator[Callable[[Pi
     """Context manager: a function that appends a picture to an mp4 video, which is moved to `path`
     when it is complete.
     """
-    part = path.with_name(f".{path.stem}.part.mp4")  # OpenCV selects the container by extension
+    # A name of its own, because two runs may write the same video; OpenCV selects the container by
+    # the extension.
+    part = path.with_name(f".{path.stem}.{token_hex(4)}.part.mp4")
     path.parent.mkdir(parents=True, exist_ok=True)
-    part.unlink(missing_ok=True)  # it may be a symbolic link
     # OpenCV does not report that a picture was not written, such as on a full disk: the pictures of
     # the file are counted. Its messages are replaced by ours.
     level, count = cv2.utils.logging.getLogLevel(), 0

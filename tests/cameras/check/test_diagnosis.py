@@ -222,6 +222,22 @@ def test_no_step_of_a_focal_length_leaves_the_numbers(room):
     assert (views.focal_px > 0).all() and np.isfinite(views.focal_px).all()
 
 
+@pytest.mark.parametrize("view", [1, *slow(0, 4)])
+def test_a_view_with_exchanged_sides_is_no_wrong_camera(recording, room, view):
+    """As a detector gives what it sees from behind."""
+    other = np.array(recording.skeleton.mirror)
+    frames = []
+    for found in recording:
+        joint = np.where(found.view == view, other[found.joint], found.joint)
+        order = np.lexsort((joint, found.view))
+        parts = (each[order] for each in (found.view, joint, found.xy, found.confidence))
+        place = np.argsort(order)
+        frames.append(Detections(*parts, place[found.pairs], found.affinity))
+    found = diagnose(Recording(recording.skeleton, frames), room)
+    assert [(each.kind, each.cameras) for each in found.findings] == [(Kind.SIDES, (view,))]
+    assert found.trust.left_out == ()
+
+
 @pytest.mark.slow
 def test_exchanged_cameras_are_named(recording, room):
     found = only_finding(recording, exchanged(room, 1, 4))
