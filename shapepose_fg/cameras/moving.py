@@ -183,7 +183,7 @@ class Start:
     stretch: float = 1.0
     """Ratio of the world's unit to that of the odometry."""
     knots_s: Array = field(default_factory=lambda: np.zeros(1))
-    """(K,) times on the camera's own clock between which its drift is linear."""
+    """(K,) times on the camera's own clock between which the odometry's drift is linear."""
     drift: Array = field(default_factory=lambda: np.zeros((1, 6)))
     """(K, 6) corrections of the odometry's drift in the world: rotation vectors and metres."""
     agreeing: float = 0.0
@@ -266,9 +266,9 @@ class Filmed:
     camera: Camera
     """The camera."""
     trajectory: Trajectory
-    """Its odometry, on its own clock."""
+    """The camera's odometry, on the camera's own clock."""
     own_s: Array
-    """(F,) times of frames with people, ascending, on its own clock."""
+    """(F,) times of frames with people, ascending, on the camera's own clock."""
     rays: Array
     """(F, K, J, 3) joints of up to K people of a frame at depth 1 in the camera; NaN for none."""
 
@@ -460,9 +460,9 @@ class _Fit:
     placed: Placed
     """(N,) people."""
     frame: Index
-    """(N,) frames in which the camera sees them."""
+    """(N,) frames in which the camera sees the people."""
     rays: Array
-    """(N, J, 3) their joints in the camera, at depth 1."""
+    """(N, J, 3) joints of the people in the camera, at depth 1."""
     sigmas: Array
     """(12,) prior standard deviations of the parameters before the drift; 0: fixed."""
 
@@ -625,12 +625,12 @@ def _root_mean_square(slopes: Array, covariance: Array, more: float) -> tuple[fl
 
 
 def _with_drift(information: Array, x: Array, kinds: Index) -> tuple[Array, Array]:
-    """Ratios (2,) of the drift's rotations and translations to their standard deviations, root mean
-    square over their probability, and the covariance of the parameters `x` for these.
+    """Ratios (2,) of the actual to the stated standard deviations of the drift's rotations and
+    translations, and the covariance of the parameters `x` with the actual ones.
 
-    Parameters have a unit prior that `information` does not include; they are rotations (0 in
-    `kinds`) or translations (1) of the drift, or others (-1). The ratios' prior is log-normal;
-    parameters are integrated out.
+    The ratios have a log-normal prior; the result is the root mean square under their posterior,
+    with the parameters integrated out. Parameters have a unit prior that `information` does not
+    include; they are rotations (0 in `kinds`) or translations (1) of the drift, or others (-1).
     """
     both = information @ x + x
 

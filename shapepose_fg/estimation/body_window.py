@@ -479,8 +479,8 @@ class Marginals:
     poses: Array
     """(T, N, N) covariances of each frame's root (tangents of the world), angles and place."""
     steps: Array
-    """(T, N, N) covariances of the next frame's pose, rows, with this one's, columns; zero in
-    the last."""
+    """(T, N, N) cross-covariances of the next frame's pose (rows) with that of each frame
+    (columns); zero in the last frame."""
     shape: Array
     """(10, 10) covariance of the betas; of single frames (T, 10, 10)."""
     across: Array

@@ -17,7 +17,7 @@ class FactorEvidence:
     name: str
     """Name of the function that created the factor."""
     others: tuple[tuple[int, int, int], ...]
-    """Joints that it connects this one to: person, joint and frame of each."""
+    """Joints to which the factor connects this joint: person, joint and frame of each."""
     information: Array
     """(3, 3) information on the joint's position, 1/m², given the covariance of the factor's other
     variables without this factor."""

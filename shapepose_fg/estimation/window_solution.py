@@ -127,7 +127,7 @@ class Sources:
     place: Array
     """(3,) the joint, metres."""
     whole: Array
-    """(3, 3) all information on it, 1/m²."""
+    """(3, 3) all information on the joint, 1/m²."""
     of_body: Array
     """(3, 3) information from the body in the same frame, without the joint's own views."""
     widen: float

@@ -130,7 +130,7 @@ class _Detections:
     table: ObservationTable
     views: Views
     sigmas_px: Array
-    """(N, J, V) standard deviations of these detections, pixels; 0 without one."""
+    """(N, J, V) standard deviations of the detections, pixels; 0 without one."""
 
     @classmethod
     def of(cls, people: Reconstruction, rig: Rig, config: PipelineConfig) -> "_Detections":

@@ -196,8 +196,8 @@ def judged(setup: SetupHypothesis, change: Change) -> float:
 
 
 def score_of(setup: SetupHypothesis, change: Change) -> float:
-    """Score of the changed cameras for the people that all others see (`Match.score`), the lowest;
-    0 if they see none.
+    """Lowest score of the changed cameras for the people that all others see (`Match.score`); 0 if
+    the others see none.
     """
     others = setup.others(*change.finding.cameras)
     return min(
