@@ -218,7 +218,7 @@ def camera_names(path: Path) -> list[str]:
                 for each in places
             ]
             if any(holds):
-                return [name for name, there in zip(names, holds, strict=True) if there]
+                return [name for name, has_files in zip(names, holds, strict=True) if has_files]
     holds = listing([each.name for each in entries])
     cure = "give the folder with a file or folder for each camera"
     raise InputError(f"{folder}: there are no detections; it contains {holds}; {cure}")
@@ -292,11 +292,11 @@ def _named(folder: Path, name: str, patterns: Sequence[str]) -> Path | None:
         place = in_any_form(folder / pattern.format(name))
         if suffix := Path(pattern).suffix:
             in_capitals = place.with_name(place.name.removesuffix(suffix) + suffix.upper())
-            there = [each for each in (place, in_capitals) if each.is_file()]
+            found = [each for each in (place, in_capitals) if each.is_file()]
         else:
-            there = [place] if place.is_dir() else []
-        if there:
-            return there[0]
+            found = [place] if place.is_dir() else []
+        if found:
+            return found[0]
     return None
 
 
