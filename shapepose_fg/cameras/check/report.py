@@ -338,7 +338,9 @@ def result_check(
         )
     warnings += _speeds(people)
     chance = [*_too_many(people), *_clutter(uses)][:1]
-    warnings += chance or _mostly_unused(uses, people, detections, rig, frames)
+    if Kind.JOINT_ORDER not in {finding.kind for finding in report.findings}:
+        # With a wrong order of joints, most detections fit no person.
+        warnings += chance or _mostly_unused(uses, people, detections, rig, frames)
     return ResultCheck(report, uses, tuple(warnings))
 
 

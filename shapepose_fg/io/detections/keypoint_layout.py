@@ -231,9 +231,9 @@ def _called(
         if fit:
             return (fit[0], []), f"{source} names {_shown(joints)}"
         has = (
-            f"have {layouts[0].keypoint_count} keypoints instead of {count}"
+            f"has {layouts[0].keypoint_count} keypoints instead of {count}"
             if layouts
-            else ("are not a known layout")
+            else "is no known layout"
         )
         return None, f"{source} names {_shown(joints)}, which {has}"
     if not any(body_points(joints)):
