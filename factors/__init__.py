@@ -1,7 +1,7 @@
 """GTSAM factors for people seen by calibrated cameras: keys, noise, projection, body priors,
 motion, contact.
 
-Only GTSAM and NumPy. Builders take keys, arrays and noise, and return native
+The package imports only GTSAM and NumPy. Builders take keys, arrays and noise, and return native
 `gtsam.NonlinearFactor`s for a graph of your own. Units: metres in the world, pixels in the image;
 cameras look along +z, x right, y down.
 """

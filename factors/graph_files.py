@@ -204,11 +204,11 @@ class _Writer:
             found["data"] = [each.tolist() for each in self._data(name, factor)]
             if name != "motion":
                 found |= _noise_data(factor.noiseModel())
-            for here, there in zip(
+            for written, read_back in zip(
                 *(each.linearize(self._values).jacobian() for each in (factor, _factor(found))),
                 strict=True,
             ):
-                if not np.abs(here - there).max() <= 1e-9 * max(np.abs(here).max(), 1.0):
+                if not np.abs(written - read_back).max() <= 1e-9 * max(np.abs(written).max(), 1.0):
                     raise ValueError("a file cannot hold it exactly")
         except (ValueError, RuntimeError) as error:
             raise ValueError(f"factor {number}, {type(factor).__name__}: {error}") from None
@@ -270,11 +270,11 @@ class _Writer:
         points = near + np.array(
             [[0.0, 0, 0], [0.3, 0.1, -0.2], [-0.2, 0.4, 0.1], [0.1, -0.3, 0.5]]
         )
-        there = [pixel(each) for each in points]
+        pixels = [pixel(each) for each in points]
         for n, camera in enumerate(self._cameras):
             if all(
                 uv is not None and np.abs(uv - camera.project(each)).max() < 1e-9
-                for each, uv in zip(points, there, strict=True)
+                for each, uv in zip(points, pixels, strict=True)
             ):
                 self._cameras.insert(0, self._cameras.pop(n))
                 return camera

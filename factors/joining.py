@@ -106,16 +106,16 @@ def reported_factor(
     if not poses:
         return gtsam.PriorFactorPoint3(key, place, gaussian(covariance))
     root = np.linalg.inv(np.linalg.cholesky(covariance))
-    here, terms = gtsam.Values(), [(key, root)]
-    here.insert(key, place)
+    point, terms = gtsam.Values(), [(key, root)]
+    point.insert(key, place)
     for pose_key, pose, goes in poses:
-        here.insert(pose_key, pose)
+        point.insert(pose_key, pose)
         terms.append((pose_key, -root @ goes))
     make: Any = gtsam.JacobianFactor  # its constructors take keys and matrices alternately
     linear = make(
         *(each for term in terms for each in term), np.zeros(3), gtsam.noiseModel.Unit.Create(3)
     )
-    return gtsam.LinearContainerFactor(linear, here)
+    return gtsam.LinearContainerFactor(linear, point)
 
 
 class PeopleInGraph:
@@ -161,13 +161,13 @@ class PeopleInGraph:
                 f"person {one.person}: frames must be in order of time, but {one.time_s} s is not"
             )
         linked = one.time_s - last_s <= self._link_s
-        there = np.flatnonzero(seen.any(axis=1))
+        present = np.flatnonzero(seen.any(axis=1))
         x, v = (
             keys(one.person, np.arange(J), one.frame)
             for keys in (self.space.positions, self.space.velocities)
         )
         near, start = isotropic(3, _START_M), isotropic(3, CONSTANT_VELOCITY.start[0])
-        for joint in there.tolist():
+        for joint in present.tolist():
             position, velocity = int(x[joint]), int(v[joint])
             if linked[joint]:
                 before = one.person, joint, int(last_frame[joint])
@@ -185,7 +185,7 @@ class PeopleInGraph:
             made.times_s |= {position: one.time_s, velocity: one.time_s}
         for factor in self._seen(one, seen, x):
             made.graph.push_back(factor)
-        last_s[there], last_frame[there] = one.time_s, one.frame
+        last_s[present], last_frame[present] = one.time_s, one.frame
 
     def _seen(
         self, one: Sighting, seen: NDArray[np.bool_], x: NDArray[np.int64]

@@ -59,10 +59,10 @@ def robust_kernel(name: KernelName | None, width_sigma: float | None = None) -> 
 def kernel_weight(
     name: KernelName | None, whitened_norm: ArrayLike, width_sigma: float | None = None
 ) -> NDArray[np.float64]:
-    """Weight (...,) of the kernel for residuals with the whitened norm `whitened_norm` (...,); 1 at
+    """Weight (...,) of the kernel for residuals with this `whitened_norm` (...,); 1 for a norm of
     0.
 
-    This is the weight of the squared residual when GTSAM linearises a robust factor, for arrays.
+    It is the weight of the squared residual when GTSAM linearises a robust factor.
     """
     r = np.asarray(whitened_norm, dtype=np.float64)
     if name is None:

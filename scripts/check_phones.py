@@ -3,8 +3,8 @@
     python scripts/check_phones.py --rooms 6:18
     python scripts/check_phones.py --rooms 6:18 --logs
 
-The rooms are those of tests/cameras/filmed_by_phones.py; people walk as in the recorded motions
-of `--data FOLDER` (or SHAPEPOSE_DATA). The command is told 65 degrees, --focal and one distance, or
+The rooms are those of tests/cameras/filmed_by_phones.py; people walk as in the recorded motions of
+`--data FOLDER` (or SHAPEPOSE_DATA). The command is given 65 degrees, --focal and one distance, or
 with `--logs` the lenses that the phones have logged. It prints the rows of the table in
 docs/evaluation/cameras.md: errors, and in brackets two standard deviations; the numbers of fixed
 phones whose rotation and position are within theirs; for the carried phone the bound of its error

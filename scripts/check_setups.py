@@ -4,10 +4,9 @@ detectors.
     python scripts/check_setups.py --rigs 0:20 --output checks.csv
 
 Simulated rooms with 3 to 6 cameras and 1 to 8 people, 6 s each. In every room the same kinds of
-faults are simulated with a detector of typical errors; detectors with lasting biases are simulated
-without faults. Run it from a clone. It prints the tables of docs/evaluation/cameras.md, with --read
-of files that it wrote. About a minute
-and a half per room on one core.
+faults are simulated with a detector of typical errors; detectors with persistent biases are
+simulated without faults. Run it from a clone. It prints the tables of docs/evaluation/cameras.md,
+with --read of files that it wrote. About a minute and a half per room on one core.
 """
 
 import csv
@@ -158,7 +157,7 @@ def _faults(seen: Recording, scene: Scene, rng: np.random.Generator) -> Iterator
 def _biased(
     seen: Recording, scene: Scene, rng: np.random.Generator
 ) -> Iterator[tuple[str, Recording]]:
-    """The recording as detected by detectors with lasting biases."""
+    """The recording as detected by detectors with persistent biases."""
     shape = scene.people, 25, len(scene.rig)
     people = np.array([scene.truth_at(frame) for frame in range(len(seen))])
     yield "no bias", seen

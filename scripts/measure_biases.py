@@ -1,5 +1,5 @@
-"""Measure a detector's lasting biases (`shapepose_fg/cameras/check/biases.py`) on a recording with
-well-calibrated cameras.
+"""Measure a detector's persistent biases (`shapepose_fg/cameras/check/biases.py`) on a recording
+with well-calibrated cameras.
 
     python scripts/measure_biases.py calibration.json detections [--up z]
 

@@ -127,7 +127,7 @@ def held_back(mocap: Mocap) -> Iterator[Case]:
             yield Case(label, label, make, span, 1001, config)
 
 
-def who_is_there(mocap: Mocap | None, split: Split, seeds: Sequence[int]) -> Iterator[Case]:
+def crowds_and_crossings(mocap: Mocap | None, split: Split, seeds: Sequence[int]) -> Iterator[Case]:
     """4 s of crowds of eight people and crossings of seven with 2 to 8 cameras, at 10 to 60 frames
     a second, and of two people; single frames at 30 frames a second only, since they are
     independent of the rate.
@@ -197,7 +197,7 @@ def main(
 ) -> None:
     """Measure the requested tables, and print or write them."""
     motions = None if mocap is None else Mocap.load(mocap)
-    tables = {"who is there": who_is_there(motions, split, seed or range(6101, 6106))}
+    tables = {"who is there": crowds_and_crossings(motions, split, seed or range(6101, 6106))}
     if motions is not None:
         tables = {"time": in_time(motions, split), "held back": held_back(motions), **tables}
     for name in only or tables:

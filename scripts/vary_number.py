@@ -1,4 +1,4 @@
-"""Measure what a number of the code is worth: results with other values, on the same recordings.
+"""Measure the effect of a number in the code: results with other values, on the same recordings.
 
     python scripts/vary_number.py tracking.track_selection._COST 0.2 x2 --mocap cmu_smpl24.npz
     python scripts/vary_number.py estimation.draft.DISAGREE inf --real rig.json detections truth 25

@@ -33,10 +33,10 @@ from shapepose_fg.estimation.gated_views import MIN_DEPTH_M
 from shapepose_fg.estimation.trajectory_graph import correlated
 
 _LEAST_S, _LEAST_WAY_M = 4.0, 0.4
-"""Minimum common duration of two tracks, s, and standard deviation of the person's position in it,
-m."""
+"""Minimum duration that two tracks have in common, s, and minimum standard deviation of the
+person's position during it, m."""
 _SAME_M = 0.7
-"""Maximum motion of a person between moments, m."""
+"""Maximum motion of a person between sampled times, m."""
 _AGREE_M, _NEAR_M = 0.5, (0.6, 0.3, 0.2)
 """Distance, m, between positions from a person's size and those of the other cameras that agree;
 and maximum median distance of a person's joints from their detections, m, by round."""
@@ -76,7 +76,7 @@ _QUARTERS = rigid(
 
 @dataclass(frozen=True)
 class Placed(Rows):
-    """People at regular moments, in three dimensions, with their tracks."""
+    """People at regular times, in three dimensions, with their tracks."""
 
     time_s: Array
     """(P,) time of each person, seconds."""
@@ -134,7 +134,7 @@ class Placed(Rows):
         return cls.of(moments[people.frame], people.frame, people.points, spread)
 
     def grid(self, track: int, length: int) -> Array:
-        """(length, J, 3) positions of a track by moment; NaN where unknown."""
+        """(length, J, 3) positions of a track by sampled time; NaN where unknown."""
         rows = np.flatnonzero(self.track == track)
         found = np.full((length, *self.points.shape[1:]), np.nan)
         found[self.moment[rows]] = self.points[rows]
@@ -166,12 +166,12 @@ def _moved_by(people: People, found: Adjusted) -> Array:
 
 @dataclass(frozen=True)
 class Start:
-    """The start of the odometry of a moving camera."""
+    """Where and when the odometry of a moving camera starts, relative to the fixed cameras."""
 
     wTo: Array
     """(4, 4) world from odometry."""
     bTc: Array
-    """(4, 4) the camera on the carrier: a quarter turn of the picture."""
+    """(4, 4) carrier from camera: a rotation of the picture by a multiple of 90 degrees."""
     offset_s: float
     """Time of the fixed cameras' clock at time 0 of the camera's own, s."""
     focal: float = 1.0
@@ -183,7 +183,7 @@ class Start:
     stretch: float = 1.0
     """Ratio of the world's unit to that of the odometry."""
     knots_s: Array = field(default_factory=lambda: np.zeros(1))
-    """(K,) times on the camera's own clock between which its drift is linear."""
+    """(K,) times on the camera's own clock between which the odometry's drift is linear."""
     drift: Array = field(default_factory=lambda: np.zeros((1, 6)))
     """(K, 6) corrections of the odometry's drift in the world: rotation vectors and metres."""
     agreeing: float = 0.0
@@ -266,9 +266,9 @@ class Filmed:
     camera: Camera
     """The camera."""
     trajectory: Trajectory
-    """Its odometry, on its own clock."""
+    """The camera's odometry, on the camera's own clock."""
     own_s: Array
-    """(F,) times of frames with people, ascending, on its own clock."""
+    """(F,) times of frames with people, ascending, on the camera's own clock."""
     rays: Array
     """(F, K, J, 3) joints of up to K people of a frame at depth 1 in the camera; NaN for none."""
 
@@ -456,13 +456,13 @@ class _Fit:
 
     filmed: Filmed
     start: Start
-    """The start before the adjustment."""
+    """Start of the odometry (pose, time, lens) before the adjustment."""
     placed: Placed
     """(N,) people."""
     frame: Index
-    """(N,) frames in which the camera sees them."""
+    """(N,) frames in which the camera sees the people."""
     rays: Array
-    """(N, J, 3) their joints in the camera, at depth 1."""
+    """(N, J, 3) joints of the people in the camera, at depth 1."""
     sigmas: Array
     """(12,) prior standard deviations of the parameters before the drift; 0: fixed."""
 
@@ -625,12 +625,12 @@ def _root_mean_square(slopes: Array, covariance: Array, more: float) -> tuple[fl
 
 
 def _with_drift(information: Array, x: Array, kinds: Index) -> tuple[Array, Array]:
-    """Ratios (2,) of the drift's rotations and translations to their standard deviations, root mean
-    square over their probability, and the covariance of the parameters `x` for these.
+    """Ratios (2,) of the actual to the stated standard deviations of the drift's rotations and
+    translations, and the covariance of the parameters `x` with the actual ones.
 
-    Parameters have a unit prior that `information` does not include; they are rotations (0 in
-    `kinds`) or translations (1) of the drift, or others (-1). The ratios' prior is log-normal;
-    parameters are integrated out.
+    The ratios have a log-normal prior; the result is the root mean square under their posterior,
+    with the parameters integrated out. Parameters have a unit prior that `information` does not
+    include; they are rotations (0 in `kinds`) or translations (1) of the drift, or others (-1).
     """
     both = information @ x + x
 
@@ -651,7 +651,7 @@ def _with_drift(information: Array, x: Array, kinds: Index) -> tuple[Array, Arra
 
 @dataclass(frozen=True)
 class _Spectrum:
-    """Fourier transforms of a track's moments, for its registration at all lags."""
+    """Fourier transforms of a track, for its registration at all lags."""
 
     known: NDArray[np.complex128]
     """(L, J) mask of joints."""
@@ -713,8 +713,8 @@ def _lasts(grid: Array) -> bool:
 
 
 def _nearest(own: Array, times: Array) -> Index:
-    """(M,) frame, of those at `own` (T,), ascending or NaN, nearest to each time; -1 if half a
-    moment lies between.
+    """(M,) frame, of those at `own` (T,), ascending or NaN, nearest to each time; -1 if it is
+    farther than half a sampling interval.
     """
     finite = np.flatnonzero(np.isfinite(own))
     after = np.searchsorted(own[finite], times).clip(1, len(finite) - 1)

@@ -60,7 +60,9 @@ class Footage:
     def of(
         cls, detections: DetectionSequence | OneClock, rig: Rig, times: FrameTimes, frames: range
     ) -> "Footage":
-        """Sightings in frames spread over the recording, as many as add information."""
+        """Sightings in frames spread over the recording; more frames would add cost but hardly any
+        information.
+        """
         taken = times.frame_s[frames.start : frames.stop]
         lasts = float(taken[-1] - taken[0])
         count = max(2, min(MOST_FRAMES, len(taken), 1 + int(lasts / _LEAST_STEP_S)))

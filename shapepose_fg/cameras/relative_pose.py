@@ -72,7 +72,7 @@ class Together:
         )
         self.rays = (one.rays, other.rays)
         self.size = (one.size, other.size)
-        self.alike = _at_once(rows[0]), _at_once(rows[1])
+        self.overlapping = _at_once(rows[0]), _at_once(rows[1])
 
     def misses(self, E: Array) -> Array:
         """(H, K) residuals of pairs of tracks under essential matrices (H, 3, 3), as shares of
@@ -106,7 +106,9 @@ class Together:
         kept, (a, b) = np.zeros(len(miss), dtype=bool), self.tracks.T
         for n in order[score[order] > 0].tolist():
             # A track cannot be two people at once.
-            rival = ((a == a[n]) & self.alike[1][b[n], b]) | ((b == b[n]) & self.alike[0][a[n], a])
+            rival = ((a == a[n]) & self.overlapping[1][b[n], b]) | (
+                (b == b[n]) & self.overlapping[0][a[n], a]
+            )
             kept[n] = not (kept & rival).any()
         return kept, float(score[kept].sum() / max(self.possible, 1))
 

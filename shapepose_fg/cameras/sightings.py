@@ -153,7 +153,8 @@ class Pairs:
     views: Index
     """(M, 2) cameras of the two sightings."""
     error: Array
-    """(M,) median distance of their rays, as a share of the person's size in the picture."""
+    """(M,) median distance between the rays of the two sightings, as a share of the person's size
+    in the picture."""
     frame: Index
     """(M,) frame of each pair."""
     third: Index

@@ -61,7 +61,7 @@ def simulate(
     from shapepose_fg.simulation import DetectorConfig
     from shapepose_fg.simulation import simulate as run_detector
     from shapepose_fg.simulation.files import check_output, named_scene, write_simulated
-    from shapepose_fg.simulation.visibility import FRAMES_WORTH_A_WORKER
+    from shapepose_fg.simulation.visibility import FRAMES_A_WORKER
 
     last = re.search(r":\s*(\d{1,6})\s*$", frames or "")
     made = named_scene(
@@ -76,7 +76,7 @@ def simulate(
     span = frame_range(frames, len(made))
     part = made.part(span)
     check_output(part, output, format)
-    workers = suitable_workers(len(span), FRAMES_WORTH_A_WORKER) if workers is None else workers
+    workers = suitable_workers(len(span), FRAMES_A_WORKER) if workers is None else workers
     start = time.perf_counter()
     with progress_bar("simulating") as progress:
         detections = run_detector(

@@ -1,4 +1,4 @@
-"""Short names of array types; shapes are given in docstrings. Keys of pairs."""
+"""Short names of array types (shapes are given in docstrings), and keys of pairs of integers."""
 
 import numpy as np
 from numpy.typing import NDArray

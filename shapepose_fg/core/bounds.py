@@ -1,5 +1,5 @@
-"""Settings with bounds: declared in the type of a field, and checked whenever settings are
-created. Types of options with few values.
+"""Settings with bounds: declared in the type of a field, and checked whenever settings are created.
+It also has the types of options with a few allowed values.
 """
 
 from functools import cache

@@ -69,7 +69,8 @@ def naming(
     `cure` at its end.
 
     `words` is the sentence between them, with {} for the error. With `kinds`, errors of these
-    classes are meant, of other libraries: of their messages the first line is used.
+    classes, from other libraries, are converted instead; only the first line of their messages is
+    used.
     """
     caught = kinds or (ValueError,)
     try:

@@ -24,8 +24,8 @@ class CameraClock:
     name: str
     """The camera's name."""
     time: Array
-    """(N,) increasing times of its frames on the common clock; seconds, or frames if there is no
-    clock."""
+    """(N,) increasing times of the camera's frames on the common clock; seconds, or frames if there
+    is no clock."""
     period: float
     """Time from one frame to the next, in the same unit."""
 

@@ -122,7 +122,7 @@ class ObservationTable(Table):
         """The table of N solved rows, from their observations and their solved `joints` (N, J, 3),
         metres.
 
-        The rows have the observations' `frame` and `track` (as the person). `place` (N, J, V) is
+        The rows have the observations' `frame`, and their `track` as `person`. `place` (N, J, V) is
         each detection's `Detections.place`, `gate` (N, J, V) are the codes of `Gate`; missing
         detections, joints without a position and points behind a camera get their own codes,
         independent of `gate`. `carried` are the observations extrapolated to the frames' times, for

@@ -74,8 +74,10 @@ class ReadInputs:
 
 def program_digest() -> str:
     """SHA-256 of this program and its data: equal for runs of the same version."""
-    here, data = Path(__file__).parent.parent, (".py", ".npz", ".json", ".safetensors")
-    parts = (_digest(package, data) for package in (here, here.with_name("factors")))
+    package_folder, data = Path(__file__).parent.parent, (".py", ".npz", ".json", ".safetensors")
+    parts = (
+        _digest(package, data) for package in (package_folder, package_folder.with_name("factors"))
+    )
     return hashlib.sha256(" ".join(parts).encode()).hexdigest()
 
 

@@ -132,8 +132,8 @@ class Reconstruction(Table):
     """Body shape and covariance of each identity, named by its number; `save` does not write
     them."""
     rig: Rig | None = None
-    """The cameras with which it was solved, set by `reconstruct`; None if unknown. `load` does not
-    read them (`read_rig(folder / "cameras.json")`)."""
+    """The cameras with which the result was solved, set by `reconstruct`; None if unknown. `load`
+    does not read them (`read_rig(folder / "cameras.json")`)."""
 
     ROWS: ClassVar = (
         "frame person time_s joints covariance velocity velocity_covariance known confidence"

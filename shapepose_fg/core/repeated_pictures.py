@@ -40,9 +40,9 @@ class WithoutRepeats(DerivedFrames):
 
     def __getitem__(self, frame: int, /) -> Detections:
         every, repeated = self._frame(frame)
-        gone = repeated.copy()
-        gone[list(self.trust.excluded(frame))] = True
-        return every.only(~gone[every.view]) if gone.any() else every
+        excluded = repeated.copy()
+        excluded[list(self.trust.excluded(frame))] = True
+        return every.only(~excluded[every.view]) if excluded.any() else every
 
     def repeated(self, frame: int) -> tuple[int, ...]:
         """The views with detections in `frame` that repeat those of the frame before."""

@@ -40,8 +40,8 @@ class NamedNetwork:
     size: tuple[int, int]
     """Width and height of the network's input, pixels."""
     boxes: str | None = None
-    """Name of the YOLOX network that detects people for it; None if this network itself
-    detects people."""
+    """Name of the YOLOX network that detects people for this network; None if it detects people
+    itself."""
 
 
 @lru_cache(maxsize=1)

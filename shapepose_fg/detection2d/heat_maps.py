@@ -68,9 +68,10 @@ class HeatMapNetwork:
     network: OnnxNetwork
     """The network."""
     layout: NetworkLayout
-    """The layout of its output."""
+    """The layout of the network's output."""
     long_side: int = _LONG_SIDE
-    """Longer side of its input, pixels: a larger input detects smaller people, and takes longer."""
+    """Longer side of the network's input, pixels: a larger input detects smaller people, and takes
+    longer."""
     suffix, tail = ".txt", ""
 
     @classmethod

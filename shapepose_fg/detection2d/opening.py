@@ -73,13 +73,13 @@ def open_network(
         opened = BoxNetwork(opened, people.model_copy(update={"size": opened.size or people.size}))
         opened.find(np.zeros((64, 64, 3), dtype=np.uint8))
     keypoints = OnnxNetwork.open(form.network, device=device)
-    for name, there in (
+    for name, known in (
         (form.input, keypoints.inputs),
         *((each, keypoints.outputs) for each in form.outputs or ()),
     ):
-        if name is not None and name not in there:
+        if name is not None and name not in known:
             raise InputError(
-                f"{network}: the network has no {name!r}, but {' '.join(there)}; name one of these"
+                f"{network}: the network has no {name!r}, but {' '.join(known)}; name one of these"
             )
     form = form.model_copy(update={"size": keypoints.size or form.size})
     return TopDownNetwork.of(keypoints, form, find_skeleton(form.skeleton), opened)

@@ -211,9 +211,9 @@ def _refuse_others(run: DetectionRun, unfinished: Path) -> None:
             f"{unfinished}: this is not a run of this program; delete the folder, or give "
             "another --output"
         )
-    elif there := [place for place in places if place.exists()]:
+    elif existing := [place for place in places if place.exists()]:
         raise InputError(
-            f"{there[0]}: there are detections already; delete them, or give another --output"
+            f"{existing[0]}: there are detections already; delete them, or give another --output"
         )
 
 

@@ -39,9 +39,9 @@ class KeypointForm(BaseModel, extra="forbid"):
     """Output of the network: for each joint two 1D distributions along x and y (SimCC), a heat map,
     or x, y and score."""
     input: str | None = None
-    """Name of its input; None for the only one."""
+    """Name of the network's input; None for the only one."""
     outputs: list[str] | None = None
-    """Names of its outputs: x and y of SimCC, otherwise one; None for the first ones."""
+    """Names of the network's outputs: x and y of SimCC, otherwise one; None for the first ones."""
     size: tuple[Side, Side] = (192, 256)
     """Width and height of the network's input, pixels, if the ONNX file does not fix them."""
     colours: Literal["bgr", "rgb"] = "bgr"
@@ -92,7 +92,7 @@ class TopDownNetwork:
     form: KeypointForm
     """Description of the network."""
     skeleton: Skeleton
-    """Skeleton of its joints."""
+    """Skeleton to which the network's joints are assigned."""
     place: Index
     """(N,) index of each of the network's joints among the skeleton's K keypoints, -1 for none."""
     boxes: BoxNetwork | None

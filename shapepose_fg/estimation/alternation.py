@@ -1,7 +1,7 @@
 """Algorithm 1 of the paper, frame by frame: body fits (Theta step) and joints (X step) in turn.
 
-For the paper's preset, and for fitters without a body model. Otherwise joints and bodies are one
-problem (`body_solution.py`).
+It is used by the paper's preset and by fitters without a body model; otherwise joints and bodies
+are one problem (`body_solution.py`).
 """
 
 from collections.abc import Sequence

@@ -59,7 +59,7 @@ STEPS, SETTLED_M = 8, 2e-3
 """Maximum number of steps of the solver, and mean motion of joints below which it ends, metres. The
 last step, by GTSAM, then moves them by a tenth of that."""
 HELD = 1e-6
-"""Information on every unknown, so that what nothing determines stays where it is."""
+"""Information added to every unknown, so that undetermined ones keep their values."""
 DAMPING = 1e-3
 
 
@@ -121,7 +121,7 @@ class BodyWindow:
     """The model of one person in T frames."""
 
     over_time = True
-    """Whether rows are a person's in one frame after the other."""
+    """Whether the rows are successive frames of one person."""
     deviation_m = DEVIATION_M
 
     def __init__(
@@ -134,7 +134,7 @@ class BodyWindow:
         motion: MotionModel,
         law: Motion,
     ):
-        """Make the model of T rows of one person, times rising; `sigmas_px` (T, J, V) as
+        """Make the model of T rows of one person, in order of time; `sigmas_px` (T, J, V) as
         `observation_sigmas`.
         """
         self.observations, self.sigmas_px, self.views, self.config = (
@@ -185,7 +185,7 @@ class BodyWindow:
         return self._descended(state)
 
     def _descended(self, state: BodyState) -> BodyState:
-        """The state of least cost; the solver starts at `state`, where `last` is linearised."""
+        """The state of least cost; the solver starts at `state`, at which `last` was linearised."""
         around, damping, done = self.last, DAMPING, False
         for _ in range(STEPS):
             if done:
@@ -378,7 +378,9 @@ class BodyWindow:
         return (around.gain @ deviation[..., None])[..., 0]
 
     def _faster(self, bodies: Array) -> Array:
-        """(T - 1, J) how many times the mean density of acceleration each joint has, at least 1."""
+        """(T - 1, J) ratio of each joint's density of acceleration to its mean over all speeds, at
+        least 1.
+        """
         X = bodies + self.origin
         evidence = linearise(self.observations, self.sigmas_px, X, self.views, self.config)
         points = np.where(np.isfinite(evidence.target).all(-1, keepdims=True), evidence.target, X)
@@ -396,7 +398,7 @@ class BodyWindow:
         return energy, pull[:T]
 
     def _eliminated(self, root: Array, around: Around, damping: float) -> tuple[Array, Array]:
-        """The factor of the poses and what is left of the betas
+        """The factor of the poses, and the system of the betas after the poses are eliminated
         (`body/kernels/solving.eliminated`).
         """
         T, N = around.pull.shape
@@ -477,8 +479,8 @@ class Marginals:
     poses: Array
     """(T, N, N) covariances of each frame's root (tangents of the world), angles and place."""
     steps: Array
-    """(T, N, N) covariances of the next frame's pose, rows, with this one's, columns; zero in
-    the last."""
+    """(T, N, N) cross-covariances of the next frame's pose (rows) with that of each frame
+    (columns); zero in the last frame."""
     shape: Array
     """(10, 10) covariance of the betas; of single frames (T, 10, 10)."""
     across: Array
@@ -526,8 +528,8 @@ class Marginals:
         first, last, lasts = moments(self.window.times_s)
         across = own[first]
         for k in range(int((last - first).max(initial=0))):
-            there = np.minimum(first + k, T - 2)
-            across = np.where((first + k < last)[:, None, None, None], goes[there] @ across, across)
+            step = np.minimum(first + k, T - 2)
+            across = np.where((first + k < last)[:, None, None, None], goes[step] @ across, across)
         found = (own[first] + own[last] - across - across.mT) / lasts[:, None, None, None] ** 2
         # Standing feet move no farther than their random walk.
         walk = np.minimum(self.window.walk, 1.0) * np.diff(self.window.times_s)[:, None]

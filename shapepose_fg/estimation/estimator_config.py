@@ -52,9 +52,9 @@ class RefineConfig(Settings):
     max_sigma_m: Metres = 0.5
     """Maximum standard deviation of a joint determined by its views, in the worst direction, m."""
     with_body: bool = True
-    """Whether joints and bodies are one problem (`body_window.BodyWindow`), and X_0 is an initial
-    estimate of all joints. In the paper bodies and joints are found in turn, and joints that stage
-    I does not find are missing until the body gives them a position."""
+    """Whether joints and bodies are solved as one problem (`body_window.BodyWindow`), from an
+    initial estimate X_0 of all joints. In the paper bodies and joints are solved in turn, and
+    joints that stage I does not find are missing until the body gives them a position."""
 
     @classmethod
     def paper(cls) -> "RefineConfig":

@@ -17,7 +17,7 @@ class FactorEvidence:
     name: str
     """Name of the function that created the factor."""
     others: tuple[tuple[int, int, int], ...]
-    """Joints that it connects this one to: person, joint and frame of each."""
+    """Joints to which the factor connects this joint: person, joint and frame of each."""
     information: Array
     """(3, 3) information on the joint's position, 1/m², given the covariance of the factor's other
     variables without this factor."""
@@ -61,13 +61,13 @@ def _evidence(
     ends = np.cumsum([0, *sizes])
     at = {each: np.arange(ends[n], ends[n + 1]) for n, each in enumerate(keys)}
     H = np.asarray(linear.information())
-    mine, others = at[key], [each for each in keys if each != key]
-    information = H[np.ix_(mine, mine)]
+    own, others = at[key], [each for each in keys if each != key]
+    information = H[np.ix_(own, own)]
     if len(others) > 0:
         rest = np.concatenate([at[each] for each in others])
         joint = marginals.jointMarginalCovariance(gtsam.KeyVector(others))
         covariance = np.block([[joint.at(a, b) for b in others] for a in others])
-        across = H[np.ix_(mine, rest)]
+        across = H[np.ix_(own, rest)]
         # H_jj - H_jo (H_oo + C^-1)^-1 H_oj, for a covariance C of any rank.
         known = covariance @ np.linalg.inv(np.eye(len(rest)) + H[np.ix_(rest, rest)] @ covariance)
         information = information - across @ known @ across.T

@@ -30,17 +30,18 @@ class FactorSolution:
     covariance: Array
     """(T, J, 3, 3) covariances of the joints in the graph, m²."""
     marginals: Marginals
-    """Those of the model."""
+    """Marginal covariances of the person's window in this solution."""
 
 
 def solve_with_factors(
     people: Sequence[BodyGraph], config: WindowGraphConfig
 ) -> list[FactorSolution]:
-    """Solve the people of a window who have active user factors; those whom factors couple as one
-    graph.
+    """Solve the people of a window who have active user factors; people whom factors couple are
+    solved as one graph.
 
-    A round is a minimum by GTSAM of the graph around the present bodies; then bodies are linearised
-    and detections gated anew. People whose solution fails are as they were, with a `failure`.
+    In each round GTSAM minimises the graph linearised at the present bodies; then bodies are
+    linearised, and detections gated, again. People whose solution fails keep their previous state,
+    with a `failure`.
     """
     found = list[FactorSolution]()
     for ties in {id(each.ties): each.ties for each in people if each.ties.factors}.values():

@@ -164,8 +164,9 @@ def _where(error: RuntimeError, people: Sequence[PersonWindow], names: Sequence[
     if key is None or all(key not in set(person.state_keys.ravel().tolist()) for person in people):
         return ""
     joint = split_key(key)
-    who = f" of person {joint.person}" if len(people) > 1 else ""
-    return f" near {names[joint.joint]}{who} in frame {joint.frame}: no factor determines it there"
+    of_person = f" of person {joint.person}" if len(people) > 1 else ""
+    place = f"{names[joint.joint]}{of_person} in frame {joint.frame}"
+    return f" near {place}: no factor determines it there"
 
 
 def gtsam_cameras(views: Views) -> list[gtsam.PinholeCameraCal3_S2]:

@@ -14,12 +14,14 @@ MISSED = 0.2
 """Share of joints in plain view with a missing or weak detection, in simulated crowds. One, two,
 three, four views miss 0.18, 0.046, 0.010 and 0.003 of them simultaneously, as if independent."""
 UNUSUAL = 3e-4
-"""Prior share of joints in poses unknown to the detector: an assumption, since the simulation has
-none. Three views that miss a joint add 5 cm, four 10 cm."""
+"""Prior probability that a detector misses a joint in plain view because the pose is unusual: an
+assumption, since the simulated detector knows all poses. With it, a joint's standard deviation
+grows by 5 cm if three views miss it, and by 10 cm if four do."""
 ELSEWHERE_M = 0.25
-"""Standard deviation per axis of such a joint, metres: within reach of its neighbour. Also an
-assumption: in simulated crowds with three and four cameras and a detector that knows every pose,
-the log score gives this no weight; the evidence is a stretched arm on real footage."""
+"""Standard deviation per axis , metres, of a joint in an unusual pose (`UNUSUAL`) from the body's:
+within reach of its neighbour. Also an assumption: in simulated crowds with three and four cameras
+and a detector that knows every pose, the log score gives this no weight; the evidence is a
+stretched arm on real footage."""
 _BEHIND_M = 0.05
 """Minimum depth behind a limb for occlusion, m."""
 ARMS_AND_LEGS = {

@@ -72,8 +72,9 @@ class MotionModel:
         return self.psd_still + self.psd_speed * np.asarray(speed_m_s) ** 2
 
     def faster(self, points: Array, variance: Array, times_s: Array) -> Array:
-        """(T - 1, J) how many times the mean density over all speeds the accelerations of points
-        (T, J, 3), metres, have in each step, at least 1; arguments as `in_time.motion_of`.
+        """(T - 1, J) ratio of the power spectral density of the accelerations of points (T, J, 3),
+        metres, in each step to its mean over all speeds, at least 1; arguments as
+        `in_time.motion_of`.
         """
         speed, turning = motion_of(points, variance, times_s)
         return np.maximum(np.maximum(self.acceleration(speed), turning) / self.psd_lost, 1.0)

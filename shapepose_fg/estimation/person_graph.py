@@ -35,7 +35,7 @@ definition, but GTSAM's solver wants a finite one."""
 
 
 class BodyGraph(PersonWindow):
-    """A person's window as a GTSAM graph around a solution; made when it is asked for.
+    """A person's window as a GTSAM graph around a solution; built on first use.
 
     Variables are the joints (`keys`), the body of each frame (`body_keys`): a vector of the root's
     turn since the first solution (axis times angle, rad, axes of the world), the visible angles,

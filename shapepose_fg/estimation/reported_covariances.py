@@ -28,7 +28,7 @@ this share."""
 _LASTS_S, _LASTS, _PRIOR_COUNT = 1.0, 0.4, 20.0
 """Time lag, s, at which residuals are compared for correlated errors; the prior share of correlated
 errors, and the prior's weight, as a number of squared standard deviations."""
-_LOOKS = 8
+_SINGLE_FRAMES = 8
 """Number of frames, spread evenly over the window, in which single-frame variances are computed."""
 _ANYWHERE = 1e-3
 """Prior information on the place and direction of a body in a single frame, 1/m² and 1/rad²."""
@@ -120,7 +120,7 @@ def correlation_features(marginals: Marginals) -> tuple[float, float]:
     Errors that are new in every frame are averaged over time, correlated ones are not.
     """
     window, last = marginals.window, marginals.window.last
-    some = slice(None, None, max(len(window) // _LOOKS, 1))
+    some = slice(None, None, max(len(window) // _SINGLE_FRAMES, 1))
     seen = np.asarray(last.evidence.inlier.any(axis=-1))[some]
     if not seen.any():
         return 1.0, 1.0

@@ -317,5 +317,5 @@ def poses_of(values: gtsam.Values, keys: NDArray[np.int64]) -> Array:
 
 
 def symmetric(covariance: Array) -> Array:
-    """Return a covariance with rounding errors symmetrised."""
+    """Return the covariance made exactly symmetric: rounding errors are removed."""
     return (covariance + covariance.swapaxes(-1, -2)) / 2

@@ -58,7 +58,8 @@ class CoupledGraph:
     computed: set[int] = field(default_factory=set)
     """Identities of the factors whose error has been computed."""
     problem: str = ""
-    """First of these factors whose error is not finite; empty if there is none."""
+    """Description of the first user factor with an error that is not finite; empty if there is
+    none."""
 
     def tie(self, nodes: Iterable[tuple[int, int]]) -> None:
         """Record that a factor couples these variables (`parts`)."""

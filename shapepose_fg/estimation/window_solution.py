@@ -122,12 +122,12 @@ class WindowSolution(Rows):
 
 @dataclass(frozen=True)
 class Sources:
-    """What a joint's estimate consists of, for explaining it."""
+    """Sources of the information about a joint, for explaining its estimate."""
 
     place: Array
     """(3,) the joint, metres."""
     whole: Array
-    """(3, 3) all information on it, 1/m²."""
+    """(3, 3) all information on the joint, 1/m²."""
     of_body: Array
     """(3, 3) information from the body in the same frame, without the joint's own views."""
     widen: float
@@ -200,7 +200,7 @@ class PersonGraph:
         return one[2] == other[2] or any({one[:2], other[:2]} <= p for p in self.window.ties.parts)
 
     def sources(self, t: int, joint: int) -> Sources | None:
-        """What a joint in row `t` is known from; None if it is unknown."""
+        """Sources of the information about a joint in row `t`; None if its position is unknown."""
         if not np.isfinite(self.covariance[t, joint]).all():
             return None
         whole = np.asarray(np.linalg.inv(self.covariance[t, joint]), dtype=np.float64)

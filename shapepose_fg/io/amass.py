@@ -40,7 +40,7 @@ class AmassMotion:
 
 
 def read_amass(file: Path) -> AmassMotion:
-    """Read a motion; InputError, naming the file, if it is none or if it is damaged."""
+    """Read a motion; InputError, naming the file, if it is not a motion, or is damaged."""
     arrays = read_npz(file, (*_COLUMNS, *_RATES, "body"), "download it again")
     with naming(file, "give motions in AMASS's format"):
         columns = checked_columns(_COLUMNS, arrays, {})

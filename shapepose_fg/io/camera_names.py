@@ -1,6 +1,7 @@
 """Camera names and frame numbers from file names."""
 
 import re
+import unicodedata
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -13,6 +14,21 @@ _WORDS = re.compile(r"[^\W\d_]+|\d{1,18}", re.ASCII)
 _NUMBERS = re.compile(r"\d+")
 
 
+def composed(name: str) -> str:
+    """A name with composed letters (Unicode NFC). macOS writes decomposed ones, which look the
+    same.
+    """
+    return unicodedata.normalize("NFC", name)
+
+
+def in_any_form(place: Path) -> Path:
+    """The path, or the entry of its folder that has the same name in another Unicode form."""
+    if place.name.isascii() or place.exists() or not place.parent.is_dir():
+        return place
+    entries = place.parent.iterdir()
+    return next((each for each in entries if composed(each.name) == composed(place.name)), place)
+
+
 def match_names(cameras: Sequence[str], names: Sequence[str]) -> list[int] | None:
     """For each camera, the index of its name among `names`, which may be longer or spelled
     differently.
@@ -23,6 +39,7 @@ def match_names(cameras: Sequence[str], names: Sequence[str]) -> list[int] | Non
     (`2022-09-19_synced_Cam1` is `view_01_json`). None if a camera has no match or several: nothing
     is guessed.
     """
+    cameras, names = ([composed(each) for each in listed] for listed in (cameras, names))
     words = [
         re.compile(rf"(?<![A-Za-z0-9]){re.escape(camera)}(?![A-Za-z0-9])") for camera in cameras
     ]

@@ -30,11 +30,11 @@ def lenses_of(detections: Path, fields: Sequence[str], size: tuple[int, int] | N
     """Cameras without poses, one for each file or folder of `detections`, in the order of their
     names.
 
-    `fields` are fields of view along the longer side of a picture in degrees, upright or not,
-    photos of the same lens with the focal length in EXIF, or logs of the phone with its intrinsics
-    (.csv); `CAMERA=` before a value restricts it to one camera. `size` is (width, height) of the
-    pictures, pixels; by default it is read from footage.json, which `detect` writes. InputError
-    names what is missing.
+    `fields` are fields of view in degrees, along the longer side of a picture (the vertical one if
+    it is upright), photos of the same lens with the focal length in EXIF, or logs of the phone with
+    its intrinsics (.csv); `CAMERA=` before a value restricts it to one camera. `size` is (width,
+    height) of the pictures, pixels; by default it is read from footage.json, which `detect` writes.
+    InputError names what is missing.
     """
     names = camera_names(detections)
     given = dict(

@@ -258,12 +258,12 @@ def _detections(folder: Path, has_videos: bool) -> Path:
     """
 
     def is_pose(path: Path) -> bool:
-        there = (
+        has_poses = (
             len(numbered(path, FRAME_FILE)) > 0
             if path.is_dir()
             else path.suffix in (".json", ".txt")
         )
-        return there and not path.name.startswith(".")
+        return has_poses and not path.name.startswith(".")
 
     for place in (folder / name for name in _POSES):
         if place.is_dir() and any(map(is_pose, place.iterdir())):

@@ -79,9 +79,9 @@ def own_times(recording: DetectionTable, times: FrameTimes, views: int) -> Array
     return own if recording.picture is None else np.where(recording.picture >= 0, own, np.nan)
 
 
-def _own(there: Mask) -> Index:
+def _own(exists: Mask) -> Index:
     """(T, V) frame number for frames that a camera has, otherwise -1."""
-    return np.where(there, np.arange(len(there))[:, None], -1)
+    return np.where(exists, np.arange(len(exists))[:, None], -1)
 
 
 def write_moments(file: Path, rig: Rig, picture: Index) -> None:

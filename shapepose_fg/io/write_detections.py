@@ -41,7 +41,8 @@ def write_association(recording: DetectionSequence, rig: Rig, folder: str | Path
             )
     if rig.up != "z":
         raise ValueError(
-            f"the format has z up, but this rig {rig.up}; rotate the world and the truth first"
+            f"the format has z up, but in this rig {rig.up} is up; rotate the world and the truth "
+            "first"
         )
     folder, calibration = Path(folder), dict[str, Any]()
     for camera in rig.cameras:

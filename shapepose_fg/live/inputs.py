@@ -162,7 +162,7 @@ class _Client:
     connection: socket.socket
     sender: _Sender
     heard_s: float
-    """Time of its last line, or of its connection, on the monotonic clock, s."""
+    """Time of the client's last line, or of the connection, on the monotonic clock, s."""
 
 
 def _from_socket(where: str, given: _Given) -> None:

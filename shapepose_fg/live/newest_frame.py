@@ -32,14 +32,14 @@ _LATER, _FADES_S = 3.5, 0.25
 predictions, and the time constant with which accelerations decay, s."""
 _PACE, _PACE_UNSEEN = 0.1, 0.4
 """Factors on the filter's variances of velocities, for joints that two views see and for others:
-the filter assumes fast joints (`pipeline.setup.FAST_M_S`). With these 95 % regions hold 94 to 97 %
-of joints 0.1 to 1 s ahead (four stretches of split `tune`, six cameras, on which they were
-chosen)."""
+the filter assumes fast joints (`pipeline.setup.FAST_M_S`). With these factors, 95 % regions contain
+94 to 97 % of joints 0.1 to 1 s ahead (four stretches of split `tune`, six cameras, on which they
+were chosen)."""
 _FORGOTTEN = 0.1
 """Share of the filter's variance, which grows while no two views see a joint, that is added to the
-variance from the body: a hidden head may have turned. Regions of 95 % then hold 98 to 100 % of
-unseen joints in three stretches of split `tune`, and 92 and 86 % in crowds, where they held 91 to
-95, 75 and 57 %."""
+variance from the body: a hidden head may have turned. 95 % regions then contain 98 to 100 % of
+unseen joints in three stretches of split `tune`, and 92 and 86 % in crowds; without it 91 to 95, 75
+and 57 %."""
 
 
 def fed_back(tracker: Tracker, now: FilterState, refined: Reconstruction) -> FilterState:

@@ -42,11 +42,11 @@ from shapepose_fg.proposal.thinning import thinned
 AHEAD_S = 1.0
 """Longest prediction after the newest frame, s."""
 _SETTLES = 2 / 3
-"""Share of the lag that a window settles at least, where the lag has several frames."""
+"""Minimum share of the lag that a window settles, if the lag has several frames."""
 _BEFORE = 7.0
-"""Duration that a window includes before the settled frames: the lag over this, a frame or two.
-With a third of the lag it takes an eighth more time, and errors are 0.04 mm smaller (two stretches
-of split `tune`)."""
+"""Ratio of the lag to the duration that a window includes before the settled frames, which is a
+frame or two. With a third of the lag it takes an eighth more time, and errors are 0.04 mm smaller
+(two stretches of split `tune`)."""
 _BEHIND = 3.0
 """Age of a frame, in lags, at which it is settled without refinement, because solving is too
 slow."""
@@ -54,8 +54,8 @@ _OFF_CLOCK = 10
 """Number of consecutive views with a wrong time after which the camera is reported, and frames from
 `push` are accepted."""
 _STANDS = 30
-"""Excess of views without a pose over views with one, after which a camera is taken to stand where
-the rig has it."""
+"""Excess of views without a pose over views with one, after which a camera counts as static, with
+the rig's pose."""
 
 
 @dataclass(frozen=True)
@@ -406,9 +406,8 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
     def catch_up(self) -> None:
         """Wait until a further window can be submitted.
 
-        After each `push` of frames that come from a file, which is read faster than windows are
-        solved: without it, the oldest frames are settled without refinement
-        (`report().unrefined`).
+        Call this after each `push` of frames from a file, which is read faster than windows are
+        solved; otherwise the oldest frames are settled without refinement (`report().unrefined`).
         """
         with self._lock:
             if self._windows.waiting >= self._most_waiting:

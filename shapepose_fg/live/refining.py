@@ -96,7 +96,7 @@ class _Sent:
     names: dict[int, int]
     """Identities of the tracks."""
     own: int
-    """Number of frames, from `start` on, that it settles."""
+    """Number of frames, from `start` on, that the window settles."""
     start: int
 
 

@@ -43,8 +43,8 @@ def cluster(
         if address is not None:
             refuse_other_programs(client, at)
         # A task instead of scattered data, since it can be repeated after a process is lost.
-        there = client.submit(cloudpickle.loads, packed(shared), pure=False)
-        call = (one_item, tuple(this_program().items()), there)
+        remote = client.submit(cloudpickle.loads, packed(shared), pure=False)
+        call = (one_item, tuple(this_program().items()), remote)
         with _naming_lost_work():
             yield pool_of(client, call, ahead / sharing)
 
@@ -178,11 +178,13 @@ def refuse_other_programs(client: Any, address: str) -> None:
         _refuse_other(f"--cluster {address}: its process {process}", this_program(), found)
 
 
-def _refuse_other(process: str, own: dict[str, str], theirs: dict[str, str]) -> None:
+def _refuse_other(process: str, own: dict[str, str], other_versions: dict[str, str]) -> None:
     """Raise InputError if a process has other versions than `own`."""
-    other = next((name for name in own if theirs.get(name) != own[name]), None)
+    other = next((name for name in own if other_versions.get(name) != own[name]), None)
     if other is not None:
-        which = f" ({theirs.get(other)} there, {own[other]} here)" if other != _ITSELF else ""
+        which = (
+            f" ({other_versions.get(other)} there, {own[other]} here)" if other != _ITSELF else ""
+        )
         raise InputError(
             f"{process} has another version of {other}{which}; install the same version there, "
             "because results must not depend on the process"

@@ -67,7 +67,7 @@ class WindowConfig(Settings):
     """How frames are divided into windows."""
 
     overlap_s: Annotated[float, Interval(ge=0, le=60)] = 0.4
-    """Duration of the frames before and after a window that it includes without returning them, s:
+    """Duration of the frames before and after a window that are solved with it but not returned, s;
     smoothing reaches a few frames. Windows of other lengths move joints by under 2 mm in the median
     (tests/pipeline/test_windows.py)."""
     keyframe_s: Annotated[float, Interval(ge=0, le=0.5)] = 0.0
@@ -86,7 +86,7 @@ class WindowConfig(Settings):
 
     @property
     def shared_s(self) -> float:
-        """Overlap of windows, s: it reaches the next keyframe at least."""
+        """Overlap of windows, s; at least the interval between keyframes."""
         return max(self.overlap_s, self.keyframe_s)
 
 

@@ -229,8 +229,8 @@ def with_person_shapes(
     if len(people) == 0:
         return people
     rows, numbers = WindowBodies.of(people), np.unique(people.person).tolist()
-    here: Mapped = lambda work, items: map(partial(work, model, sigma_m), items)  # noqa: E731
-    shapes, (bodies,) = bodies_with_shapes(lambda: [rows], numbers, model, known, floor, here)
+    mapped: Mapped = lambda work, items: map(partial(work, model, sigma_m), items)  # noqa: E731
+    shapes, (bodies,) = bodies_with_shapes(lambda: [rows], numbers, model, known, floor, mapped)
     return replace(people, shapes=shapes, **bodies)
 
 

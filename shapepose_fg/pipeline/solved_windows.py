@@ -167,7 +167,7 @@ class SolvedChunk:
     parts: tuple[Part, ...]
     """Windows of the chunk."""
     notes: Notes
-    """Notes about tracking its people."""
+    """Notes about tracking the chunk's people."""
     begins: Border
     """Tracks at the beginning of the chunk."""
     ends: Border

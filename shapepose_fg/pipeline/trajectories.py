@@ -1,4 +1,4 @@
-"""Trajectories of moving cameras: odometry, corrected by the people they see.
+"""Trajectories of moving cameras: odometry, corrected by the people that the cameras see.
 
 People are tracked with the poses corrected so far; each window's people and poses are solved
 jointly (`estimation/trajectory_graph.py`), and last the poses of the whole recording in one graph,

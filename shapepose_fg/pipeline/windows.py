@@ -113,7 +113,7 @@ class Engine:
         return spans, StreamState(tracking, tuple(decided), before)
 
     def isolated_frames(self, frames: Iterable[Input]) -> Span:
-        """Independent frames in one window, because bodies are fitted fastest in batches."""
+        """Put independent frames into one window, because bodies are fitted fastest in batches."""
         decided, people = list[Decided](), 0
         for frame in frames:
             decided.append(isolated_frame(self.tracker, frame, people))

@@ -22,8 +22,8 @@ depth, m."""
 _FAR_M = 0.25
 """Maximum distance of a detection from the projection of a placed joint, m."""
 _REACH_M = 0.6
-"""A joint whose place is not known yet is sought this far around its neighbours on the skeleton: no
-limb from a joint to the next is longer, the trunk aside."""
+"""Radius around the skeleton neighbours of a joint of unknown position within which it is searched
+for, m: no limb from a joint to the next is longer, except the trunk."""
 
 
 def associate(

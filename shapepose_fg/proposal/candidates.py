@@ -33,12 +33,13 @@ class CandidateConfig(Settings):
     """Radius rho of a cluster, m: points of one joint this close to the most confident one vote for
     it."""
     min_votes: Count = 3
-    """The paper's three points; a candidate with fewer is *weak* and cannot anchor a person. Two
-    cameras give a single pair, so the limit is min(min_votes, pairs of views)."""
+    """Minimum number of points of a strong candidate, three in the paper; one with fewer is *weak*
+    and cannot anchor a person. Two cameras give a single pair, so the limit is min(min_votes, pairs
+    of views)."""
     min_view_fraction: Annotated[float, Interval(gt=0, le=1)] = 1 / 6
-    """With very many views, chance crossings of rays also get three votes: a strong candidate needs
-    the votes of all pairs of this fraction of the views (30 cameras: 5 views, 10 votes; 18 and
-    fewer: 3)."""
+    """Fraction of the views whose pairs must all vote for a strong candidate: with very many views,
+    chance crossings of rays also get three votes (30 cameras: 5 views, 10 votes; 18 and fewer:
+    3)."""
     weak: bool = True
     """Whether clusters with fewer votes are kept as weak candidates. The paper drops them, and
     loses joints seen by only two views."""

@@ -67,7 +67,7 @@ class FrameArrays(NamedTuple):
 
     @classmethod
     def of(cls, detections: Detections, rig: Rig, skeleton: Skeleton) -> "FrameArrays":
-        """Build it from detections and cameras."""
+        """The arrays of detections and cameras."""
         view, joint, xy, _, _ = detections.columns
         confidence = np.require(detections.confidence, float, ["C", "W"])
         seen = view, joint, xy, confidence, detections.order, detections.rank, *detections.ties

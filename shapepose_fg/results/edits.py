@@ -116,11 +116,10 @@ def replay(people: Reconstruction, edits: Sequence[Edit]) -> Edited:
 
 
 def undo(original: Reconstruction, current: Reconstruction, edits: Sequence[Edit]) -> Edited:
-    """Undo the last of `edits`: `original` after all others, where `current` is the result of all
-    of them.
+    """Undo the last of `edits`: returns `original` after all the others.
 
-    Identities that the last correction did not touch keep the rows of `current`, which may be
-    solved already.
+    `current` is the result of all edits. Identities that the last correction did not touch keep the
+    rows of `current`, which may be solved already.
     """
     before, last = replay(original, edits[:-1]), edits[-1]
     touched = {last.person, last.other} - {None}

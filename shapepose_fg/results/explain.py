@@ -130,7 +130,7 @@ class _Detections:
     table: ObservationTable
     views: Views
     sigmas_px: Array
-    """(N, J, V) standard deviations of these detections, pixels; 0 without one."""
+    """(N, J, V) standard deviations of the detections, pixels; 0 without one."""
 
     @classmethod
     def of(cls, people: Reconstruction, rig: Rig, config: PipelineConfig) -> "_Detections":
@@ -260,14 +260,14 @@ def _looks_like(
     """
     people, names = all_of_it.people, all_of_it.people.joint_names.tolist()
     rows = np.flatnonzero(people.frame == people.frame[row])
-    alike = np.array(
+    same_kind = np.array(
         [j for j, name in enumerate(names) if name in (names[joint], mirrored(names[joint]))]
     )
-    points, covariance = people.joints[rows][:, alike], people.covariance[rows][:, alike]
+    points, covariance = people.joints[rows][:, same_kind], people.covariance[rows][:, same_kind]
     xy, _, slope = (each[:, :, view] for each in all_of_it.views.rows(rows).project(points))
     offset_px, spread = (xy - at)[..., None], sigma**2 * np.eye(2) + slope @ covariance @ slope.mT
     known = np.isfinite(offset_px).all(axis=(-1, -2)) & np.isfinite(spread).all(axis=(-1, -2))
-    known &= ~((rows == row)[:, None] & (alike == joint))
+    known &= ~((rows == row)[:, None] & (same_kind == joint))
     squared = np.full(known.shape, np.inf)
     squared[known] = (offset_px[known].mT @ np.linalg.solve(spread[known], offset_px[known]))[
         ..., 0, 0
@@ -275,7 +275,7 @@ def _looks_like(
     squared[np.linalg.norm(offset_px[..., 0], axis=-1) >= _APART * off] = np.inf
     n, j = np.unravel_index(squared.argmin(), squared.shape)
     return (
-        f"person {people.person[rows[n]]}'s {names[alike[j]]}"
+        f"person {people.person[rows[n]]}'s {names[same_kind[j]]}"
         if squared[n, j] < OFF_SIGMA**2
         else ""
     )

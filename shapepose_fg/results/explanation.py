@@ -48,7 +48,7 @@ class ViewReason:
     camera: str
     """Name of the camera."""
     gate: str
-    """Whether its detection was used, and the reason if not: a name of `Gate`."""
+    """Whether the camera's detection was used, and the reason if not: a name of `Gate`."""
     detection_px: tuple[float, float] | None
     """The detection, undistorted pixels; None where there is none."""
     score: float
@@ -78,8 +78,8 @@ class FactorReason:
     name: str
     """Name of the function that made the factors."""
     others: tuple[str, ...]
-    """Joints that the factors connect it to, as `person 3's RWrist`; empty for factors on this
-    joint only."""
+    """Joints to which the factors connect this joint, as `person 3's RWrist`; empty for factors on
+    this joint only."""
     share: float
     """Share of the user's factors in the information about the joint, 0 to 1."""
 
@@ -114,8 +114,8 @@ class Explanation:
     function that connect it to the same joints. Their contributions in other frames are in
     `motion_share`."""
     missing_factors: tuple[str, ...] = ()
-    """Functions with which the result was solved, and that were not given here: the shares exclude
-    them."""
+    """Functions of user factors with which the result was solved, but which were not given for the
+    explanation; the shares exclude their factors."""
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, as printed by `shapepose-fg explain --json`."""
@@ -127,13 +127,13 @@ class Explanation:
         when = f"frame {self.frame}" + (
             f" ({self.time_s:.3f} s)" if self.time_s is not None else ""
         )
-        who = f"{self.joint} of person {self.person} in {when}"
+        joint = f"{self.joint} of person {self.person} in {when}"
         if self.position_m is None or self.sigma_m is None:
-            where = f"{who} has no position."
+            where = f"{joint} has no position."
         else:
             x, y, z = self.position_m
             where = (
-                f"{who} is at ({x:.3f}, {y:.3f}, {z:.3f}) m, within {1e3 * self.sigma_m:.0f} mm "
+                f"{joint} is at ({x:.3f}, {y:.3f}, {z:.3f}) m, within {1e3 * self.sigma_m:.0f} mm "
                 "(one sigma)."
             )
         used = [view for view in self.views if view.gate == GATES[Gate.USED]]

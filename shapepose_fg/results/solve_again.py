@@ -48,7 +48,7 @@ class Solver:
 
     @classmethod
     def of(cls, people: Reconstruction, rig: Rig, run_file: Path = Path("run.json")) -> "Solver":
-        """Build it for a result of these cameras; raises InputError if `run_file` lacks its
+        """The data for a result of these cameras; raises InputError if `run_file` lacks its
         settings.
         """
         configuration = people.run.get("configuration")
@@ -63,7 +63,7 @@ class Solver:
 
     @classmethod
     def read(cls, folder: Path, people: Reconstruction) -> "Solver":
-        """Build it for a result loaded from `folder`; raises InputError as `of` does, and for other
+        """The data for a result loaded from `folder`; raises InputError as `of` does, and for other
         cameras.
         """
         rig, table = cameras_of(folder), people.observations

@@ -32,11 +32,12 @@ class TrackSummary:
     gaps: int
     """Number of gaps between the first and the last frame."""
     stature_m: float
-    """Height of its mean body in T-pose, m; NaN without a body."""
+    """Height of the person's mean body in T-pose, m; NaN without a body."""
     confidence: float
-    """Mean confidence of its joints, 0 to 1."""
+    """Mean confidence of the person's joints, 0 to 1."""
     seen: float
-    """Share of its estimated joints that a view saw; NaN if the result does not record it."""
+    """Share of the person's estimated joints that a view saw; NaN if the result does not record
+    it."""
     walked_m: float
     """Walked distance, m, summed over half seconds; steps under 5 cm are ignored."""
 

@@ -104,7 +104,9 @@ def _mixture(tails: float) -> tuple[Array, Array]:
 
 
 def _shape(tails: float) -> float:
-    """Student's t has the 95 % region of a Gaussian with its shape matrix over this number."""
+    """Ratio of the covariance of a Gaussian's 95 % region to the shape matrix of the Student's t
+    with the same region.
+    """
     return float(chdtri(3, 0.05) / (3 * fdtri(3, tails, 0.95)))
 
 

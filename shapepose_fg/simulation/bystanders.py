@@ -43,10 +43,10 @@ def walking_clips(mocap: Mocap, *, without: frozenset[str]) -> list[int]:
     found = []
     for index, action, plan in _clips(mocap, 60, without):
         if "walk" in action and "uneven" not in action and mocap.tiers[index] <= 0:
-            way = np.linalg.norm(plan[-1] - plan[0])
-            speed = way / len(plan) * float(mocap.arrays["fps"][index])
-            straight = way > 0.95 * np.linalg.norm(np.diff(plan, axis=0), axis=1).sum()
-            found += [index] if way > 2.5 and straight and speed < 1.6 else []
+            length_m = np.linalg.norm(plan[-1] - plan[0])
+            speed = length_m / len(plan) * float(mocap.arrays["fps"][index])
+            straight = length_m > 0.95 * np.linalg.norm(np.diff(plan, axis=0), axis=1).sum()
+            found += [index] if length_m > 2.5 and straight and speed < 1.6 else []
     return found
 
 
@@ -103,13 +103,13 @@ def walk_along(
     person takes slower steps. `start` is the phase of the loop at which the walk begins, 0 to 1.
     """
     cycle, gain = _cycle(perform(body, betas, clip.resampled(fps)))
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])[
+    travelled_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])[
         : len(path)
     ]
     count = len(cycle)
     # Steps do not stop abruptly: below a quarter of the recorded speed the feet continue in place.
     floor = 0.25 * gain / count
-    advance = np.maximum(np.diff(way, prepend=0.0), 0.0)
+    advance = np.maximum(np.diff(travelled_m, prepend=0.0), 0.0)
     advance[1:] = np.maximum(advance[1:], floor)
     phase = (np.cumsum(advance) / gain + start) % 1.0 * count
     low = phase.astype(int) % count
@@ -129,8 +129,8 @@ def _cycle(walk: Performance) -> tuple[Performance, float]:
     length, m.
     """
     count = len(walk)
-    way = walk.joints[-1, 0, :2] - walk.joints[0, 0, :2]
-    walk = walk.moved(np.zeros(2), -float(np.arctan2(way[1], way[0])))
+    displacement = walk.joints[-1, 0, :2] - walk.joints[0, 0, :2]
+    walk = walk.moved(np.zeros(2), -float(np.arctan2(displacement[1], displacement[0])))
     seam = 4
     features = (walk.joints - walk.joints[:, :1]).reshape(count, -1)
     first, last = np.arange(seam, count // 2), np.arange(count // 2, count)
@@ -152,12 +152,12 @@ def _cycle(walk: Performance) -> tuple[Performance, float]:
     return Performance(rotations, joints - joints[:, :1] + places[:, None], walk.rest), length
 
 
-Way = tuple[Array, Array]
+WalkerPath = tuple[Array, Array]
 """Positions (T, 2), metres, and headings (T,), radians from the x axis towards y, unwrapped, of a
 walker."""
 
 
-def way_through(
+def path_through(
     others: Array,
     frames: int,
     rng: np.random.Generator,
@@ -166,20 +166,20 @@ def way_through(
     speed_mps: float,
     distance_m: Array,
     half_room_m: float,
-) -> Way:
+) -> WalkerPath:
     """A path from wall to wall and back, with distance `distance_m` (K,) or a little more from
     `others` (T, K, 2).
     """
     # Number of random paths, of which the best is used.
-    ways = [_walk(others, frames, rng, fps, speed_mps, distance_m, half_room_m) for _ in range(4)]
-    return max(ways, key=lambda way: comparable(_way_worth(way, others, distance_m)))
+    paths = [_walk(others, frames, rng, fps, speed_mps, distance_m, half_room_m) for _ in range(4)]
+    return max(paths, key=lambda path: comparable(_path_score(path, others, distance_m)))
 
 
-def _way_worth(way: Way, others: Array, distance_m: Array) -> float:
+def _path_score(path: WalkerPath, others: Array, distance_m: Array) -> float:
     """Score of a path: mainly no contact, then closeness."""
-    if others.shape[1] == 0 or len(way[0]) == 0:
+    if others.shape[1] == 0 or len(path[0]) == 0:
         return 0.0
-    room = (np.linalg.norm(others - way[0][:, None], axis=-1) - distance_m).min(axis=1)
+    room = (np.linalg.norm(others - path[0][:, None], axis=-1) - distance_m).min(axis=1)
     return (
         30.0 * float(np.minimum(room, 0.0).mean())
         + min(float(room.min()), 0.0)
@@ -195,14 +195,14 @@ def _walk(
     speed: float,
     distance: Array,
     half: float,
-) -> Way:
+) -> WalkerPath:
     """One random path: each decision takes the best turn and pace for the next two seconds (dynamic
     window).
     """
     # Interval between a walker's decisions, s.
     hold = max(1, round(0.1 * fps))
-    xy, heading, pace = _way_start(others, rng, half)
-    goal = _way_goal(xy, rng, half)
+    xy, heading, pace = _path_start(others, rng, half)
+    goal = _path_goal(xy, rng, half)
     # Turning rates that a walker considers, rad/s.
     # Speeds that a walker considers, as shares of the walker's own.
     grids = np.meshgrid(np.linspace(-1.9, 1.9, 15), [0.15, 0.45, 0.75, 1.0])
@@ -210,7 +210,7 @@ def _walk(
     rate, places, headings = 0.0, np.empty((frames, 2)), np.empty(frames)
     for frame in range(0, frames, hold):
         if np.linalg.norm(goal - xy) < 0.5:
-            goal = _way_goal(xy, rng, half)
+            goal = _path_goal(xy, rng, half)
         ahead = np.minimum(frame + np.round(_HORIZON_S * fps).astype(int), frames - 1)
         options = _arcs(xy, heading, turns, paces * speed)
         cost = (
@@ -245,7 +245,7 @@ def _arcs(xy: Array, heading: float, turns: Array, speeds: Array) -> Array:
     return xy + np.cumsum(along(angle) * (speeds[:, None] * step)[..., None], axis=1)
 
 
-def _way_start(others: Array, rng: np.random.Generator, half: float) -> tuple[Array, float, float]:
+def _path_start(others: Array, rng: np.random.Generator, half: float) -> tuple[Array, float, float]:
     """A free position, a heading towards the centre, and the initial pace."""
     spots = rng.uniform(-0.95 * half, 0.95 * half, (64, 2))
     if others.size > 0:
@@ -255,7 +255,7 @@ def _way_start(others: Array, rng: np.random.Generator, half: float) -> tuple[Ar
     return spots[0], float(np.arctan2(-spots[0][1], -spots[0][0]) + rng.uniform(-0.5, 0.5)), 0.75
 
 
-def _way_goal(xy: Array, rng: np.random.Generator, half: float) -> Array:
+def _path_goal(xy: Array, rng: np.random.Generator, half: float) -> Array:
     """A random goal near the opposite wall."""
     angle = np.arctan2(-xy[1], -xy[0]) + rng.uniform(-0.9, 0.9)
     return rng.uniform(0.75, 0.95) * half * along(angle)

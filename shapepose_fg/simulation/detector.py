@@ -67,8 +67,7 @@ class DetectorConfig:
     wrong_affinities: float = 1.0
     """Level of the share of wrong pairs with an affinity."""
     offsets: KeypointOffsets | None = None
-    """Offsets of its joints from those of the body, as detectors differ in their skeletons. None:
-    no offsets."""
+    """Offsets of the detector's joints from those of the body; None: no offsets."""
     statistics: DetectorStatistics = field(default_factory=measured, repr=False)
     """The measured distributions."""
     visibility: VisibilityConfig = field(default_factory=VisibilityConfig)

@@ -17,11 +17,11 @@ from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.decompositions import comparable
 from shapepose_fg.core.skeleton import smpl_joints
 from shapepose_fg.simulation.bystanders import (
+    path_through,
     stand,
     standing_clips,
     walk_along,
     walking_clips,
-    way_through,
 )
 from shapepose_fg.simulation.limbs import turned_about
 from shapepose_fg.simulation.mocap import Clip, Mocap
@@ -117,7 +117,10 @@ class Room:
         middle = (steps.min(axis=0) + steps.max(axis=0)) / 2
         two = [one.moved(-middle) for one in two]
         turns, shifts = self._pair_options(_long_axis(steps - middle))
-        scores = [self._worth(two, turn, shift) for turn, shift in zip(turns, shifts, strict=True)]
+        scores = [
+            self._position_score(two, turn, shift)
+            for turn, shift in zip(turns, shifts, strict=True)
+        ]
         placed = (
             [one.moved(shifts[index], float(turns[index])) for one in two]
             for index in np.argsort(comparable(-np.array(scores)), kind="stable")[:_TRIED]
@@ -157,7 +160,7 @@ class Room:
         speed = float(np.linalg.norm(clip.pelvis[-1] - clip.pelvis[0]) / len(clip) * clip.fps)
         # Maximum speed of walking people in a crowded room, m/s.
         # Distance of walking people from others' limbs, m.
-        path, heading = way_through(
+        path, heading = path_through(
             np.concatenate([middles, limbs], axis=1),
             self.frames,
             self.rng,
@@ -195,7 +198,7 @@ class Room:
             side = -0.6 if len(self.performed) == 0 else 0.6
         return turns, np.array([0.0, side]) + self.rng.normal(0.0, 0.2, (_PAIR_OPTIONS, 2))
 
-    def _worth(self, two: list[Performance], turn: float, shift: Array) -> float:
+    def _position_score(self, two: list[Performance], turn: float, shift: Array) -> float:
         """Score of a pair's position: inside the room, close to others, but not closer than
         allowed.
         """

@@ -44,7 +44,7 @@ FramePeople = tuple[Array, NDArray[np.float32]] | tuple[Array, NDArray[np.float3
 that time."""
 AHEAD = 4
 """Number of frames per worker that are submitted ahead; each is little work."""
-FRAMES_WORTH_A_WORKER = 100
+FRAMES_A_WORKER = 100
 """Minimum number of frames per worker; with fewer, starting it costs more than it saves."""
 
 
@@ -147,7 +147,7 @@ def see(
     seen = np.where(in_image, 1.0 - stopped.mean(axis=-1), 0.0)
     hidden_by = np.where(in_image, NOBODY, BORDER)
     hidden = in_image & (seen < 0.5)
-    hidden_by[hidden] = _commonest(np.where(owner == own, ITSELF, owner)[hidden], stopped[hidden])
+    hidden_by[hidden] = _mode(np.where(owner == own, ITSELF, owner)[hidden], stopped[hidden])
     return Visibility(seen, in_image, hidden_by)
 
 
@@ -205,7 +205,7 @@ def seen_from_the_front(seen: Array, joints: Array, centres: Array, ramp: Array)
     return result
 
 
-def _commonest(values: Index, counts: Mask) -> Index:
+def _mode(values: Index, counts: Mask) -> Index:
     """Mode (...,) of `values` (..., R) where `counts` is true; the first on a tie."""
     votes = ((values[..., :, None] == values[..., None, :]) & counts[..., None, :]).sum(axis=-1)
     best = np.where(counts, votes, 0).argmax(axis=-1)

@@ -52,7 +52,7 @@ class Hypotheses:
     """(H,) index of the person of the previous frame that each track continues; -1 for none."""
     global_hypothesis: NDArray[np.intp]
     """(H,) global hypothesis to which each track belongs."""
-    there: NDArray[np.bool_]
+    tracked: NDArray[np.bool_]
     """(H, T) frames in which each track hypothesis is tracked."""
     candidate: NDArray[np.int32]
     """(H, T, J, V) detections of each track hypothesis, -1 for none."""
@@ -73,7 +73,7 @@ class Hypotheses:
     def account(self) -> EvidenceTable:
         """The hypotheses as weighted detections for the selection."""
         return EvidenceTable.of(
-            self.candidate, self.weight, self.cost, self.there, self.counts, self.lasts_s
+            self.candidate, self.weight, self.cost, self.tracked, self.counts, self.lasts_s
         )
 
     def __len__(self) -> int:
@@ -82,7 +82,7 @@ class Hypotheses:
     @classmethod
     def concatenate(cls, parts: Sequence["Hypotheses"]) -> "Hypotheses":
         """Concatenate hypotheses; their global hypotheses are renumbered and stay separate."""
-        names = ("carried", "there", "candidate", "places", "weight", "cost")
+        names = ("carried", "tracked", "candidate", "places", "weight", "cost")
         columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
         first = np.cumsum([0, *(int(part.global_hypothesis.max(initial=-1)) + 1 for part in parts)])
         columns["global_hypothesis"] = np.concatenate(
@@ -123,14 +123,14 @@ def explained(
         times_of(frames),
         np.full((len(carried), len(tracker.skeleton), len(frames[0].rig)), -1),
     )
-    on, everything = Seed(-1, carried, unseen, backwards=False), Rest.of(frames)
+    on, everything = Seed(-1, carried, unseen, backwards=False), RemainingDetections.of(frames)
     found = follow_hypotheses(tracker, everything, [on], keep)
     plain = _plain(found, times)
     if plain.all():
         return found, found.account.choose(found.global_hypothesis)
-    rest = Rest.of(frames, found.candidate[plain], found.places[plain])
+    remaining = RemainingDetections.of(frames, found.candidate[plain], found.places[plain])
     found = Hypotheses.concatenate(
-        [found, follow_hypotheses(tracker, rest, _seeds(tracker, rest.frames), keep)]
+        [found, follow_hypotheses(tracker, remaining, _seeds(tracker, remaining.frames), keep)]
     )
     before = 0.0
     for _ in range(_ROUNDS):
@@ -146,17 +146,19 @@ def explained(
 
 
 def _plain(found: Hypotheses, times: Array) -> NDArray[np.bool_]:
-    """(H,) hypotheses that span all frames with high evidence throughout; all, of one frame."""
+    """(H,) hypotheses that span all frames with high evidence throughout; all of them, if there is
+    only one frame.
+    """
     if len(times) == 1:
         return np.ones(len(found), dtype=bool)
     evidence = found.weight.sum(axis=(2, 3)) - found.cost
     frames = min(len(times), max(1, round(SEARCH_S / float(np.median(np.diff(times))))))
     high = sliding_window_view(evidence, frames, axis=1).mean(axis=-1) >= _PLAIN
-    return np.asarray(found.there.all(axis=1) & high.all(axis=1))
+    return np.asarray(found.tracked.all(axis=1) & high.all(axis=1))
 
 
 @dataclass(frozen=True)
-class Rest:
+class RemainingDetections:
     """T frames without the detections of K people, who are tracked already."""
 
     whole: Sequence[Input]
@@ -174,7 +176,7 @@ class Rest:
         frames: Sequence[Input],
         candidate: NDArray[np.int32] | None = None,
         places: Array | None = None,
-    ) -> "Rest":
+    ) -> "RemainingDetections":
         """Remove the detections `candidate` (K, T, J, V), -1 for none, of people at `places` from
         the frames; by default, nobody is tracked already.
         """
@@ -185,11 +187,11 @@ class Rest:
             np.setdiff1d(np.arange(len(frame.detections)), candidate[:, t])
             for t, frame in enumerate(frames)
         ]
-        rest = [
+        remaining = [
             replace(frame, detections=frame.detections.rows(own))
             for frame, own in zip(frames, left, strict=True)
         ]
-        return cls(frames, rest, [np.append(own, -1) for own in left], places)
+        return cls(frames, remaining, [np.append(own, -1) for own in left], places)
 
 
 def times_of(frames: Sequence[Input]) -> Array:
@@ -272,12 +274,14 @@ Followed = tuple[int, Seed, NDArray[np.intp]]
 """A global hypothesis's number, its seed, and the numbers of the people in it."""
 
 
-def follow_hypotheses(tracker: Tracker, rest: Rest, seeds: Sequence[Seed], keep: int) -> Hypotheses:
+def follow_hypotheses(
+    tracker: Tracker, remaining: RemainingDetections, seeds: Sequence[Seed], keep: int
+) -> Hypotheses:
     """Track all `seeds` forwards and backwards through T frames, in parallel.
 
     People found on the forward pass are also tracked backwards.
     """
-    log, frames = _Log(tracker, rest, keep), rest.frames
+    log, frames = _Log(tracker, remaining, keep), remaining.frames
     given, born = list[Followed](), list[Followed]()
     for hypothesis, seed in enumerate(seeds):
         carried = seed.tracks.ids if seed.frame < 0 else None
@@ -344,8 +348,8 @@ def _follow(
                 for hypothesis, since in births.items()
                 if hypothesis not in tracks.global_hypothesis[duplicates]
             }
-            rest = np.setdiff1d(np.arange(len(tracks)), duplicates)
-            tracks, candidate = tracks.rows(rest), candidate[rest]
+            remaining = np.setdiff1d(np.arange(len(tracks)), duplicates)
+            tracks, candidate = tracks.rows(remaining), candidate[remaining]
         if abs(time_s - sought_s) < SEARCH_S:
             continue
         sought_s = time_s
@@ -399,11 +403,16 @@ def _duplicates(
 
 
 class _Log:
-    """Collects the states of all tracks on their way."""
+    """Collects the states of all tracks in all frames."""
 
-    def __init__(self, tracker: Tracker, rest: Rest, keep: int) -> None:
-        self.tracker, self.rest, self.frames, self.keep = tracker, rest, rest.whole, keep
-        self.shape = (len(tracker.skeleton), len(rest.whole[0].rig))
+    def __init__(self, tracker: Tracker, remaining: RemainingDetections, keep: int) -> None:
+        self.tracker, self.remaining, self.frames, self.keep = (
+            tracker,
+            remaining,
+            remaining.whole,
+            keep,
+        )
+        self.shape = (len(tracker.skeleton), len(remaining.whole[0].rig))
         self.carried, self.global_hypothesis = list[int](), list[int]()
         self.parts = list[tuple[int, NDArray[np.intp], NDArray[np.intp], Array, Array, Array]]()
         self.kept = list[tuple[NDArray[np.intp], JointStates]]()
@@ -425,11 +434,11 @@ class _Log:
         if len(tracks) == 0:
             return
         frame, joints, A = self.frames[t], tracks.joints, len(tracks)
-        candidate = self.rest.index[t][candidate]
+        candidate = self.remaining.index[t][candidate]
         places = np.where((joints.sigma_m < LOST_M)[..., None], joints.position, np.nan)
         arrays = FrameArrays.of(frame.detections, frame.rig, self.tracker.skeleton)
         # The people who are tracked already occlude those of every hypothesis.
-        others = self.rest.places[:, t]
+        others = self.remaining.places[:, t]
         hypotheses = (
             np.unique(tracks.global_hypothesis) if len(others) > 0 else tracks.global_hypothesis[:0]
         )

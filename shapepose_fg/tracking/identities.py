@@ -112,9 +112,9 @@ def _decide(tracker: Tracker, state: FollowState, own: int) -> tuple[FollowState
         (held.get(n, frame), rows.get(n, nobody)) for n, frame in enumerate(state.pending[:until])
     ]
     last = chosen.during(own - 1) & (identity >= 0)
-    who = chosen.hypothesis[last]
+    hypothesis = chosen.hypothesis[last]
     time_s = float(frames[own - 1].time_s.mean())
-    people = people_at(time_s, identity[last], found.joints.rows(who))
+    people = people_at(time_s, identity[last], found.joints.rows(hypothesis))
     return FollowState(people, next_id, state.pending[until:]), decided
 
 
@@ -133,7 +133,7 @@ def _with_detections(
     detection, if nothing follows the `last` frame: at these ends, unseen frames would cost less
     than a birth or death.
     """
-    frame = np.arange(found.there.shape[1])
+    frame = np.arange(found.tracked.shape[1])
     seen = (found.candidate[chosen.hypothesis] >= 0).any(axis=(2, 3))
     seen &= (chosen.start[:, None] <= frame) & (frame < chosen.stop[:, None])
     start = np.where(first, seen.argmax(axis=1), chosen.start)
@@ -193,7 +193,7 @@ def _identities(
     """
     identity = np.full(len(chosen), -1, dtype=np.intp)
     early = np.flatnonzero(chosen.start == 0)
-    carried = np.flatnonzero((found.carried >= 0) & found.there[:, 0])
+    carried = np.flatnonzero((found.carried >= 0) & found.tracked[:, 0])
     distance_m = core_distance(
         found.places[chosen.hypothesis[early], 0], found.places[carried, 0], skeleton
     )

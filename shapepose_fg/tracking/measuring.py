@@ -42,7 +42,7 @@ class MeasurementNoise(NamedTuple):
 
     @classmethod
     def of(cls, config: ObservationConfig, joints: tuple[str, ...]) -> "MeasurementNoise":
-        """Build it from the settings, for the named `joints`."""
+        """The noise for these settings and the named `joints`."""
         return cls(
             scatter=config.scatter(joints),
             sigma_m=float(config.sigma_m),

@@ -75,7 +75,7 @@ class Bones(NamedTuple):
 
     @classmethod
     def of(cls, skeleton: Skeleton, longest_m: Array) -> "Bones":
-        """Build it from a detector's skeleton."""
+        """The bones of a detector's skeleton."""
         core, order = (
             np.zeros(len(skeleton), dtype=bool),
             np.concatenate(skeleton.tree_levels).astype(np.intp),

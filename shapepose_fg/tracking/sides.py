@@ -56,7 +56,7 @@ class _Compared:
 
     groups: Sequence[Index]
     """(G) indices of the detections of each 2D person."""
-    who: Index
+    person: Index
     """(G,) number of the person that each 2D person matches; -1 for none."""
     log: Array
     """(G, S) log-probability that this view has swapped the sides of each combination of parts
@@ -105,14 +105,14 @@ class _Compared:
         """
         states = exchanges(skeleton)
         right = np.exp(self.log) @ ~states > _AGREES
-        same = (self.who[:, None] == self.who) & (self.who >= 0)
+        same = (self.person[:, None] == self.person) & (self.person >= 0)
         certain = self.log.max(axis=1) > self.log[:, 0] + _SURE
         found = states[np.where(certain, self.log.argmax(axis=1), 0)]
         return found & ((same @ right) | ~(same @ ~found) & (same.sum(axis=1, keepdims=True) > 1))
 
     def of_person(self, number: int) -> Array:
         """(G', S) `log` of the 2D people of one person."""
-        return self.log[self.who == number]
+        return self.log[self.person == number]
 
     def corrected(
         self, given: Input, own: Mapping[int, tuple[Mask, Array]], skeleton: Skeleton
@@ -129,7 +129,7 @@ class _Compared:
             np.zeros(part.max()),
         )
         for group, person, exchanged in zip(
-            self.groups, self.who.tolist(), self.exchanged(skeleton), strict=True
+            self.groups, self.person.tolist(), self.exchanged(skeleton), strict=True
         ):
             if person >= 0 and (person in own or exchanged.any()):
                 of, (turned, doubt) = part[found.joint[group]], own.get(person, (right, right))

@@ -36,7 +36,8 @@ APPEARS_S = 0.125
 """Cost of a track birth or death within the observed time, s of evidence; as much as 0.3 s of
 missed detections in plain view. People rarely appear or disappear in the middle of the scene."""
 _MOST_HYPOTHESES = 8
-"""Maximum number of global hypotheses given priority in turn, the most promising ones."""
+"""Maximum number of global hypotheses whose people are given priority, each in one alternative
+selection; the most promising are tried."""
 LEAST_S = 0.1
 """Minimum evidence of a person, in seconds during which all views see the whole person; less in
 short recordings (`_EVEN`)."""
@@ -248,7 +249,7 @@ class EvidenceTable:
     """(H, T, J V) weight of each detection."""
     cost: Array
     """(H, T) cost of presence."""
-    there: Mask
+    tracked: Mask
     """(H, T) frames in which the hypothesis is followed."""
     lasts_s: Array
     """(T,) duration that each frame represents, s."""
@@ -263,12 +264,18 @@ class EvidenceTable:
 
     @classmethod
     def of(
-        cls, candidate: Whole, weight: Real, cost: Real, there: Mask, counts: Index, lasts_s: Array
+        cls,
+        candidate: Whole,
+        weight: Real,
+        cost: Real,
+        tracked: Mask,
+        counts: Index,
+        lasts_s: Array,
     ) -> "EvidenceTable":
-        """Build it from detections `candidate` (H, T, J, V), the number of detections per frame
-        `counts` (T,), and `weight` (H, T, J, V) and `cost` (H, T) of `weighed`.
+        """Build the table from detections `candidate` (H, T, J, V), the number of detections per
+        frame `counts` (T,), and `weight` (H, T, J, V) and `cost` (H, T) of `weighed`.
         """
-        shape = (*there.shape, candidate[0, 0].size if there.size > 0 else 0)
+        shape = (*tracked.shape, candidate[0, 0].size if tracked.size > 0 else 0)
         first, count = (np.cumsum(counts) - counts).astype(np.int32), int(counts.sum())
         place = np.where(candidate >= 0, candidate + first[:, None, None], np.int32(count)).reshape(
             shape
@@ -281,7 +288,7 @@ class EvidenceTable:
             place,
             weights,
             np.asarray(cost, dtype=np.float64),
-            there,
+            tracked,
             lasts_s,
             count,
             *span,
@@ -333,13 +340,13 @@ class EvidenceTable:
 
     def left_over(self, chosen: SelectedTracks) -> SelectedTracks:
         """Tracks that could be added to the `chosen` ones if births and deaths cost nothing."""
-        return self.in_turn(np.zeros(len(self.there), dtype=bool), besides=chosen)
+        return self.in_turn(np.zeros(len(self.tracked), dtype=bool), besides=chosen)
 
     @cached_property
     def unshared_s(self) -> Array:
         """(H, T) evidence of each hypothesis, seconds, as if there were no other."""
         share = self.weight.sum(axis=2, dtype=np.float64)
-        return np.where(self.there, (share - self.cost) * self.lasts_s, -np.inf)
+        return np.where(self.tracked, (share - self.cost) * self.lasts_s, -np.inf)
 
     @cached_property
     def holders(self) -> tuple[Index, NDArray[np.int32], NDArray[np.float32]]:
@@ -369,7 +376,10 @@ class EvidenceTable:
             before = np.column_stack([besides.hypothesis, besides.start, besides.stop])
         appears_s = factor * APPEARS_S if besides is None else 0.0
         given = self.unshared_s.copy(), self.place, *self.holders, self.lasts_s, first, before
-        costs, (H, T) = (appears_s, self.begins, self.ends, factor * self.least_s), self.there.shape
+        costs, (H, T) = (
+            (appears_s, self.begins, self.ends, factor * self.least_s),
+            self.tracked.shape,
+        )
         free, changed = np.ones(self.detections, dtype=bool), np.ones(H, dtype=bool)
         room = np.empty((H, 3), dtype=np.intp), np.empty(H)
         chosen, evidence = np.empty((H * T, 3), dtype=np.intp), np.empty(H * T)

@@ -20,7 +20,7 @@ from shapepose_fg.core.detections import Detections, Recording
 from shapepose_fg.core.rendering import look_at
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.core.trajectory import Trajectory
-from shapepose_fg.simulation.bystanders import walk_along, walking_clips, way_through
+from shapepose_fg.simulation.bystanders import path_through, walk_along, walking_clips
 from shapepose_fg.simulation.detector import Detector, DetectorConfig
 from shapepose_fg.simulation.mocap import Mocap
 from shapepose_fg.simulation.performance import Performance, together
@@ -80,7 +80,7 @@ def _walkers(count: int, mocap: Mocap, rng: np.random.Generator) -> Scene:
     others = np.zeros((frames, 0, 2))
     for each in betas:
         clip = mocap.clip(int(rng.choice(walking_clips(mocap, without=frozenset()))))
-        path, heading = way_through(
+        path, heading = path_through(
             others,
             frames,
             rng,

@@ -278,3 +278,11 @@ def test_rates_are_a_hundredth_to_a_hundred_thousand_frames_a_second(text):
 )
 def test_starts_are_seconds_or_the_camera_s_own_frames(text, seconds):
     assert typed_start(text, 0.04, True) == pytest.approx(seconds)
+
+
+def test_videos_named_in_another_unicode_form(tmp_path):
+    folder = touched(tmp_path, "Gro\u0308ße.mp4", "left.mp4")
+    assert [path.name for path in find_footage([str(folder)], ("Gr\u00f6ße", "left"))[0]] == [
+        "Gro\u0308ße.mp4",
+        "left.mp4",
+    ]

@@ -113,7 +113,7 @@ def test_a_data_set_s_name_is_obeyed(tmp_path, rig):
         is COCO_17
     )
     table = read_detections(written(tmp_path, video({"dataset_name": "horse10"}, 17)), rig)
-    assert any("names horse10, which are not a known layout" in note for note in table.notes)
+    assert any("names horse10, which is no known layout" in note for note in table.notes)
 
 
 def test_joints_that_a_body_lacks_are_passed_over_and_said(tmp_path, rig):
@@ -237,9 +237,9 @@ id = "None"
             "[pose]\npose_model = 'Body_with_feet'",
             17,
             "COCO_17",
-            "which have 26 keypoints instead of 17",
+            "which has 26 keypoints instead of 17",
         ),
-        ("[pose]\npose_model = 'unheard_of'", 17, "COCO_17", "which are not a known layout"),
+        ("[pose]\npose_model = 'unheard_of'", 17, "COCO_17", "which is no known layout"),
         ("[pose]\n", 17, "COCO_17", "without joint names"),
         (CUSTOM, 8, "NAMED_8", "names its joints"),
     ],

@@ -2,6 +2,8 @@
 
 import json
 import re
+import unicodedata
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -395,6 +397,21 @@ def test_files_with_a_suffix_in_capitals(tmp_path, rig):
     for file in (tmp_path / "whole").glob("*.json"):
         file.rename(file.with_suffix(".JSON"))
     assert len(read_detections(tmp_path / "whole", rig)) == 3
+
+
+@pytest.mark.parametrize("form", ["NFC", "NFD"])
+def test_names_of_cameras_in_another_unicode_form(tmp_path, rig, form):
+    """As macOS writes them; the calibration has the other form."""
+    names = "Größe", "カメラ ガ"
+    other = {"NFC": "NFD", "NFD": "NFC"}[form]
+    there = [unicodedata.normalize(form, name) for name in names]
+    cameras = [
+        replace(camera, name=unicodedata.normalize(other, name))
+        for camera, name in zip(rig.cameras, names, strict=True)
+    ]
+    people = people_of(COCO_18)
+    openpose(tmp_path, dict(zip(there, people.values(), strict=True)))
+    assert len(read_detections(tmp_path, replace(rig, cameras=tuple(cameras)))) == 3
 
 
 def test_scores_that_are_all_zero_are_noted(tmp_path, rig):

@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 
 from shapepose_fg.core.detections import Input
-from shapepose_fg.tracking.global_hypotheses import Rest, Seed, explained, follow_hypotheses
+from shapepose_fg.tracking.global_hypotheses import (
+    RemainingDetections,
+    Seed,
+    explained,
+    follow_hypotheses,
+)
 from shapepose_fg.tracking.tracker import Tracker, Tracks
 
 
@@ -36,14 +41,16 @@ def test_worlds_that_have_become_alike_are_followed_once(
 ):
     frames, truth = walking
     given, seeds = inputs(five_cameras, frames), [seed(tracker, truth, 6), seed(tracker, truth, 20)]
-    found = follow_hypotheses(tracker, Rest.of(given), seeds, keep=40)
+    found = follow_hypotheses(tracker, RemainingDetections.of(given), seeds, keep=40)
     side_by_side = sum(people_followed)
     people_followed.clear()
-    apart = [follow_hypotheses(tracker, Rest.of(given), [each], keep=40) for each in seeds]
+    apart = [
+        follow_hypotheses(tracker, RemainingDetections.of(given), [each], keep=40) for each in seeds
+    ]
     assert side_by_side < 0.75 * sum(people_followed)
     np.testing.assert_array_equal(found.global_hypothesis, [0, 0, 1, 1])
     for rows, own in zip((slice(0, 2), slice(2, 4)), apart, strict=True):
-        np.testing.assert_array_equal(found.there[rows], own.there)
+        np.testing.assert_array_equal(found.tracked[rows], own.tracked)
         # A frame's detections may be the other world's for as long as both are told apart; later
         # they are one.
         assert (found.candidate[rows] == own.candidate).mean() > 0.999

@@ -9,7 +9,7 @@ from shapepose_fg.core.detections import Detections, Input
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.pipeline.runs.parts import Checkpoint, checkpoint_arrays, checkpoint_of
 from shapepose_fg.pipeline.windows import StreamState
-from shapepose_fg.tracking.global_hypotheses import Rest, Seed, follow_hypotheses
+from shapepose_fg.tracking.global_hypotheses import RemainingDetections, Seed, follow_hypotheses
 from shapepose_fg.tracking.identities import BLOCK_S, FollowingConfig, FollowState, finish, follow
 from shapepose_fg.tracking.stitching import Ends, StitchingConfig, Trace, stitch
 from shapepose_fg.tracking.tracker import Tracks
@@ -244,9 +244,9 @@ def test_who_is_found_on_the_way_forwards_is_followed_back_in_the_same_world(
     frames = [Input(t, np.full(5, t / 30), each, five_cameras) for t, each in enumerate(found_late)]
     none = np.zeros((0, len(tracker.skeleton), 5), dtype=np.intp)
     found = follow_hypotheses(
-        tracker, Rest.of(frames), [Seed(0, Tracks.none(tracker.skeleton), none)], 0
+        tracker, RemainingDetections.of(frames), [Seed(0, Tracks.none(tracker.skeleton), none)], 0
     )
-    assert found.there.shape == (2, len(frames)) and found.there.all()
+    assert found.tracked.shape == (2, len(frames)) and found.tracked.all()
     seen = (found.candidate >= 0).sum(axis=(2, 3))
     assert (
         (seen[0] == 5 * 25).all()

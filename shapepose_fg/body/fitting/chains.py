@@ -43,7 +43,7 @@ class MotionChain:
             width = (1.0 + 0 * gaps if last else gaps)[..., None]
             none = 0 * weights[0]
             pairs = zip([*weights, none], [none, *weights], strict=True)
-            weights = [(after[1:] - lasts[..., None] * here[:-1]) / width for here, after in pairs]
+            weights = [(after[1:] - lasts[..., None] * now[:-1]) / width for now, after in pairs]
         self._weights, n = weights, law.order
         noise = law.noise(gaps[..., None], law.density(acceleration))[..., -1, -1]
         self._smooth = real[n - 1 :, None] / noise

@@ -170,7 +170,7 @@ class BodyEnergy:
         """Linearise the energy at free parameters (B, P), with a scale of the robust kernel for all
         rows or each row (B,).
 
-        Systems include the Jacobian of the keypoints `keypoints` (B, N); None: of all.
+        Systems include the Jacobian of some `keypoints` (B, N); None: of all.
         """
         (B, P), K = free.shape, len(self.model.keypoint_names)
         keypoints = np.broadcast_to(np.arange(K), (B, K)) if keypoints is None else keypoints

@@ -185,7 +185,7 @@ class JointPosterior(Rows):
 
     @classmethod
     def of(cls, body: Evaluated) -> "JointPosterior":
-        """Build it from evaluated bodies, with systems for all joints."""
+        """The posterior of evaluated bodies, with systems for all joints."""
         return cls(body.free, body.xyz, body.covariances()[0], body.squared, body.left)
 
 

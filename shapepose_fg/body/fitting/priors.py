@@ -90,7 +90,7 @@ class PosePrior:
     def regression(self, given: Index, predicted: Index) -> Array:
         """Matrix G (M, A) that predicts angles `predicted` (M,) from `given` ones (A,).
 
-        E[asked | given] = mean[asked] + G (given - mean[given]).
+        E[predicted | given] = mean[predicted] + G (given - mean[given]).
         """
         S = self.covariance
         G = np.linalg.solve(S[given[:, None], given], S[given[:, None], predicted])

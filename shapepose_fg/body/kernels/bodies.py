@@ -65,8 +65,8 @@ def _product(A, B, C):
 
 @part
 def _bent(slope, L, T, q, c):
-    """Effect of rotating joint q about its axis c through the pose blend shapes; `slope` (207,) is
-    their gradient.
+    """Change of the energy by a rotation of joint q about its axis c, through the pose blend
+    shapes; `slope` (207,) is the energy's gradient by the blend shapes' inputs.
     """
     x, y, z, at, total = T[0, c], T[1, c], T[2, c], 9 * q - 9, 0.0
     for i in range(3):
@@ -259,7 +259,7 @@ def _turned(priors, free, w):
 @part
 def _normal(priors, rows, b, keypoints, H, w):
     """Lower triangle of half the Gauss-Newton Hessian at the last `_slopes`, followed by the
-    gradient, the Jacobian of the points `keypoints`, and the unit vectors of the betas.
+    gradient, the Jacobian of the `keypoints`, and the unit vectors of the betas.
     """
     M, P, A, K, N = w.entry, len(w.gradient), len(priors.mean), len(w.squared), len(keypoints)
     for i in range(len(H)):
@@ -299,7 +299,7 @@ def _normal(priors, rows, b, keypoints, H, w):
 @kernel(Limbs, Priors, "f2", Rows, "f1 i2", Linear, Work)
 def linearised(limbs, priors, free, rows, scale, keypoints, linear, w):
     """Linearise the energy of B rows at `free` (B, P), with a scale of the robust kernel per row,
-    `scale` (B,); systems include the points `keypoints` (B, N).
+    `scale` (B,); systems include the Jacobians of the `keypoints` (B, N).
     """
     A, g, pose = len(priors.mean), w.gradient, w.entry[0]
     for b in range(len(free)):

@@ -96,7 +96,7 @@ class _Instructions(dict[int, Callable[[Any], None]]):
     """The instructions that the reader supports."""
 
     def __missing__(self, code: int) -> None:
-        raise RefusedPickle(f"it has the instruction {bytes([code])!r}, which no array needs")
+        raise RefusedPickle(f"it has the pickle opcode {bytes([code])!r}, which no array needs")
 
 
 class _Reader(pickle._Unpickler):  # type: ignore[name-defined]

@@ -242,7 +242,7 @@ def _with_biases(
 
 
 def without_biases(setup: SetupHypothesis) -> SetupHypothesis:
-    """The set-up without the lasting bias of each joint in each view that people have in common.
+    """The set-up without the persistent bias of each joint in each view that people have in common.
 
     Such a bias along the motion of a person looks like an offset in time.
     """

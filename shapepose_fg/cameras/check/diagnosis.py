@@ -15,7 +15,7 @@ from shapepose_fg.cameras.check.evidence import Evidence, SetupHypothesis, gathe
 from shapepose_fg.cameras.check.exclusion import trust_of
 from shapepose_fg.cameras.check.findings import SURE, Finding, Kind, one_of
 from shapepose_fg.cameras.check.hypotheses import GOOD_PAIR, mistake_of_cameras
-from shapepose_fg.cameras.check.joint_order import order_of_joints
+from shapepose_fg.cameras.check.joint_order import order_of_joints, unlike_bodies
 from shapepose_fg.cameras.check.lags import Lag, lag_of, lags
 from shapepose_fg.cameras.check.over_time import parted, parting_of
 from shapepose_fg.cameras.check.small_errors import LEAST_DEG, SmallErrors
@@ -250,9 +250,9 @@ def _all_mistakes(
     findings += [*(small if setup.cameras_used > 2 else []), *unfit]
     build = build_of(refined.structure()[1].points, detections.skeleton)
     order = order_of_joints(detections, refined)
-    findings += order or _of_people(
-        build, rig
-    )  # with wrong joints, unit and up axis cannot be tested
+    # With wrong joints, unit and up axis cannot be tested.
+    of_people = [] if order else _of_people(build, rig)
+    findings += order or (of_people and unlike_bodies(detections, refined)) or of_people
     trust = trust_of(findings, given, refined, frames)
     return Diagnosis(tuple(findings), given, setup, tuple(remaining), build, tuple(biased), trust)
 

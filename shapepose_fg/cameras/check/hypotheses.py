@@ -54,7 +54,7 @@ _FEW_FRAMES = 40
 """Number of frames that are sufficient for mistakes of all cameras."""
 _EXPLAINED = 0.65
 """Total score above which no other explanation than detector errors is searched for."""
-_PRICE = 0.02
+_PENALTY = 0.02
 """Minimum gain in score per fitted parameter: half a centimetre of a person's joints is 0.02."""
 
 
@@ -88,7 +88,7 @@ def mistake_of_cameras(setup: SetupHypothesis, rng: np.random.Generator) -> Chan
             for score, each in options
             if score - fits[view] > GAIN and likelihood(score, count, each.freedom) > least
         ]
-        options.sort(key=lambda option: option[0] - _PRICE * option[1].freedom, reverse=True)
+        options.sort(key=lambda option: option[0] - _PENALTY * option[1].freedom, reverse=True)
         tried += [each for _, each in options if not _slight(each.finding)][:4]
     for first, second in combinations(weak, 2):
         cameras = {first: setup.camera(second), second: setup.camera(first)}
@@ -192,12 +192,12 @@ def _slight(finding: Finding) -> bool:
 
 def judged(setup: SetupHypothesis, change: Change) -> float:
     """Gain in total score by a change, less the penalty for its parameters."""
-    return change.setup.total - setup.total - _PRICE * change.freedom / setup.view_count
+    return change.setup.total - setup.total - _PENALTY * change.freedom / setup.view_count
 
 
 def score_of(setup: SetupHypothesis, change: Change) -> float:
-    """Score of the changed cameras for the people that all others see (`Match.score`), the lowest;
-    0 if they see none.
+    """Lowest score of the changed cameras for the people that all others see (`Match.score`); 0 if
+    the others see none.
     """
     others = setup.others(*change.finding.cameras)
     return min(

@@ -68,6 +68,20 @@ def order_of_joints(detections: DetectionSequence, setup: SetupHypothesis) -> li
     return [Finding(Kind.JOINT_ORDER, (), joints=_words(names, order))]
 
 
+def unlike_bodies(detections: DetectionSequence, setup: SetupHypothesis) -> list[Finding]:
+    """The finding that people in pictures have no proportions of a body, in whatever order that was
+    tested; none if they have.
+
+    It explains an implausible stature or up axis better than the calibration does.
+    """
+    skeleton = detections.skeleton
+    people = _people(detections, setup, skeleton)
+    fits = fit_of_order(people, keypoint_names(skeleton)) if len(people) > 0 else np.zeros(0)
+    fits = fits[np.isfinite(fits)]
+    unlike = len(fits) >= MIN_SIGHTINGS and fits.mean() < LIKE_A_BODY
+    return [Finding(Kind.JOINT_ORDER, (), joints=("",))] if unlike else []
+
+
 def _words(names: Sequence[str], order: Sequence[int]) -> tuple[str, ...]:
     """The exchanged joints among the names (J) in words; entry k of `order` is the index of the
     true `names[k]`.

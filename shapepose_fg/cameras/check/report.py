@@ -239,7 +239,7 @@ def rounded(value: Any) -> Any:
     return float(f"{value:.4g}") if isinstance(value, float) else value
 
 
-_LOOKED_AT = 200
+_MOST_SAMPLES = 200
 """Number of frames in which unused detections are counted, and of rows whose distances from the
 other cameras are measured, spread over the recording."""
 _REASONS = {
@@ -338,7 +338,9 @@ def result_check(
         )
     warnings += _speeds(people)
     chance = [*_too_many(people), *_clutter(uses)][:1]
-    warnings += chance or _mostly_unused(uses, people, detections, rig, frames)
+    if Kind.JOINT_ORDER not in {finding.kind for finding in report.findings}:
+        # With a wrong order of joints, most detections fit no person.
+        warnings += chance or _mostly_unused(uses, people, detections, rig, frames)
     return ResultCheck(report, uses, tuple(warnings))
 
 
@@ -390,7 +392,7 @@ def _left_out(table: ObservationTable, rig: Rig) -> tuple[Array, Array]:
     """(R, J, V) distances of detections from joints triangulated by two or more others, px and mm;
     R sampled rows.
     """
-    rows = np.unique(np.linspace(0, len(table) - 1, min(len(table), _LOOKED_AT)).astype(np.intp))
+    rows = np.unique(np.linspace(0, len(table) - 1, min(len(table), _MOST_SAMPLES)).astype(np.intp))
     xy, gate = table.xy[rows].astype(np.float64), table.gate[rows]
     weight, size = table.confidence[rows].astype(np.float64), size_of(np.moveaxis(xy, 2, 1))
     px, depth = left_out(xy, weight, size, Views.of(rig), gate == Gate.USED)
@@ -457,17 +459,17 @@ def _mostly_unused(
 ) -> list[str]:
     """Warnings on cameras with mostly unused detections, and on people that were not found."""
     # Share of used detections below which a camera is reported, and minimum number of detections.
-    few = [use for use in uses if use.offered >= 50 and use.used < 0.5 * use.offered]
-    repeated = _repeated(people, detections, rig, frames) if few else np.zeros(len(rig))
-    again = [use for use in few if repeated[rig.names.index(use.camera)] > 0.5]
-    told = list(_unused([use for use in few if use not in again]))
+    hardly_used = [use for use in uses if use.offered >= 50 and use.used < 0.5 * use.offered]
+    repeated = _repeated(people, detections, rig, frames) if hardly_used else np.zeros(len(rig))
+    again = [use for use in hardly_used if repeated[rig.names.index(use.camera)] > 0.5]
+    warnings = list(_unused([use for use in hardly_used if use not in again]))
     if again:
-        told.append(
+        warnings.append(
             f"{' '.join(use.camera for use in again)}: the detector finds people more than once: "
             "most of the unused detections are beside a used one of the same joint; use "
             "non-maximum suppression in the detector"
         )
-    return told if len(again) > 1 else [*told, *_unseen(people, detections, rig, frames)]
+    return warnings if len(again) > 1 else [*warnings, *_unseen(people, detections, rig, frames)]
 
 
 def _repeated(
@@ -479,7 +481,9 @@ def _repeated(
     if table is None:
         return beside
     order = np.argsort(people.frame, kind="stable")
-    for at in np.unique(np.linspace(0, len(frames) - 1, min(len(frames), _LOOKED_AT)).astype(int)):
+    for at in np.unique(
+        np.linspace(0, len(frames) - 1, min(len(frames), _MOST_SAMPLES)).astype(int)
+    ):
         found = detections[frames[at]]
         span = np.searchsorted(people.frame[order], [frames[at], frames[at] + 1])
         rows = order[slice(*span)]
@@ -545,7 +549,9 @@ def unseen(
     duration of the recording, None for isolated frames.
     """
     core = list(detections.skeleton.core)
-    looked_at = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), _LOOKED_AT)).astype(int))
+    looked_at = np.unique(
+        np.linspace(0, len(frames) - 1, min(len(frames), _MOST_SAMPLES)).astype(int)
+    )
     seen = np.zeros((len(looked_at), len(names)))
     for row, frame in enumerate(looked_at.tolist()):
         found = detections[frames[frame]]

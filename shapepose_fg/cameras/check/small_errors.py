@@ -54,7 +54,8 @@ _KNOCKED = 3
 MOST_PEOPLE = 150
 """Maximum number of people used, spread over the recording."""
 _LEAST_OF_ONE = 6
-"""Minimum number of frames of a person; people with fewer are pooled for the biases."""
+"""Minimum number of frames of a person for biases of that person's own; people with fewer are
+pooled."""
 LEAST_DEG = 0.25
 """Minimum rotation, or shift of a principal point, that is reported, degrees."""
 

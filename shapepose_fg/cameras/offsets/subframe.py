@@ -126,8 +126,8 @@ class InSpace:
 
     @classmethod
     def of(cls, pairwise: Pairwise) -> "InSpace":
-        """Build it from people at consecutive times. Tracks that contradict most others of a person
-        are excluded, because two dancers may be nearer to each other than a camera's error.
+        """Place people at consecutive times. Tracks that contradict most others of a person are
+        excluded, because two dancers may be nearer to each other than a camera's error.
         """
         tracks, views, shift, fps = pairwise.tracks, pairwise.views, pairwise.shift, pairwise.fps
         step = max(1, round(fps / 15))

@@ -92,7 +92,7 @@ def _run(
                 if len(todo) == len(entries)
                 else f", {len(entries) - len(todo)} of them are already done"
             )
-            _say(scheduler, f"{len(entries)} recordings{done}", count, here=is_local)
+            _say(scheduler, f"{len(entries)} recordings{done}", count, is_local=is_local)
             batch_status.write()
             runner = BatchRunner(entries, sizes, output, scheduler.address, count)
             try:
@@ -144,9 +144,9 @@ def status_of(
     return found
 
 
-def _say(scheduler: "Scheduler", what: str, at_once: int, *, here: bool) -> None:
+def _say(scheduler: "Scheduler", what: str, at_once: int, *, is_local: bool) -> None:
     """Print what will be done, and where its progress is shown."""
-    place = "here" if here else f"at {scheduler.address}"
+    place = "here" if is_local else f"at {scheduler.address}"
     print(
         f"{what}; {scheduler.processes} processes {place}, {at_once} recordings at once", flush=True
     )
@@ -157,7 +157,7 @@ def _say(scheduler: "Scheduler", what: str, at_once: int, *, here: bool) -> None
         )
     if scheduler.dashboard is not None:
         print(f"what every process does: {scheduler.dashboard}", flush=True)
-    elif here:
+    elif is_local:
         note(
             "Dask's dashboard, which shows what every process does, needs bokeh: pip install "
             '"dask[dashboard]"'

@@ -115,7 +115,7 @@ class Prepared:
     request: Request
     """The request; cameras, detections and times are those of the project if there is one."""
     project: "Pose2SimProject | None"
-    """The project to which it belongs; None if there is none."""
+    """The project to which the request belongs; None if there is none."""
     calibration: Path
     """Path of the calibration."""
     detections: Path

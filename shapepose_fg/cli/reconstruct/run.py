@@ -213,7 +213,7 @@ class _Run:
     inputs: dict[str, str]
     """Checksums of the input files as read."""
     execution: Execution
-    """How it is executed (processes, cluster)."""
+    """How the reconstruction is executed (processes, cluster)."""
     report: SetupReport | None
     """Problems of cameras and detections; None if they were not checked."""
 

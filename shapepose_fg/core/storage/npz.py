@@ -29,7 +29,7 @@ class Pieces:
     """An array that is produced in pieces along its first axis."""
 
     dtype: np.dtype[Any]
-    """Type of its values."""
+    """Type of the array's values."""
     shape: tuple[int, ...]
     """Shape of the whole array."""
     pieces: Callable[[], Iterable[NDArray[Any]]]

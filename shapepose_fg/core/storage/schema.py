@@ -29,9 +29,9 @@ class Column:
     """Axes, separated by spaces: a letter stands for a length that is the same in all columns of a
     table; N is the number of rows."""
     dtype: Any = np.float64
-    """Type of its values."""
+    """Type of the column's values."""
     unit: str = ""
-    """Unit of its values; empty if they have none."""
+    """Unit of the column's values; empty if they have none."""
     most: float = np.inf
     """Maximum magnitude in a file; real results are smaller, and products of larger numbers could
     overflow."""
@@ -45,11 +45,11 @@ class Column:
     codes: type[Enum] | None = None
     """Meanings of the codes, numbered from 0."""
     stored: Any = None
-    """Type in files, if it differs."""
+    """Type in files, if it differs from `dtype`."""
 
     @property
     def has_rows(self) -> bool:
-        """Whether the first axis is the rows."""
+        """Whether the first axis of the array counts the rows of the table."""
         return self._lengths[0] == "N"
 
     @cached_property

@@ -96,7 +96,7 @@ class Node:
     values: Mapping[str, Any]
     """Numbers, lists of numbers, arrays, and other values; None counts as missing."""
     place: str
-    """File, and camera in it, for messages."""
+    """File and camera, for messages."""
     cures: Mapping[str, str] = field(default_factory=dict)
     """Advice for error messages by name; under "" for all other names."""
 

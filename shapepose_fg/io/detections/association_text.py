@@ -349,10 +349,10 @@ def with_middles(view: ViewCandidates, skeleton: Skeleton) -> ViewCandidates:
     seen = view.seen.rows(order)
     known = np.zeros((len(skeleton), len(skeleton)), dtype=bool)
     known[tuple(np.array(skeleton.limbs).T)] = True
-    there = np.flatnonzero(known[tuple(seen.joint[seen.pairs].T)])
-    there = there[np.argsort(seen.pairs[there, 0], kind="stable")]
+    present = np.flatnonzero(known[tuple(seen.joint[seen.pairs].T)])
+    present = present[np.argsort(seen.pairs[present, 0], kind="stable")]
     return ViewCandidates(
-        view.frame[order], replace(seen, pairs=seen.pairs[there], affinity=seen.affinity[there])
+        view.frame[order], replace(seen, pairs=seen.pairs[present], affinity=seen.affinity[present])
     )
 
 

@@ -96,7 +96,7 @@ def _best_fit(people: Sequence[KeptPeople], layouts: Sequence[Skeleton]) -> tupl
             # Maximum number of a camera's people that are compared with the
             # proportions of a body.
             fits.append(_fits(each.some(200), layouts))
-            if (best := _sure(fits[-1])) is not None:
+            if (best := _significant_best(fits[-1])) is not None:
                 chosen.setdefault(layouts[best].name, each.camera)
     if len(chosen) > 1:
         (one, first), (other, second) = list(chosen.items())[:2]
@@ -106,14 +106,14 @@ def _best_fit(people: Sequence[KeptPeople], layouts: Sequence[Skeleton]) -> tupl
             f"give the detections of one model for all cameras, or {_CURE}"
         )
     fits_of_all = np.concatenate(fits, axis=1)
-    best = _sure(fits_of_all)
+    best = _significant_best(fits_of_all)
     if best is None:
         if fits_of_all.shape[1] > 0 and fits_of_all.mean(axis=1).max() < LIKE_A_BODY:
             return usual, ", the most common layout, although people look like none of them"
         rivals = [
             each.name
             for each, fit in zip(layouts, fits_of_all, strict=True)
-            if not _surely(fits_of_all[0] - fit)
+            if not _fits_better(fits_of_all[0] - fit)
         ]
         return (
             usual,
@@ -132,7 +132,7 @@ def _fits(people: Array, layouts: Sequence[Skeleton]) -> Array:
     return fits[:, np.isfinite(fits).all(axis=0)]
 
 
-def _sure(fits: Array) -> int | None:
+def _significant_best(fits: Array) -> int | None:
     """Index of the layout that people fit significantly best; None if this is not clear.
 
     `fits` (L, N) are the fits of N people to L layouts, of which the first is the most common one.
@@ -145,10 +145,10 @@ def _sure(fits: Array) -> int | None:
         return None
     best = int(np.argmax(fits.mean(axis=1)))
     rivals = range(1, len(fits)) if best == 0 else range(1)
-    return best if all(_surely(fits[best] - fits[rival]) for rival in rivals) else None
+    return best if all(_fits_better(fits[best] - fits[rival]) for rival in rivals) else None
 
 
-def _surely(more: Array) -> bool:
+def _fits_better(more: Array) -> bool:
     """Whether people fit one layout significantly better than another; `more` (N,) are the
     differences of their fits.
     """
@@ -231,9 +231,9 @@ def _called(
         if fit:
             return (fit[0], []), f"{source} names {_shown(joints)}"
         has = (
-            f"have {layouts[0].keypoint_count} keypoints instead of {count}"
+            f"has {layouts[0].keypoint_count} keypoints instead of {count}"
             if layouts
-            else ("are not a known layout")
+            else "is no known layout"
         )
         return None, f"{source} names {_shown(joints)}, which {has}"
     if not any(body_points(joints)):

@@ -5,6 +5,7 @@ A format of your own is an entry in `FORMATS` and a function that reads it.
 """
 
 import re
+import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,7 +14,7 @@ from shapepose_fg.core.camera import Camera, Rig
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.core.skeleton import BODY_25, Skeleton
 from shapepose_fg.core.storage.kept_arrays import InMemory, KeptArrays
-from shapepose_fg.io.camera_names import listing, match_by_parts
+from shapepose_fg.io.camera_names import in_any_form, listing, match_by_parts
 from shapepose_fg.io.detection_table import DetectionTable
 from shapepose_fg.io.detections.arrays import (
     cameras_of_freemocap,
@@ -166,7 +167,7 @@ def find_places(path: Path, rig: Rig) -> tuple[DetectionFormat, list[Path], list
                 f'{folder / form.names[0].format(missing)}: the detections of camera "{missing}"'
                 " are missing,"
                 f" {folder} contains {holds}; add them, or leave the camera out with --without"
-                f" {missing}"
+                f" {shlex.quote(missing)}"
             )
     # Such as `walk_Miqus_1_23087_json` for camera `23087`, or `cam01_json` for camera `int_cam1`.
     for form, offered, names in _offered(entries):
@@ -217,7 +218,7 @@ def camera_names(path: Path) -> list[str]:
                 for each in places
             ]
             if any(holds):
-                return [name for name, there in zip(names, holds, strict=True) if there]
+                return [name for name, has_files in zip(names, holds, strict=True) if has_files]
     holds = listing([each.name for each in entries])
     cure = "give the folder with a file or folder for each camera"
     raise InputError(f"{folder}: there are no detections; it contains {holds}; {cure}")
@@ -288,14 +289,14 @@ def _named(folder: Path, name: str, patterns: Sequence[str]) -> Path | None:
     suffix.
     """
     for pattern in patterns:
-        place = folder / pattern.format(name)
+        place = in_any_form(folder / pattern.format(name))
         if suffix := Path(pattern).suffix:
             in_capitals = place.with_name(place.name.removesuffix(suffix) + suffix.upper())
-            there = [each for each in (place, in_capitals) if each.is_file()]
+            found = [each for each in (place, in_capitals) if each.is_file()]
         else:
-            there = [place] if place.is_dir() else []
-        if there:
-            return there[0]
+            found = [place] if place.is_dir() else []
+        if found:
+            return found[0]
     return None
 
 

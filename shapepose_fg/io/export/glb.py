@@ -212,11 +212,11 @@ def _animate(file: _File, first: int, motion: SkinnedMotion, times: Array) -> No
     rotations = _shortest(motion.rotations)
     for joint in range(BONES):
         channel(first + 1 + joint, "rotation", at, rotations[:, joint])
-    there = np.zeros(len(times), dtype=bool)
-    there[motion.index] = True
-    if not there.all():
-        turns = np.flatnonzero(np.diff(there, prepend=not there[0]))
-        scale = np.repeat(there[turns].astype(np.float64)[:, None], 3, axis=1)
+    visible = np.zeros(len(times), dtype=bool)
+    visible[motion.index] = True
+    if not visible.all():
+        turns = np.flatnonzero(np.diff(visible, prepend=not visible[0]))
+        scale = np.repeat(visible[turns].astype(np.float64)[:, None], 3, axis=1)
         channel(
             first, "scale", file.array(times[turns].astype(np.float32), bounds=True), scale, "STEP"
         )

@@ -44,14 +44,14 @@ class Markers:
     """(T, M) standard deviation, root mean square over the axes, metres; NaN if unknown."""
 
     @property
-    def there(self) -> Mask:
+    def present(self) -> Mask:
         """(T, M) mask of the existing markers."""
         return np.asarray(np.isfinite(self.xyz).all(axis=2))
 
     @property
     def frames(self) -> Index:
         """(F,) the frames with at least one marker."""
-        return np.flatnonzero(self.there.sum(axis=1))
+        return np.flatnonzero(self.present.sum(axis=1))
 
 
 def markers_of(
@@ -85,8 +85,8 @@ def opensim_names(joints: tuple[str, ...]) -> tuple[str, ...]:
 def write_trc(job: Job) -> Written:
     """A file per person, with a row for each frame in which the person has a marker."""
 
-    def write(who: int, markers: Markers, take: Take, written: Written) -> None:
-        path = job.folder / f"person_{who}.trc"
+    def write(person: int, markers: Markers, take: Take, written: Written) -> None:
+        path = job.folder / f"person_{person}.trc"
         written.add(path, trc_text(markers, take.frames, take.times_s, take.fps, path.name))
 
     return _each(job, job.take, "trc", Written(), write)
@@ -100,9 +100,9 @@ def write_c3d(job: Job) -> Written:
     written = Written()
     even, origin = _c3d_take(written, job.take)
 
-    def write(who: int, markers: Markers, take: Take, written: Written) -> None:
+    def write(person: int, markers: Markers, take: Take, written: Written) -> None:
         def name(span: tuple[int, int] | None) -> str:
-            return f"person_{who}" + ("" if span is None else f"_frames_{span[0]}-{span[1]}")
+            return f"person_{person}" + ("" if span is None else f"_frames_{span[0]}-{span[1]}")
 
         _write_c3d(markers, take, job.folder, name, written, origin)
 
@@ -148,7 +148,7 @@ def trc_text(markers: Markers, frames: Whole, times_s: Array, fps: float, name: 
         raise ValueError(f"{name}: no frame has a marker")
     frames, words = (
         frames[rows],
-        np.where(markers.there[..., None], np.char.mod("%.6f", markers.xyz), "NaN")[rows],
+        np.where(markers.present[..., None], np.char.mod("%.6f", markers.xyz), "NaN")[rows],
     )
     rate, count = f"{fps:.10g}", len(markers.names)
     lines = [
@@ -206,7 +206,7 @@ def c3d_bytes(
     world, in the axes of the file.
     """
     ezc3d = optional("ezc3d", "export")
-    xyz, sigma, exists = markers.xyz[part], markers.sigma_m[part], markers.there[part]
+    xyz, sigma, exists = markers.xyz[part], markers.sigma_m[part], markers.present[part]
     file = ezc3d.c3d()
     file["header"]["points"]["first_frame"] = first_frame
     point = file["parameters"]["POINT"]

@@ -156,11 +156,11 @@ def _ik_tool(name: str, markers: Markers, span: str) -> str:
     """The settings of OpenSim's inverse kinematics; the weight of a marker is its inverse
     variance, relative to the median marker.
     """
-    sigma = np.where(markers.there & np.isfinite(markers.sigma_m), markers.sigma_m, np.inf)
+    sigma = np.where(markers.present & np.isfinite(markers.sigma_m), markers.sigma_m, np.inf)
     spread = np.median(sigma[markers.frames], axis=0)
     usual = np.median(spread[np.isfinite(spread)]) if np.isfinite(spread).any() else 1.0
     ratio = usual / np.where(np.isfinite(spread), np.maximum(spread, 1e-6), usual)
-    weights = np.where(markers.there.any(axis=0), ratio**2, 0).clip(0, 10)
+    weights = np.where(markers.present.any(axis=0), ratio**2, 0).clip(0, 10)
     tasks = (
         f"<IKMarkerTask name={quoteattr(marker)}><apply>{str(weight > 0).lower()}</apply>"
         f"<weight>{weight:.3f}</weight></IKMarkerTask>"

@@ -123,12 +123,13 @@ class ExportFormat:
     `write(opened, rows, folder) -> Written` of an `OpenedReconstruction` and row numbers (R,), None
     for all."""
     identities: bool = True
-    """Whether it stores people over time, and therefore requires a result with identities."""
+    """Whether the format stores people over time, and therefore requires a result with
+    identities."""
     observations: bool = False
-    """Whether it includes the detections from which people were solved."""
+    """Whether the format includes the detections from which people were solved."""
     rows: bool = False
-    """Whether it contains the rows of the result unchanged, and is written without loading all into
-    memory."""
+    """Whether the format contains the rows of the result unchanged, and is written without loading
+    all into memory."""
 
     @property
     def write(self) -> Any:

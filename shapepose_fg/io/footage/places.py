@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from shapepose_fg.core.errors import InputError
-from shapepose_fg.io.camera_names import listing, match_by_parts
+from shapepose_fg.io.camera_names import composed, listing, match_by_parts
 
 VIDEOS = frozenset(".mp4 .m4v .mov .avi .mkv .webm .mpg .mpeg .ts .mts .m2ts .wmv".split())
 """File extensions of videos."""
@@ -94,9 +94,9 @@ def _in_folder(folder: Path, cameras: Sequence[str]) -> tuple[list[Path], list[s
         raise InputError(f"{folder}: there is no such folder; check the path")
     entries = [each for each in sorted(folder.iterdir()) if not each.name.startswith(".")]
     offered = [each for each in entries if _is_footage(each)]
-    names = [each.name if each.is_dir() else each.stem for each in offered]
+    names = [composed(each.name if each.is_dir() else each.stem) for each in offered]
     exact = [
-        [path for path, name in zip(offered, names, strict=True) if name == camera]
+        [path for path, name in zip(offered, names, strict=True) if name == composed(camera)]
         for camera in cameras
     ]
     for camera, found in zip(cameras, exact, strict=True):

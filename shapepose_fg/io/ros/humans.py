@@ -52,7 +52,8 @@ class _Limb(NamedTuple):
     smpl: tuple[int, ...]
     """SMPL's joints from above the pelvis to the upper link."""
     side: float
-    """1 on the left, -1 on the right: direction along y."""
+    """1 on the left, -1 on the right: direction of this side along the body's y axis, which points
+    left."""
 
     @property
     def is_arm(self) -> bool:

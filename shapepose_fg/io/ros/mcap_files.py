@@ -116,12 +116,12 @@ def read_views(
         while waiting:
             (camera, seen, time_s), frame = waiting[0]
             with naming(file, _CURE_POSES):
-                (pose,), (covariances,), (there,) = frames.at(frame, np.array([time_s]))
+                (pose,), (covariances,), (known,) = frames.at(frame, np.array([time_s]))
             stands = not (carrier[camera] or frames.moves(frame))
-            if now_s < (begun_s if stands else time_s) + LONGEST_GAP_S and not there:
+            if now_s < (begun_s if stands else time_s) + LONGEST_GAP_S and not known:
                 return
             waiting.popleft()
-            if there or stands:
+            if known or stands:
                 yield (
                     camera,
                     seen,

@@ -69,10 +69,10 @@ class PeopleTopics:
         With `has_bodies`, also /tf and the topics of REP 155, which have one pose of each person at
         a time and must be of one kind.
         """
-        here = f"/people/{kind}"
-        yield here, "shapepose_msgs/People", people_message(rows, kind, time_s, self._covariances)
+        topic = f"/people/{kind}"
+        yield topic, "shapepose_msgs/People", people_message(rows, kind, time_s, self._covariances)
         # Lifetime of the markers of a person who is no longer seen, s.
-        yield f"{here}/markers", "visualization_msgs/MarkerArray", markers(rows, time_s, 0.2)
+        yield f"{topic}/markers", "visualization_msgs/MarkerArray", markers(rows, time_s, 0.2)
         if has_bodies:
             yield from self._bodies(rows, time_s)
 
@@ -87,13 +87,13 @@ class PeopleTopics:
         yield f"{_BODIES}/tracked", "hri_msgs/IdsList", ids
         self._described &= {each.body_id for each in people}
         for each in people:
-            here = f"{_BODIES}/{each.body_id}"
-            yield f"{here}/joint_states", "sensor_msgs/JointState", joint_state(each, time_s)
+            topic = f"{_BODIES}/{each.body_id}"
+            yield f"{topic}/joint_states", "sensor_msgs/JointState", joint_state(each, time_s)
             if self._camera is not None:
                 points = skeleton_2d(rows, each.row, self._camera)
                 skeleton, region = skeleton_and_region(points, self._camera, time_s)
-                yield f"{here}/skeleton2d", "hri_msgs/Skeleton2D", skeleton
-                yield f"{here}/roi", "hri_msgs/NormalizedRegionOfInterest2D", region
+                yield f"{topic}/skeleton2d", "hri_msgs/Skeleton2D", skeleton
+                yield f"{topic}/roi", "hri_msgs/NormalizedRegionOfInterest2D", region
             if each.body_id not in self._described and (urdf := each.urdf()) is not None:
                 self._described.add(each.body_id)
-                yield f"{here}/urdf", "std_msgs/String", {"data": urdf}
+                yield f"{topic}/urdf", "std_msgs/String", {"data": urdf}

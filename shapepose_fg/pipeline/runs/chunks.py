@@ -71,8 +71,8 @@ def _until(stop: int, segment: range, first: int, time_s: Array, config: Pipelin
     """Frame up to which people must be tracked for the window that ends at `stop`.
 
     It adds half a window, the overlap, the tracker's block and look-ahead, and two spare frames, in
-    whole batches. `Engine` compares means over the cameras' times, with other rounding: one frame
-    more or less, twice.
+    whole batches. The spare frames are needed because `Engine` compares means over the cameras'
+    times, which are rounded differently, at two borders.
     """
     beyond = stop + config.batch_frames // 2 + 1
     while beyond < segment.stop and time_s[beyond] - time_s[stop] <= config.windows.shared_s:

@@ -31,7 +31,8 @@ unfinished run."""
 _MANIFEST = "manifest.json"
 _FORMAT = "shapepose-fg unfinished run 1"
 _WORDS = {"program": "version of this program", "cameras": "set of cameras", "skeleton": "skeleton"}
-"""Words for differences, for keys that are not words themselves."""
+"""Descriptions of the manifest's keys in messages about differences; other keys describe
+themselves."""
 
 
 def open_run(

@@ -43,7 +43,7 @@ class PictureView:
     camera: Camera
     """The camera, with its lens."""
     placement: Placement
-    """Position of calibrated pixels in its pictures."""
+    """Position of calibrated pixels in the camera's pictures."""
     size: tuple[int, int]
     """Width and height of the canvas, pixels: the picture, enlarged or reduced."""
 

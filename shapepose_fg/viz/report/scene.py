@@ -100,7 +100,7 @@ class _Packing:
     origin: Array
     """(3,) origin, metres."""
     unit_m: float
-    """Unit, metres."""
+    """Length of one unit of the integers, metres."""
 
     def __call__(self, points: Array) -> Array:
         """Convert points (..., 3) to integers (..., 3); unknown or too distant points become

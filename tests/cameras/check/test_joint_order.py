@@ -74,6 +74,18 @@ def test_other_names_are_found_from_how_bodies_look(dance, wrong):
 
 
 @pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(4))
+def test_any_other_order_is_neither_a_unit_nor_an_axis(dance, seed):
+    """Of all joints, so that no layout comes near: the stature is then anything."""
+    seen = Recording(BODY_25, dance.recording.frames[:20])
+    order = np.random.default_rng(seed).permutation(len(BODY_25.joints))
+    frames = [replace(frame, joint=order[frame.joint]) for frame in seen]
+    report = check_setup(Recording(BODY_25, frames), dance.scene.rig)
+    kinds = {each.kind for each in report.findings}
+    assert Kind.JOINT_ORDER in kinds and not kinds & {Kind.UNIT, Kind.UP}
+
+
 def test_nothing_is_said_of_the_right_names(dance):
     assert order_findings(dance.recording, dance.scene.rig) == []
 
