@@ -82,8 +82,9 @@ def live(
             report = people.report()
             if report.frames > frames:
                 frames = report.frames
-                publish("now", people.people())
-                publish("settled", people.settled())
+                # Also without people, so that readers notice when everybody has left.
+                publish("now", people.people(), [people.newest_s])
+                publish("settled", people.settled(), ())
                 if is_file:
                     people.catch_up()
             if report.jumps > jumps:
@@ -96,9 +97,9 @@ def live(
         try:
             feed(detections, rig, joints, of_lines, push)
         except InputError:
-            publish("settled", people.finish())
+            publish("settled", people.finish(), ())
             raise
-        publish("settled", people.finish())
+        publish("settled", people.finish(), ())
         report = people.report()
     out = f"{report.dropped} measurements were dropped (late, repeated, or at the wrong time)"
     if report.unrefined > 0:

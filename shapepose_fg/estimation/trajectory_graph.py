@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from factors import (
     DEFAULT_WIDTH_SIGMA,
     camera_keys,
+    format_key,
     gaussian,
     isotropic,
     joint_keys,
@@ -38,6 +39,12 @@ from shapepose_fg.estimation.gated_views import (
     linearise,
     observation_sigmas,
     triangulate,
+)
+from shapepose_fg.estimation.user_factors import (
+    UserFactor,
+    items_of,
+    name_of,
+    refuse_unsuitable,
 )
 
 CameraFactors = Callable[["TrajectoryGraph", NDArray[np.int64]], Iterable[gtsam.NonlinearFactor]]
@@ -270,9 +277,25 @@ class TrajectoryGraph:
         deque(map(self.values.insert, joints, points[used]), maxlen=0)
         near = isotropic(3, UNDETERMINED_M)
         deque(map(self.graph.addPriorPoint3, joints, points[used], [near] * len(joints)), maxlen=0)
-        for factor in self._own(self, self.keys) if self._own is not None else ():
-            self.graph.add(factor)
+        if self._own is not None:
+            self._add_own(self._own)
         return joints
+
+    def _add_own(self, function: CameraFactors) -> None:
+        """Add the user's factors; ValueError for one that cannot be used, naming the function."""
+        name = name_of(function)
+        for factor in items_of(function(self, self.keys), name):
+            refuse_unsuitable(factor, name)
+            each = UserFactor(factor, tuple(factor.keys()), name)
+            for key in each.keys:
+                if not self.values.exists(key):
+                    raise ValueError(
+                        f"your factor ({name}) uses {format_key(key)}, which is not in this "
+                        "window: use its `keys`, or joints in `graph.values`"
+                    )
+            if problem := each.problem(self.values):
+                raise ValueError(problem)
+            self.graph.add(factor)
 
     def _chosen(self, reach_m: float) -> tuple[Mask, Array, Array]:
         """(N, J, V) observations that constrain camera poses, and the joints (N, J, 3), metres, and

@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -247,18 +248,9 @@ class PersonWindow:
         if isinstance(item, gtsam.Values):
             self._add_start(item)
             return
-        if not isinstance(item, gtsam.NonlinearFactor):
-            raise ValueError(
-                f"{_called(name)} is a {type(item).__name__}: yield factors of GTSAM, or "
-                "gtsam.Values with initial values of your variables"
-            )
         nodes, touched = list[tuple[int, int]](), list[tuple[PersonWindow, int]]()
+        refuse_unsuitable(item, name)
         what = _called(name)
-        if _is_constrained(item):
-            raise ValueError(
-                f"{what} has a sigma of 0, which the solver does not meet: give it a small one, "
-                "for example isotropic(3, 0.001)"
-            )
         for key in item.keys():  # noqa: SIM118 - GTSAM's, not a dictionary's
             person = next((each for each in (self, *self.people) if key in each._own), None)
             if person is not None:
@@ -334,13 +326,7 @@ def add_factors(people: Sequence[PersonWindow], functions: Sequence[FactorFuncti
         person.people = together[int(person.frames[0]) if single_frames else 0]
     for function in functions:
         for person in people:
-            items = function(person, person.keys)
-            if not isinstance(items, Iterable):
-                raise ValueError(
-                    f"{name_of(function)} returned a {type(items).__name__} instead of factors: "
-                    "yield them one by one, or return a list of them"
-                )
-            for item in items:
+            for item in items_of(function(person, person.keys), name_of(function)):
                 person.add(item, name_of(function))
 
 
@@ -355,6 +341,30 @@ def functions_of(given: ExtraFactors | None) -> tuple[FactorFunction, ...]:
                 f"extra_factors must be a function (window, keys), or a list of them, got {each!r}"
             )
     return functions
+
+
+def items_of(returned: object, name: str) -> Iterable[Any]:
+    """What the function `name` of the user returned; ValueError if it cannot be gone through."""
+    if not isinstance(returned, Iterable):
+        raise ValueError(
+            f"{name} returned a {type(returned).__name__} instead of factors: yield them one by "
+            "one, or return a list of them"
+        )
+    return returned
+
+
+def refuse_unsuitable(factor: object, name: str) -> None:
+    """Raise ValueError if a `factor` of the function `name` is none, or has a sigma of 0."""
+    if not isinstance(factor, gtsam.NonlinearFactor):
+        raise ValueError(
+            f"{_called(name)} is a {type(factor).__name__}: yield factors of GTSAM, or, on people, "
+            "gtsam.Values with initial values of your variables"
+        )
+    if _is_constrained(factor):
+        raise ValueError(
+            f"{_called(name)} has a sigma of 0, which the solver does not meet: give it a small "
+            "one, for example isotropic(3, 0.001)"
+        )
 
 
 def _called(name: str) -> str:
@@ -372,7 +382,7 @@ def _is_constrained(factor: gtsam.NonlinearFactor) -> bool:
     return noise is not None and noise.isConstrained()
 
 
-def name_of(function: FactorFunction) -> str:
+def name_of(function: Callable[..., Any]) -> str:
     """Name of a user function."""
     inner = getattr(function, "func", function)  # of functools.partial
     return str(getattr(inner, "__name__", type(inner).__name__))

@@ -358,6 +358,13 @@ class OnlineReconstructor(AbstractContextManager["OnlineReconstructor"]):
         state.slots.clear()
         state.before, state.watch, state.rig = None, CameraWatch.of(len(self.rig)), self.rig
 
+    @property
+    def newest_s(self) -> float:
+        """Time of the newest frame, seconds, also if nobody is in it; not finite before the first
+        frame.
+        """
+        return float(self._now.state.tracks.time_s)
+
     def people(self, time_s: float | None = None) -> Reconstruction:
         """The people at `time_s`, from the newest frame's time (the default) to a second after it.
 

@@ -28,8 +28,9 @@ from shapepose_fg.io.ros.mcap_files import McapWriter
 from shapepose_fg.io.ros.messages import COVARIANCES
 from shapepose_fg.live.sockets import MOST_CLIENTS, accept, listen
 
-Publish = Callable[[str, Reconstruction], None]
-"""Function that takes the kind of the rows, `now` or `settled`, and the rows."""
+Publish = Callable[[str, Reconstruction, Sequence[float]], None]
+"""Function that takes the kind of the rows, `now` or `settled`, the rows, and the times of the
+frames to be written as empty if there are no rows, s."""
 
 
 @contextmanager
@@ -44,9 +45,9 @@ def published(
             files.enter_context(_target(each, rig, note, covariances)) for each in where or ["-"]
         ]
 
-        def publish(kind: str, people: Reconstruction) -> None:
+        def publish(kind: str, people: Reconstruction, empty_s: Sequence[float] = ()) -> None:
             for target in targets:
-                target(kind, people)
+                target(kind, people, empty_s)
 
         yield publish
 
@@ -86,8 +87,8 @@ def _target(
         if where.endswith(".mcap"):
             stream = files.enter_context(_OutputFile(Path(where)))
             written = files.enter_context(McapWriter(cast("IO[bytes]", stream), rig, covariances))
-            yield lambda kind, people: _by_time(
-                people, lambda rows, time_s: written.frame(rows, time_s, kind)
+            yield lambda kind, people, empty_s: _by_time(
+                people, empty_s, lambda rows, time_s: written.frame(rows, time_s, kind)
             )
             return
         if where == "rerun" or where.startswith("rerun+") or where.endswith(".rrd"):
@@ -106,7 +107,7 @@ def _target(
                     rerun_app.shown(first, None if where == "rerun" else where)
                 )
             log = rerun_log.LiveLog(stream, rig, body_of({}, None))
-            yield lambda kind, people: log.moment(people) if kind == "now" else None
+            yield lambda kind, people, _: log.moment(people) if kind == "now" else None
             return
         if where.startswith("tcp:"):
             send = files.enter_context(_Listeners(listen(where), note)).send
@@ -121,8 +122,8 @@ def _target(
                     sink.write(line.encode())
                     sink.flush()
 
-        yield lambda kind, people: _by_time(
-            people, lambda rows, time_s: send(line_of(kind, rows, time_s, covariances))
+        yield lambda kind, people, empty_s: _by_time(
+            people, empty_s, lambda rows, time_s: send(line_of(kind, rows, time_s, covariances))
         )
 
 
@@ -145,8 +146,10 @@ def line_of(kind: str, people: Reconstruction, time_s: float, covariances: str =
     return json.dumps(line, allow_nan=False, separators=(",", ":")) + "\n"
 
 
-def _by_time(people: Reconstruction, take: Callable[[Reconstruction, float], None]) -> None:
-    for time_s in np.unique(people.time_s).tolist():
+def _by_time(
+    people: Reconstruction, empty_s: Sequence[float], take: Callable[[Reconstruction, float], None]
+) -> None:
+    for time_s in np.unique(people.time_s).tolist() or empty_s:
         take(people.rows(people.time_s == time_s), time_s)
 
 

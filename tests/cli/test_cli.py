@@ -558,6 +558,21 @@ def test_a_reader_that_stops_reading_is_no_error():
     assert result.returncode == 1
 
 
+def test_a_reader_that_stops_before_the_summary_is_no_error(recording, monkeypatch, capsys):
+    """And a full disk below the standard output is none of the results."""
+    errors = [BrokenPipeError(32, "Broken pipe"), OSError(28, "No space left on device")]
+    for error, code in zip(errors, (1, 2), strict=True):
+
+        def refuse(_: object, error: OSError = error) -> None:
+            raise error
+
+        monkeypatch.setattr("shapepose_fg.cli.reconstruct.run.show", refuse)
+        assert run(*recording, "--frames", "0:2", "--no-temporal", "--overwrite") == code
+    said = capsys.readouterr().err
+    assert "Broken pipe" not in said
+    assert re.search(r"error: No space left on device; the results in \S+ are complete", said)
+
+
 def test_settings_are_looked_at_before_the_recording(recording, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(
         "shapepose_fg.cli.reconstruct.run.read_recording", lambda *_: pytest.fail("it is read")

@@ -66,6 +66,24 @@ def test_people_come_out_as_lines(tmp_path, cameras, five_cameras, two_people):
         assert np.linalg.norm(joints[order] - two_people, axis=-1).mean() < 0.01
 
 
+def test_frames_without_people_have_a_line(tmp_path, cameras, five_cameras):
+    """A reader of the lines notices that everybody has left, and that the program runs."""
+    empty = [
+        json.dumps({"camera": name, "time_s": frame / 10, "people": []})
+        for frame in range(4)
+        for name in five_cameras.names
+    ]
+    (tmp_path / "in.jsonl").write_text("\n".join(empty))
+    given = ["--calibration", cameras, "--detections", str(tmp_path / "in.jsonl")]
+    with pytest.raises(SystemExit) as ended:
+        main(["live", *given, "--workers", "1", "--output", str(tmp_path / "out.jsonl")])
+    assert ended.value.code == 0
+    told = [json.loads(line) for line in (tmp_path / "out.jsonl").read_text().splitlines()]
+    assert [each["kind"] for each in told] == ["now"] * 4
+    assert [each["time_s"] for each in told] == pytest.approx(np.arange(4) / 10)
+    assert all(each["people"] == [] for each in told)
+
+
 @pytest.mark.slow
 def test_all_frames_of_a_file_are_refined(tmp_path, cameras, five_cameras, two_people):
     """A file is read faster than its windows are solved."""

@@ -281,6 +281,9 @@ def test_without_a_fixed_camera_people_are_where_they_are_before_the_robot():
     assert np.sqrt(people.covariance[last].trace(axis1=2, axis2=3)).min() > sigma[-1]
 
 
+NOWHERE = gtsam.Pose3(gtsam.Rot3(), np.full(3, np.nan))
+
+
 def _moved(points: NDArray[np.float64], poses: NDArray[np.float64]) -> NDArray[np.float64]:
     return points @ poses[:, :3, :3].mT + poses[:, None, :3, 3]
 
@@ -297,6 +300,25 @@ def test_factors_of_your_own_on_poses_count(drifted):
 
     rig = refine_trajectories(drifted.recording, drifted.rig, times=TIMES, camera_factors=surveyed)
     assert np.linalg.norm(camera_error(drifted, rig)[30, 3:]) < 0.004
+
+
+def test_factors_on_poses_that_cannot_count_are_refused(drifted):
+    key = camera_key(0, 3)
+    exact, lost = gtsam.noiseModel.Constrained.All(6), camera_key(0, 99999)
+    for wrong, words in (
+        ([gtsam.PriorFactorPose3(key, gtsam.Pose3(), exact)], "has a sigma of 0"),
+        ([gtsam.PriorFactorPose3(lost, gtsam.Pose3(), diagonal([0.1] * 6))], "not in this window"),
+        ([gtsam.PriorFactorPoint3(key, np.zeros(3), diagonal([0.1] * 3))], "cannot be computed"),
+        ([gtsam.PriorFactorPose3(key, NOWHERE, diagonal([0.1] * 6))], "is not finite"),
+        (None, "returned a NoneType"),
+    ):
+        with pytest.raises(ValueError, match=f"<lambda>.*{words}"):
+            refine_trajectories(
+                drifted.recording,
+                drifted.rig,
+                times=TIMES,
+                camera_factors=lambda graph, keys, wrong=wrong: wrong,
+            )
 
 
 @pytest.mark.slow

@@ -257,6 +257,8 @@ class _Run:
                 return self._finished(kept)
         except Stopped as stop:
             raise Stopped(stop.number, self._interrupted_state()) from None
+        except BrokenPipeError:  # the reader of our output, such as `head`, has ended
+            raise
         except (OSError, MemoryError, RuntimeError) as error:
             if (what := failure(error)) is None:
                 raise
@@ -376,6 +378,8 @@ class _Run:
     def _interrupted_state(self) -> str:
         """The state of an interrupted run, and how to resume it."""
         output, count = self.known.output, len(self.task.whole()[0])
+        if not (output / manifest.PARTS).is_dir():  # stopped while the summary is printed
+            return f"the results in {output} are complete"
         try:
             done = manifest.frames_done(output)
         except InputError as error:
