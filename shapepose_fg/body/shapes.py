@@ -9,8 +9,8 @@ from shapepose_fg.core.shapes import SubjectShapes as SubjectShapes
 
 
 def recognise(found: SubjectShapes, known: SubjectShapes, ratio: float = 10.0) -> Index:
-    """(G,) index of the `known` person that each of the `found` is, by shape only; -1 for a
-    stranger.
+    """(G,) index of the `known` person with whom each `found` person is identified, by shape only;
+    -1 for a stranger.
 
     `found` must be estimates under the adults' prior N(0, I). A person is recognised if the
     evidence is `ratio` times as likely for the known shape as for a random adult (Bayes factor): by

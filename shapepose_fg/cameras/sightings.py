@@ -138,8 +138,8 @@ class Groups(Rows):
     member: Index
     """(P, V) row of the sighting by each camera, -1 for none."""
     error: Array
-    """(P,) median distance of the rays of the two cameras by which each was found, as a share of
-    the size."""
+    """(P,) median distance of the rays of the two cameras by which each person was found, as a
+    share of the size."""
 
 
 @dataclass(frozen=True)

@@ -190,8 +190,8 @@ def _followed(seen: Sightings) -> list[Index]:
 
 
 def _smoothed(rays: Array, frame: Index, width: float) -> tuple[Array, Array]:
-    """`lines` of directions (N, J, 3) at ascending frames (N,), for every frame from the first to
-    the last.
+    """Smooth directions (N, J, 3) at ascending frames (N,) by `lines`, for every frame from the
+    first to the last.
     """
     full = np.full((frame[-1] - frame[0] + 1, *rays.shape[1:]), np.nan)
     full[frame - frame[0]] = rays

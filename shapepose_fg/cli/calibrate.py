@@ -25,6 +25,7 @@ from shapepose_fg.cli.options import (
     RateOptions,
     SeenOptions,
     Stature,
+    check_output_files,
     chosen_cameras,
     grouped,
     json_option,
@@ -160,6 +161,7 @@ def calibrate(
     from shapepose_fg.io.timestamps import write_timestamps
 
     within = _within(tolerance)
+    check_output_files({"--output": output, "--times": times, "--report": report})
     if times is not None and rate.timestamps is not None:
         raise InputError(
             "--times and --timestamps: times are either estimated or given; give one of them"

@@ -2,7 +2,7 @@
 
 import os
 import stat
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -65,6 +65,7 @@ def live(
     from shapepose_fg.live.outputs import published
 
     rig, joints = cameras.rig(), find_skeleton(skeleton) or BODY_25
+    _check_files(detections, output or ())
     with (
         SparingNotes(note) as of_lines,
         SparingNotes(note) as of_readers,
@@ -105,6 +106,23 @@ def live(
     if report.unrefined > 0:
         out += f"; {report.unrefined} frames were not refined, because solving did not keep up"
     note(f"{report.frames} frames, {report.late} of them late; {out}")
+
+
+def _check_files(detections: str | None, outputs: Sequence[str]) -> None:
+    """Raise InputError if the input is a missing file, or if it is an output, too: outputs are
+    emptied when they are opened.
+    """
+    if detections is not None and detections != "-" and not detections.startswith("tcp:"):
+        if Path(detections).is_dir():
+            raise InputError(f"{detections}: this is a folder; give a file or a pipe")
+        if not Path(detections).exists():
+            raise InputError(f"{detections}: there is no such file; check the path")
+    if not _is_file(detections):
+        return
+    given = os.fstat(0) if detections in (None, "-") else Path(detections).stat()
+    for each in outputs:
+        if Path(each).is_file() and os.path.samestat(given, Path(each).stat()):
+            raise InputError(f"--output {each}: this is the input; give another file")
 
 
 def _is_file(detections: str | None) -> bool:

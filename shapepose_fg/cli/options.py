@@ -17,6 +17,7 @@ from shapepose_fg.cli.terminal import note, note_of_reading
 from shapepose_fg.core.bounds import Axis, Unit, interval_of, violated
 from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.frame_times import LEAST_FPS, MOST_FPS
+from shapepose_fg.core.storage.output_folder import prepare_output
 
 if TYPE_CHECKING:
     from shapepose_fg.core.camera import Rig
@@ -407,6 +408,21 @@ def next_reconstruct(options: Mapping[str, object]) -> str:
         for word in (name, f"{value:g}" if isinstance(value, float) else str(value))
     ]
     return f"next: {shlex.join(['shapepose-fg', 'reconstruct', *words])}"
+
+
+def check_output_files(files: Mapping[str, Path | None]) -> None:
+    """Raise InputError, before long work, if one of the output files, by option, is a folder, is in
+    a folder where nothing can be written, or is that of another option, too.
+    """
+    given = {option: file for option, file in files.items() if file is not None}
+    for option, file in given.items():
+        if file.is_dir():
+            raise InputError(f"{option} {file}: this is a folder; give the name of a file")
+        if file.parent.is_dir():
+            prepare_output(file.parent)
+        for other, same in given.items():
+            if other != option and same.resolve() == file.resolve():
+                raise InputError(f"{option} and {other} {file}: this is one file; give two")
 
 
 def refuse_missing(places: Mapping[str, Path | None]) -> None:

@@ -14,6 +14,7 @@ from shapepose_fg.cli.options import (
     ProjectOptions,
     RateOptions,
     Stature,
+    check_output_files,
     grouped,
     json_option,
     next_reconstruct,
@@ -82,6 +83,9 @@ def refine_calibration(
     rate, source = seen.rate(rate), cast(Path, seen.calibration)
     rig = seen.still_rig("refine-calibration")
     check_target(source, output)
+    check_output_files({"--report": report})
+    if report is not None and report.resolve() == output.resolve():
+        raise InputError(f"--output and --report {report}: this is one file; give two")
     if may.reference is not None and may.reference not in rig.names:
         raise InputError(
             f"--reference {may.reference}: there is no such camera; give one of "

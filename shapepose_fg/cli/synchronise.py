@@ -11,6 +11,7 @@ from shapepose_fg.cli.options import (
     TIME,
     Hertz,
     ProjectOptions,
+    check_output_files,
     frames_option,
     grouped,
     json_option,
@@ -36,6 +37,7 @@ def synchronise(
     """
     from shapepose_fg.io.timestamps import write_timestamps
 
+    check_output_files({"--output": output})
     seen = given.located()
     fps = seen.source.fps if fps is None and seen.source is not None else fps
     rig = seen.still_rig("synchronise")

@@ -253,7 +253,8 @@ def mean_confidence(observations: Observations, inlier: Mask) -> Array:
 
 
 def triangulate(observations: Observations, views: Views, config: ObservationConfig) -> Array:
-    """X_0 completed: joints seen by at least two views but missing from stage I, (N, J, 3) metres.
+    """Complete X_0, (N, J, 3) metres, with joints that at least two views see but stage I does not
+    find.
 
     Linear triangulation, iterated with robust weights; joints of stage I keep their position, and
     joints seen by fewer than two views, or by views that disagree, stay NaN.

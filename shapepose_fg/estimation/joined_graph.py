@@ -67,7 +67,7 @@ class JoinedPeople:
         self._still = [make_camera(camera.K, camera.wTc) for camera in rig.cameras]
 
     def increments(self, people: Reconstruction) -> Iterator[tuple[int, Increment]]:
-        """Yield frame number and increment for each frame of `people`, in order; these need their
+        """Yield frame number and increment for each frame of `people`, in order; `people` must have
         observations.
 
         Besides the joints that constrain poses, there are the reported ones (`KeySpace.reported`),

@@ -68,9 +68,10 @@ class BodyGraph(PersonWindow):
         return self.window.observations.seen
 
     def build(self) -> "BodyGraph":
-        """Make all factors of the person, linear ones around the state, and the values; with active
-        user factors, those of all people whom they couple. Where their solution failed, the graph
-        is without them.
+        """Make all factors of the person, linear ones around the state, and the values.
+
+        With active user factors, the graph is that of all people whom they couple. User factors are
+        left out if the solution with them failed.
         """
         coupled = len(self.ties.active) > 0 and not self.failure
         everyone = [each for each in self.ties.people if isinstance(each, BodyGraph)]

@@ -64,7 +64,7 @@ class LiveState:
     slots: list[Slot] = field(default_factory=list)
     """The last frames, by time: those not settled, and those that a window includes before them."""
     before: Detections | None = None
-    """The newest frame's detections, all of them."""
+    """All detections of the newest frame."""
     settled: deque[Reconstruction] = field(default_factory=deque)
     """Settled rows that were not collected yet."""
     frames: int = 0
@@ -140,7 +140,9 @@ class WindowQueue:
         self._sent.append(_Sent(part, frames, names, own, start))
 
     def came(self, *, wait: bool = False) -> list[Refined]:
-        """Windows that were solved since the last call, oldest first; with `wait` all of them."""
+        """Windows that were solved since the last call, oldest first; with `wait`, all submitted
+        windows.
+        """
         found = []
         while len(self._sent) > 0 and (wait or self._sent[0].part.done()):
             sent = self._sent.popleft()

@@ -1,4 +1,6 @@
-"""Hypotheses of people: the detections that each would explain, and the triangulated joints."""
+"""Hypotheses of people: the detections that each hypothesis would explain, and the triangulated
+joints.
+"""
 
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -84,7 +86,7 @@ class PossiblePeople(Rows):
     places: Array
     """(H, J, 3) joints triangulated from two or more views, metres; NaN elsewhere."""
     chosen: Index
-    """(H, J, V) detections that each would explain, -1 for none."""
+    """(H, J, V) detections that each hypothesis would explain, -1 for none."""
     gap_m: Array
     """(H, J, V) distance of the joint from the detection's ray, metres; NaN without a detection or
     joint."""

@@ -191,8 +191,8 @@ class Search:
         return (core > 0).mean(axis=1), core.sum(axis=1) / np.maximum((core > 0).sum(axis=1), 1)
 
     def linked(self, anchors: Index) -> tuple[Index, Index]:
-        """The anchors with enough strong joints linked to them, and the candidates (P,
-        J) of each.
+        """The anchors with enough strong joints linked to them, and the candidates (P, J) of each
+        anchor.
         """
         chosen = grow(anchors, self.candidates, self.links, self.skeleton, self.config.growth)
         core = chosen[:, self.skeleton.core]

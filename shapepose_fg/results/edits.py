@@ -116,7 +116,7 @@ def replay(people: Reconstruction, edits: Sequence[Edit]) -> Edited:
 
 
 def undo(original: Reconstruction, current: Reconstruction, edits: Sequence[Edit]) -> Edited:
-    """Undo the last of `edits`: returns `original` after all the others.
+    """Undo the last of `edits`: returns `original` after all other edits.
 
     `current` is the result of all edits. Identities that the last correction did not touch keep the
     rows of `current`, which may be solved already.

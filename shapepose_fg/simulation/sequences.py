@@ -210,7 +210,9 @@ class Room:
         return 20.0 * min(spare, 0.0) - max(spare, 0.0) - 10.0 * outside
 
     def _roomiest(self, options: Iterable[list[Performance]]) -> list[Performance]:
-        """The first option with sufficient distances, else the one with the largest."""
+        """The first option with sufficient distances to other people and walls; the option with the
+        largest distances, if none suffices.
+        """
         best, most = [], -np.inf
         for placed in options:
             reach = max(np.abs(one.joints[:, 0, :2]).max() for one in placed)

@@ -1,5 +1,5 @@
-"""Left-right swaps: detectors exchange a person's sides for a while in some views, or of arms, legs
-or face only.
+"""Left-right swaps: in some views, detectors exchange a person's sides for a while, or those of
+arms, legs or face only.
 
 A person's sides cannot change between two frames. A 2D person with sides unlike those of the track
 is corrected if another view has the sides as predicted, or if all views have them exchanged.

@@ -71,7 +71,7 @@ class SelectedTracks(Rows):
     of a person."""
 
     def during(self, frame: int) -> Mask:
-        """(K,) whether each is present in a frame."""
+        """(K,) whether each selected track is present in a frame."""
         return (self.start <= frame) & (frame < self.stop)
 
 

@@ -558,6 +558,27 @@ def test_a_reader_that_stops_reading_is_no_error():
     assert result.returncode == 1
 
 
+@pytest.mark.parametrize(
+    ("command", "files", "said"),
+    [
+        ("calibrate", {"--output": "."}, "--output .: this is a folder; give the name of a file"),
+        ("calibrate", {"--output": "a.json", "--report": "./a.json"}, "this is one file; give two"),
+        ("synchronise", {"--output": "."}, "--output .: this is a folder"),
+        ("refine-calibration", {"--output": "a.json", "--report": "a.json"}, "give two"),
+    ],
+)
+def test_output_files_are_checked_before_the_work(
+    recording, tmp_path, monkeypatch, capsys, command, files, said
+):
+    monkeypatch.chdir(tmp_path)
+    given = ["--calibration", "calibration.json", "--detections", ".", "--fps", "25"]
+    monkeypatch.setattr(
+        "shapepose_fg.io.recording.read_recording", lambda *_, **__: pytest.fail("it is read")
+    )
+    assert run(command, *given, *(word for option in files.items() for word in option)) == 2
+    assert said in capsys.readouterr().err
+
+
 def test_a_reader_that_stops_before_the_summary_is_no_error(recording, monkeypatch, capsys):
     """And a full disk below the standard output is none of the results."""
     errors = [BrokenPipeError(32, "Broken pipe"), OSError(28, "No space left on device")]

@@ -314,6 +314,29 @@ def test_a_socket_listens_on_this_machine_only_unless_told_otherwise():
             listen(wrong)
 
 
+@pytest.mark.parametrize(
+    ("seen", "out", "said"),
+    [
+        ("in.jsonl", "in.jsonl", "in.jsonl: this is the input; give another file"),
+        ("in.jsonl", "link.jsonl", "link.jsonl: this is the input; give another file"),
+        ("none.jsonl", "old.jsonl", "none.jsonl: there is no such file"),
+        (".", "old.jsonl", "this is a folder"),
+    ],
+)
+def test_no_file_is_emptied_by_a_wrong_name(
+    tmp_path, cameras, five_cameras, two_people, capsys, seen, out, said
+):
+    text = lines(five_cameras, two_people, 2)
+    for name in ("in.jsonl", "old.jsonl"):
+        (tmp_path / name).write_text(text)
+    (tmp_path / "link.jsonl").symlink_to(tmp_path / "in.jsonl")
+    given = ["--detections", str(tmp_path / seen), "--output", str(tmp_path / out)]
+    with pytest.raises(SystemExit) as ended:
+        main(["live", "--calibration", cameras, "--workers", "1", *given])
+    assert ended.value.code == 2 and said in capsys.readouterr().err
+    assert (tmp_path / out).read_text() == text
+
+
 @pytest.mark.parametrize("name", ["out.jsonl", "out.mcap"])
 def test_a_full_disk_names_the_output(tmp_path, cameras, five_cameras, two_people, capsys, name):
     """A limit on file sizes stands for the full disk."""

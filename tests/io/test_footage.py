@@ -1,5 +1,7 @@
 """Videos and pictures: whose they are, what is in them, and what is wrong with them."""
 
+import os
+import sys
 from pathlib import Path
 
 import cv2
@@ -8,7 +10,7 @@ import pytest
 
 from shapepose_fg.core.errors import InputError
 from shapepose_fg.io.footage.clocks import typed_rate, typed_start
-from shapepose_fg.io.footage.footage import PictureFiles, Video, open_footage
+from shapepose_fg.io.footage.footage import PictureFiles, Video, open_footage, opencv_path
 from shapepose_fg.io.footage.placement import (
     CameraFootage,
     Placement,
@@ -286,3 +288,13 @@ def test_videos_named_in_another_unicode_form(tmp_path):
         "Gro\u0308ße.mp4",
         "left.mp4",
     ]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
+def test_a_video_whose_name_is_not_utf_8_is_refused(tmp_path):
+    """OpenCV would end the process with a segmentation fault."""
+    file = Path(os.fsdecode(os.fsencode(tmp_path) + b"/gr\xfc\xdfe.mp4"))
+    file.write_bytes(b"")
+    with pytest.raises(InputError, match="this path is not UTF-8"):
+        open_footage(file)
+    assert opencv_path(tmp_path / "größe.mp4") == str(tmp_path / "größe.mp4")

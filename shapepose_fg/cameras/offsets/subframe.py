@@ -25,7 +25,8 @@ _MOST_PLACED = 20_000
 _NUDGE = 0.25
 """Shift of a clock for numerical derivatives, frames: more than the errors to be found."""
 _LEAST_OTHERS = 0.2
-"""Minimum total weight of all other blocks, in the correction for one block."""
+"""Lower limit of the total weight of all other blocks of time, by which the error of one block is
+divided."""
 _MOST_SAMPLES = 3000
 """Maximum number of frames of tracks that are compared for a pair of cameras."""
 
@@ -270,10 +271,9 @@ class InSpace:
         score, gains = np.bincount(each.reshape(-1), score), np.bincount(each.reshape(-1), gains)
         late, trust = score.sum() / gain, np.ones(len(score))
         for _ in range(10):  # reweighted mean
-            from_camera = np.abs(score - late * gains) / np.sqrt(np.maximum(gains, 1e-12))
-            trust = 1 / (
-                1 + (from_camera / (2.0 * max(1.5 * float(np.median(from_camera)), 1e-12))) ** 2
-            )
+            deviation = np.abs(score - late * gains) / np.sqrt(np.maximum(gains, 1e-12))
+            usual = max(1.5 * float(np.median(deviation)), 1e-12)
+            trust = 1 / (1 + (deviation / (2.0 * usual)) ** 2)
             late = (trust * score).sum() / (trust * gains).sum()
         gains *= trust
         part = np.bincount(when, gains, blocks) / gains.sum()

@@ -20,7 +20,8 @@ from shapepose_fg.core.errors import InputError, naming
 from shapepose_fg.core.storage.files import BIG, PIECE, open_regular
 
 MOST_PACKED = 50
-"""Maximum compression ratio of larger files; measured coordinates hardly compress at all."""
+"""Maximum ratio of the size of arrays to that of their file, if the arrays have more than `BIG`
+bytes; measured coordinates hardly compress at all."""
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 
 

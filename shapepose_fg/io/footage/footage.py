@@ -189,10 +189,24 @@ def _fitting(picture: Any, size: tuple[int, int]) -> Picture | None:
     return picture if picture is not None and picture.shape[1::-1] == size else None
 
 
+def opencv_path(path: Path) -> str:
+    """The path as text for OpenCV, which crashes on text that is no UTF-8. InputError if the bytes
+    of the path are no UTF-8.
+    """
+    try:
+        return os.fsencode(path).decode()
+    except UnicodeDecodeError:
+        raise InputError(
+            f"{path}: this path is not UTF-8, so OpenCV cannot open it; rename the file or its "
+            "folders"
+        ) from None
+
+
 def _capture(path: Path) -> Any:
     """The video at `path`, opened by FFmpeg with the options for untrusted files."""
     if not path.is_file():
         raise InputError(f"{path}: there is no such video; check the path")
+    name = opencv_path(path.resolve())
     before, level = os.environ.get(_READ_OPTIONS), cv2.utils.logging.getLogLevel()
     os.environ[_READ_OPTIONS] = _SAFE_READING
     os.environ.setdefault(
@@ -201,7 +215,7 @@ def _capture(path: Path) -> Any:
     # Messages of OpenCV about damaged files are replaced by ours.
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
-        capture = cv2.VideoCapture(str(path.resolve()), cv2.CAP_FFMPEG)
+        capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG)
     finally:
         cv2.utils.logging.setLogLevel(level)
         os.environ.pop(_READ_OPTIONS)

@@ -122,7 +122,9 @@ class Human:
         def add(
             name: str, parent: str, child: str, axis=None, y: float = 0.0, z: float = 0.0
         ) -> None:
-            """Add a joint and its child link; draw the parent up to a joint along its z."""
+            """Add a joint, at (0, y, z) in the frame of the parent link, and its child link. If z
+            is not 0, the parent is drawn as a cylinder that ends at the joint.
+            """
             kind = "fixed" if axis is None else "revolute"
             joint = SubElement(robot, "joint", name=f"{name}_{self.body_id}", type=kind)
             SubElement(joint, "origin", xyz=f"0 {y:.4f} {z:.4f}")

@@ -24,7 +24,7 @@ from shapepose_fg.core.reconstruction import (
     Status,
     with_body,
 )
-from shapepose_fg.io.footage.footage import Footage, Picture
+from shapepose_fg.io.footage.footage import Footage, Picture, opencv_path
 from shapepose_fg.io.footage.placement import CameraFootage
 from shapepose_fg.viz.overlay import drawing
 
@@ -127,14 +127,15 @@ def _video(path: Path, size: Sequence[int], fps: float) -> Iterator[Callable[[Pi
     """
     # A name of its own, because two runs may write the same video; OpenCV selects the container by
     # the extension.
-    part = path.with_name(f".{path.stem}.{token_hex(4)}.part.mp4")
+    part = path.with_name(f".{token_hex(8)}.part.mp4")
+    name = str(Path(opencv_path(path)).with_name(part.name))
     path.parent.mkdir(parents=True, exist_ok=True)
     # OpenCV does not report that a picture was not written, such as on a full disk: the pictures of
     # the file are counted. Its messages are replaced by ours.
     level, count = cv2.utils.logging.getLogLevel(), 0
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    writer = cv2.VideoWriter(str(part), cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
+    writer = cv2.VideoWriter(name, cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
 
     def append(picture: Picture) -> None:
         nonlocal count
@@ -149,7 +150,7 @@ def _video(path: Path, size: Sequence[int], fps: float) -> Iterator[Callable[[Pi
             )
         yield append
         writer.release()
-        if cv2.VideoCapture(str(part), cv2.CAP_FFMPEG).get(cv2.CAP_PROP_FRAME_COUNT) != count:
+        if cv2.VideoCapture(name, cv2.CAP_FFMPEG).get(cv2.CAP_PROP_FRAME_COUNT) != count:
             raise InputError(
                 f"{path}: the video could not be written to its end; check the free disk space"
             )
