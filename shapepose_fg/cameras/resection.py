@@ -75,15 +75,15 @@ ERROR = 0.03
 
 def independent(others: Others) -> float:
     """Number of independent joints among people seen in some frames, given the correlations."""
-    if len(others) == 0:
+    return _JOINTS * independent_poses(others.frame)
+
+
+def independent_poses(frame: Index) -> float:
+    """Number of independent poses of people in these frames (P,), one for each person."""
+    if len(frame) == 0:
         return 0.0
-    frames = np.unique(others.frame)
-    return (
-        _JOINTS
-        * len(others)
-        / len(frames)
-        * max(1.0, min(float(np.ptp(frames)) / _LASTS, len(frames)))
-    )
+    frames = np.unique(frame)
+    return len(frame) / len(frames) * max(1.0, min(float(np.ptp(frames)) / _LASTS, len(frames)))
 
 
 def likelihood(score: float, count: float, freedom: int) -> float:

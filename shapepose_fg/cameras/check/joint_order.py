@@ -12,18 +12,20 @@ from shapepose_fg.body.model.target_skeletons import BODY_POINTS
 from shapepose_fg.cameras.check.evidence import SetupHypothesis
 from shapepose_fg.cameras.check.findings import Finding, Kind
 from shapepose_fg.cameras.check.small_errors import MOST_PEOPLE
+from shapepose_fg.cameras.resection import independent_poses
 from shapepose_fg.cameras.sightings import MIN_SIGHTINGS, people_of
 from shapepose_fg.core.arrays import Array
 from shapepose_fg.core.detections import DetectionSequence
 from shapepose_fg.core.joint_names import keypoint_names
 from shapepose_fg.core.skeleton import SKELETONS, Skeleton
 
-_GAIN, _SHARE = 0.02, 0.8
-"""Minimum gain in 3D, nats per pair of joints, and minimum share of people who gain. In 198
-motion-capture clips an exchange gains up to 0.035 over the right order, in at most 0.7 of the
-frames; undoing a true exchange of two joints gains 0.02 to 0.5."""
-_GAIN_2D, _SHARE_2D = 0.01, 0.85
-"""Minimum gain and share of people in pictures, if people have no or poor 3D positions."""
+_GAIN, _GAIN_2D = 0.15, 0.3
+"""Minimum gains of an exchange in a single pose, in space and in pictures, nats per pair of joints;
+the mean of N independent poses must gain 1 / sqrt(N) of them. In 1.5 s of motion capture, which are
+about one pose, the best exchange gains up to 0.12 over the right order in space, and in pictures
+0.3 in one clip of 100; undoing a true one gains 0.1 to 0.7 in space."""
+_SHARE = 0.8
+"""Minimum share of people who gain."""
 _OTHER_LAYOUT = 0.1
 """Minimum gain of a known layout, nats per pair; correct ones gain 0.7 to 1.7, except between two
 layouts that differ in two joints."""
@@ -51,11 +53,9 @@ def order_of_joints(detections: DetectionSequence, setup: SetupHypothesis) -> li
         return []
     in_space = np.isfinite(fit_of_order(space, names)).sum() >= MIN_SIGHTINGS
     order = exchanges(space if in_space else flat, names, _sides(names))
-    order = (
-        order
-        if _gains(flat, space if in_space else None, names, order)
-        else list(range(len(names)))
-    )
+    poses = max(independent_poses(setup.seen_by(view).frame) for view in range(setup.view_count))
+    if not _gains(flat, space if in_space else None, names, order, max(poses, 1.0)):
+        order = list(range(len(names)))
     backwards = in_space and _backwards(space[:, order], names)
     if backwards:
         other = {"L": "R", "R": "L"}
@@ -107,8 +107,11 @@ def _listed(words: Sequence[str]) -> str:
     return " and ".join(filter(None, (", ".join(words[:-1]), words[-1])))
 
 
-def _gains(flat: Array, space: Array | None, names: Sequence[str], order: Sequence[int]) -> bool:
-    """Whether people fit a body significantly better with another order of their joints.
+def _gains(
+    flat: Array, space: Array | None, names: Sequence[str], order: Sequence[int], poses: float
+) -> bool:
+    """Whether people in so many independent `poses` fit a body significantly better with another
+    order of their joints.
 
     Exchanges of sides or along a limb must be significant in pictures or in space. Joints with
     biased detections may fit any other order better in one of the two, so other exchanges must be
@@ -129,15 +132,21 @@ def _gains(flat: Array, space: Array | None, names: Sequence[str], order: Sequen
     if len(fits) < MIN_SIGHTINGS or fits.mean() < LIKE_A_BODY:
         return False
     in_picture, share = gain(flat)
-    in_pictures = in_picture > _GAIN_2D and share > _SHARE_2D
+    in_pictures = in_picture > _GAIN_2D / poses**0.5 and share > _SHARE
     if space is None:
         return in_pictures
     in_space, share = gain(space)
-    in_spaces = in_space > _GAIN and share > _SHARE
-    moved = {names[place][1:] for k, place in enumerate(order) if place != k}
-    if moved and (_words(names, order) == ("",) or not moved <= {*_ARMS, *_LEGS}):
+    in_spaces = in_space > _GAIN / poses**0.5 and share > _SHARE
+    exchanged = [(names[place], names[k]) for k, place in enumerate(order) if place != k]
+    if not all(_alike(*pair) for pair in exchanged):
         return in_pictures and in_spaces
     return in_picture > 0 and in_space > 0 and (in_pictures or in_spaces)
+
+
+def _alike(one: str, other: str) -> bool:
+    """Whether two joints are the two sides of one, or in one limb."""
+    limb = one[0] == other[0] and any({one[1:], other[1:]} <= {*each} for each in (_ARMS, _LEGS))
+    return limb or one[1:] == other[1:]
 
 
 def _other_layout(people: Array, skeleton: Skeleton) -> str | None:
