@@ -58,9 +58,9 @@ def measure(room: int, mocap: Mocap, folder: Path, logs: bool) -> str:
     ]
     write_used_footage(folder / "detection" / "footage.json", used, {})
     write_trajectory(odometry(phones[-1], rng), folder / "log.tum")
-    apart = np.linalg.norm(truth.centres[:, None] - truth.centres, axis=-1)
-    one, other = np.unravel_index(apart.argmax(), apart.shape)
-    far = apart[one, other] + rng.normal(0, 0.01)
+    distance = np.linalg.norm(truth.centres[:, None] - truth.centres, axis=-1)
+    one, other = np.unravel_index(distance.argmax(), distance.shape)
+    far = distance[one, other] + rng.normal(0, 0.01)
     words = ["--detections", folder / "detection", "--focal", "--tolerance", "180,100000", "--json"]
     for phone in phones:
         log, lens = folder / f"{phone.camera.name}.csv", phone.camera.K.tolist()
@@ -82,17 +82,17 @@ def measure(room: int, mocap: Mocap, folder: Path, logs: bool) -> str:
     rig, found = read_rig(rig_file), json.loads(printed.getvalue())
     by = similarity(rig.only(names[:-1]), truth)
     turn, move = errors(rig.wTc[:-1], truth.wTc, by)
-    sure = 2 * np.array(
+    two_sigma = 2 * np.array(
         [(each["sigma_turn_deg"], each["sigma_move_mm"]) for each in found["cameras"]]
     )
     frame_s = np.genfromtxt(folder / "times.csv", delimiter=",", skip_header=1)[:, -1]
     poses = rig.trajectories[0].at(frame_s) @ rig.cameras[-1].bTc
     degrees, mm = (float((each**2).mean() ** 0.5) for each in errors(poses, phones[-1].wTc, by))
     carried = found["moving"][names[-1]]
-    inside = (np.stack([turn, move]) < sure.T).sum(axis=1)
+    inside = (np.stack([turn, move]) < two_sigma.T).sum(axis=1)
     return (
-        f"{row} {turn.max():.2f}° ({sure[:, 0].max():.2f}) | {move.max():.0f} mm "
-        f"({sure[:, 1].max():.0f}) | {inside[0]}, {inside[1]} of {len(turn)} | "
+        f"{row} {turn.max():.2f}° ({two_sigma[:, 0].max():.2f}) | {move.max():.0f} mm "
+        f"({two_sigma[:, 1].max():.0f}) | {inside[0]}, {inside[1]} of {len(turn)} | "
         f"{100 * by[2] - 100:+.1f} % ({200 * found['sigma_scale']:.1f}) | "
         f"{degrees:.2f}° ({carried['within_deg']:.2f}), {mm:.0f} mm ({carried['within_mm']:.0f}) |"
     )

@@ -131,8 +131,8 @@ def _faults(seen: Recording, scene: Scene, rng: np.random.Generator) -> Iterator
         yield Spoiled(f"focal length {factor:g}", seen, zoomed(rig, v, by), Kind.FOCAL, (v,))
     for pixels in (25.0, 100.0):
         v, angle = view(), rng.uniform(0, 2 * np.pi)
-        away = shifted(rig, v, pixels * np.cos(angle), pixels * np.sin(angle))
-        yield Spoiled(f"shifted {pixels:g}", seen, away, Kind.PRINCIPAL_POINT, (v,))
+        shifted_rig = shifted(rig, v, pixels * np.cos(angle), pixels * np.sin(angle))
+        yield Spoiled(f"shifted {pixels:g}", seen, shifted_rig, Kind.PRINCIPAL_POINT, (v,))
     v, frames = view(), int(rng.integers(6, 11)) * sign()
     yield Spoiled("late", delayed(seen, v, frames), rig, Kind.LATE, (v,), frames)
     v, w = sorted(rng.choice(len(rig), 2, replace=False).tolist())

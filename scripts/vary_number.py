@@ -99,13 +99,13 @@ def lines(value: str, figures: NDArray, usual: NDArray) -> Iterator[str]:
     """The lines of the table for the `figures` (R, 6) of recordings; `usual` (R, 6) are those of
     the present value.
     """
-    known, apart = np.ma.masked_invalid(figures), np.ma.masked_invalid(figures - usual)
+    known, difference = np.ma.masked_invalid(figures), np.ma.masked_invalid(figures - usual)
     means = known.mean(axis=0).filled(np.nan)
     yield " ".join([f"{value:12}", *(f"{mean:16.2f}" for mean in means)])
-    if not apart[:, :-1].any():
+    if not difference[:, :-1].any():
         return
-    mean, count = apart.mean(axis=0).filled(np.nan), apart.count(axis=0)
-    error = 2 * apart.std(axis=0).filled(np.nan) / np.sqrt(np.maximum(count - 1, 1))
+    mean, count = difference.mean(axis=0).filled(np.nan), difference.count(axis=0)
+    error = 2 * difference.std(axis=0).filled(np.nan) / np.sqrt(np.maximum(count - 1, 1))
     beyond = (np.abs(mean) > error) & (count > 1)
     cells = [
         f"{m:+.2f} ±{e:.2f}{' *' if b else ''}" for m, e, b in zip(mean, error, beyond, strict=True)

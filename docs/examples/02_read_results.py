@@ -24,10 +24,10 @@ for name, count in zip(*np.unique(names, return_counts=True), strict=True):
 
 figure, axes = plt.subplots(figsize=(8, 4))
 for person in np.unique(result["person"]):
-    mine = (result["person"] == person) & (result["status"] == "ok")
-    time, colour = result["time_s"][mine], COLOURS[person % len(COLOURS)]
-    axes.plot(time, height[mine], color=colour, label=f"person {person}")
-    low, high = height[mine] - 1.96 * sigma[mine], height[mine] + 1.96 * sigma[mine]
+    rows = (result["person"] == person) & (result["status"] == "ok")
+    time, colour = result["time_s"][rows], COLOURS[person % len(COLOURS)]
+    axes.plot(time, height[rows], color=colour, label=f"person {person}")
+    low, high = height[rows] - 1.96 * sigma[rows], height[rows] + 1.96 * sigma[rows]
     axes.fill_between(time, low, high, color=colour, alpha=0.25, linewidth=0)
 axes.set(xlabel="time, s", ylabel="height of the left knee, m", title="with 95 % intervals")
 axes.legend()

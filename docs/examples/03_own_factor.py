@@ -29,11 +29,11 @@ print("made and inactive:", carriers.run["extra_factors"])
 
 figure, axes = plt.subplots(figsize=(8, 4))
 for people, style, what in ((without, ":", "without the factor"), (carriers, "-", "with it")):
-    apart = np.linalg.norm(people.joints[:, RIGHT] - people.joints[:, LEFT], axis=1)
-    print(f"{what}: median distance of the wrists {np.median(apart):.2f} m")
+    distance_m = np.linalg.norm(people.joints[:, RIGHT] - people.joints[:, LEFT], axis=1)
+    print(f"{what}: median distance of the wrists {np.median(distance_m):.2f} m")
     for person in np.unique(people.person):
-        mine = people.person == person
-        axes.plot(people.time_s[mine], apart[mine], style, color=COLOURS[person])
+        rows = people.person == person
+        axes.plot(people.time_s[rows], distance_m[rows], style, color=COLOURS[person])
 axes.set(xlabel="time, s", ylabel="distance of the wrists, m", ylim=(0, None))
 axes.set_title("dotted: without the factor; line: with it")
 save(figure)

@@ -18,8 +18,8 @@ def hold_hands(window, keys):
     for other in window.partners:
         rows, other_rows = window.shared(other)
         for wrist, others in (WRISTS, WRISTS[::-1]):
-            apart = window.first[rows, wrist] - other.first[other_rows, others]
-            if np.nanmedian(np.linalg.norm(apart, axis=1)) < 0.30:
+            between = window.first[rows, wrist] - other.first[other_rows, others]
+            if np.nanmedian(np.linalg.norm(between, axis=1)) < 0.30:
                 for pair in zip(keys[rows, wrist], other.keys[other_rows, others], strict=True):
                     yield gtsam.RangeFactor3(*map(int, pair), 0.14, isotropic(1, 0.01))
 
@@ -33,10 +33,10 @@ print("made and inactive:", together.run["extra_factors"])
 figure, axes = plt.subplots(figsize=(8, 4))
 for people, label in ((alone, "each person alone"), (together, "tied by a factor")):
     one, two = (people.joints[people.person == person] for person in (0, 1))
-    apart = min((np.linalg.norm(one[:, a] - two[:, b], axis=1) for a, b in (WRISTS, WRISTS[::-1])),
-                key=np.median)  # fmt: skip
-    print(f"{label}: {np.median(apart):.3f} m, varies by {1000 * np.std(apart):.0f} mm")
-    axes.plot(apart, label=label)
+    pairs = (np.linalg.norm(one[:, a] - two[:, b], axis=1) for a, b in (WRISTS, WRISTS[::-1]))
+    distance_m = min(pairs, key=np.median)
+    print(f"{label}: {np.median(distance_m):.3f} m, varies by {1000 * np.std(distance_m):.0f} mm")
+    axes.plot(distance_m, label=label)
 axes.axhline(0.143, color="grey", linestyle=":", label="truth")
 axes.set(xlabel="frame", ylabel="distance of the hands' wrists, m", ylim=(0, None))
 axes.legend()

@@ -24,16 +24,16 @@ figure, axes = plt.subplots(figsize=(8, 4))
 kinds = (("newest frame", now, "."), (f"predicted {AHEAD_S} s ahead", soon, "x"))
 for label, answers, mark in (*kinds, ("refined, 0.3 s later", behind, "-")):
     rows = Reconstruction.concatenate([each for each in answers if len(each) > 0])
-    mine = rows.person == 0
-    error = np.full(mine.sum(), np.nan)
-    for n, time in enumerate(rows.time_s[mine]):
+    of_person = rows.person == 0
+    error = np.full(of_person.sum(), np.nan)
+    for n, time in enumerate(rows.time_s[of_person]):
         frame = round(time * scene.fps)
         if frame < len(scene):
             error[n] = np.linalg.norm(
-                scene.keypoints[frame, :, HIPS] - rows.joints[mine][n, HIPS], axis=-1
+                scene.keypoints[frame, :, HIPS] - rows.joints[of_person][n, HIPS], axis=-1
             ).min()
     print(f"{label}: median error of the hips {1000 * np.nanmedian(error):.0f} mm")
-    axes.plot(rows.time_s[mine], rows.joints[mine, HIPS, 0], mark, label=label)
+    axes.plot(rows.time_s[of_person], rows.joints[of_person, HIPS, 0], mark, label=label)
 axes.set(xlabel="time, s", ylabel="x of the hips of person 0, m")
 axes.legend()
 save(figure)

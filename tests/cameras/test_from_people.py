@@ -169,7 +169,13 @@ def test_recordings_that_are_too_short_are_refused(rig, recording, frames):
         Undetermined, match="cameras cam0 cam1 cam2 cam3: at least 3 s of a person are needed, "
     ) as no:
         calibrate(recording, unposed(rig), TIMES, frames)
-    assert len(no.value.problems) == 1
+    assert len(no.value.problems) == 1 and "--without" not in no.value.problems[0]
+
+
+def test_a_camera_without_people_can_be_left_out(rig, recording):
+    empty = only(recording, lambda view, t: view != 3)
+    with pytest.raises(Undetermined, match=r"camera cam3: .* only \(--without cam3\)"):
+        calibrate(empty, unposed(rig), TIMES, range(250))
 
 
 def test_two_cameras_are_nearest_to_what_they_saw():

@@ -64,7 +64,7 @@ def test_the_notebook_runs(empty_folder):
             assert cell["outputs"] == []
             exec(compile("".join(cell["source"]), "first_hour.ipynb", "exec"), names)
     assert len(names["people"]) == 40
-    assert abs(sorted(names["apart"])[20] - 0.40) < 0.03
+    assert abs(sorted(names["distance_m"])[20] - 0.40) < 0.03
     assert (empty_folder / "results" / "people.npz").is_file()
 
 

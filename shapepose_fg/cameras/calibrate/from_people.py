@@ -222,7 +222,11 @@ def own_tracks(sightings: Sightings, rig: Rig, fps: float) -> list[CameraTracks]
     if len(lacking := np.flatnonzero(seen_s < _LEAST_S)) > 0:
         figures = ", ".join(f"{each:.1f}" for each in seen_s[lacking])
         least = f"at least {_LEAST_S:g} s of a person are needed, but only {figures} s are seen"
-        raise Undetermined((f"{_named(rig, lacking)}: {least}; {FILM}",))
+        others = ""
+        if len(rig) - len(lacking) >= 2:
+            without = ",".join(rig.names[view] for view in lacking)
+            others = f"; or calibrate the other cameras only (--without {without})"
+        raise Undetermined((f"{_named(rig, lacking)}: {least}; {FILM}{others}",))
     still = Views(rig.K, np.tile(np.eye(3, 4), (len(rig), 1, 1)))
     return [CameraTracks.of(sightings, still, view, fps) for view in range(len(rig))]
 

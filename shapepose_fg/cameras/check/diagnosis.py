@@ -346,6 +346,7 @@ def _small_findings(problem: SmallErrors, known: set[int]) -> tuple[list[Finding
         biased.append(replace(bias, probability=1 - p_camera - p_none, instead=instead))
         problem = replace(problem, biased=(*problem.biased, (person, *bias.cameras)))
     of_cameras = [each for each in of_cameras if known.isdisjoint(each.cameras)]
+    p_camera = sum(each.probability for each in of_cameras)
     if p_camera <= max(SURE * (1 - p_none), p_none) or len(of_cameras) == 0:
         return [], biased
     found = one_of(of_cameras)

@@ -1,11 +1,14 @@
 """Estimates the time offset of each camera against the others, and whether it is significant."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import expit
 
 from shapepose_fg.cameras.check.evidence import SetupHypothesis
+from shapepose_fg.cameras.check.findings import SURE
 from shapepose_fg.cameras.offsets.scan import LEAST_MISS, scan
+from shapepose_fg.cameras.resection import independent, likelihood
 from shapepose_fg.cameras.sightings import GATE
 
 _CLEAR = 0.25
@@ -21,6 +24,9 @@ class Lag:
     gain: float = 0.0
     """Decrease of the mean residual by the offset, relative to the depth of its minimum under the
     median of all offsets."""
+    probability: float = 0.0
+    """Probability of the offset against chance; computed where the gain is significant. Where
+    people stand still, errors of the detector decide which offset is best."""
 
     def exceeds(self, share: float) -> bool:
         """Whether the offset exceeds a `share` of what makes it significant."""
@@ -29,7 +35,7 @@ class Lag:
     @property
     def is_offset(self) -> bool:
         """Whether the offset is significant."""
-        return self.exceeds(1.0)
+        return self.exceeds(1.0) and self.probability > SURE
 
 
 def lags(setup: SetupHypothesis) -> list[Lag]:
@@ -61,5 +67,9 @@ def lag_of(setup: SetupHypothesis, view: int, most: int | None = None) -> Lag:
         return Lag()
     curve = np.where(known, of_pairs, 0.0).sum(axis=0) / np.where(count > 0, count, np.nan)
     best = int(np.nanargmin(curve))
-    depth = float(np.nanmedian(curve) - curve[best])
-    return Lag(int(offsets[best]), float(curve[most] - curve[best]) / max(depth, LEAST_MISS))
+    depth, drop = float(np.nanmedian(curve) - curve[best]), float(curve[most] - curve[best])
+    lag = Lag(int(offsets[best]), drop / max(depth, LEAST_MISS))
+    if not lag.exceeds(1.0):
+        return lag
+    log_odds = likelihood(drop / GATE, independent(setup.others(view)), 1)
+    return replace(lag, probability=float(expit(log_odds)))

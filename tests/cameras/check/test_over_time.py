@@ -2,12 +2,15 @@
 of them.
 """
 
-from dataclasses import replace
+from dataclasses import fields, replace
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 
-from shapepose_fg.cameras.check.findings import Kind
+from shapepose_fg.cameras.check.diagnosis import _small_findings
+from shapepose_fg.cameras.check.findings import Finding, Kind
 from shapepose_fg.cameras.check.report import (
     CameraUse,
     Distances,
@@ -15,6 +18,7 @@ from shapepose_fg.cameras.check.report import (
     check_setup,
     result_check,
 )
+from shapepose_fg.cameras.check.small_errors import SmallErrors
 from shapepose_fg.core.detections import Detections, Recording
 from shapepose_fg.core.frame_times import FrameTimes
 from shapepose_fg.core.reconstruction import Status
@@ -219,3 +223,25 @@ def test_a_second_of_film_accuses_no_camera(frames):
     """What a few frames show may be lasting errors of the detector."""
     scene = built_in_scene(people=2, frames=frames)
     assert check_setup(simulate(scene), scene.rig).findings == ()
+
+
+@pytest.mark.slow
+def test_no_camera_is_late_where_people_stand_still():
+    """The best offset is then that of the detector's errors."""
+    scene = built_in_scene(1, people=3, cameras=4, frames=200)
+    pose = {each.name: getattr(scene.motion, each.name) for each in fields(scene.motion)}
+    still = {name: np.repeat(each[:1], 200, axis=0) for name, each in pose.items()}
+    scene = replace(scene, motion=replace(scene.motion, **still | {"betas": pose["betas"]}))
+    report = check_setup(simulate(scene), scene.rig)
+    assert not any(each.kind is Kind.LATE for each in report.findings), report.warnings
+
+
+def test_a_known_camera_s_small_error_accuses_no_other():
+    """Most of the probability is that of a camera whose mistake is known; the rest is chance."""
+    causes = [
+        SimpleNamespace(person=-1, finding=Finding(Kind.TURNED, (3,), 2.0, probability=0.97)),
+        SimpleNamespace(person=-1, finding=Finding(Kind.TURNED, (1,), 1.0, probability=0.01)),
+    ]
+    problem = cast(SmallErrors, SimpleNamespace(causes=causes, biased=()))
+    assert _small_findings(problem, {3}) == ([], [])
+    assert [each.cameras for each in _small_findings(problem, {0})[0]] == [(3,)]

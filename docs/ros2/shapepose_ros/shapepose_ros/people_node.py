@@ -73,7 +73,7 @@ class PeopleNode(Node):
         self.waiting = deque[tuple[Any, str]]()
         """Views of moving cameras, and the coordinate frames whose poses they need."""
         self.publisher_of: dict[str, Any] = {}
-        self.done, self.told = 0, None
+        self.done, self.last_change = 0, None
 
         if self.moving:
             self._listen_to_poses(TFMessage, "/tf", 100)
@@ -176,13 +176,13 @@ class PeopleNode(Node):
 
     def _log_cameras(self) -> None:
         """Log cameras that fail, or work again."""
-        said = self.people.camera_changes()
-        new = list(takewhile(lambda each: each is not self.told, reversed(said)))
+        changes = self.people.camera_changes()
+        new = list(takewhile(lambda each: each is not self.last_change, reversed(changes)))
         for each in reversed(new):
             self.get_logger().warning(
                 f"camera {each.camera}: {each.state.name} at {each.time_s:.2f} s"
             )
-        self.told = said[-1] if said else None
+        self.last_change = changes[-1] if changes else None
 
 
 def main() -> None:
