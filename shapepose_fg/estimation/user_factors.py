@@ -376,7 +376,8 @@ def _is_constrained(factor: gtsam.NonlinearFactor) -> bool:
     """Whether a sigma of the factor is 0. Levenberg-Marquardt weighs such a factor by a number of
     its own when it compares errors, rejects the steps that meet it, and stays where it is.
     """
-    noise = factor.noiseModel() if hasattr(factor, "noiseModel") else None
+    model = getattr(factor, "noiseModel", None)
+    noise = None if model is None else model()
     while isinstance(noise, gtsam.noiseModel.Robust):
         noise = noise.noise()
     return noise is not None and noise.isConstrained()

@@ -39,7 +39,7 @@ class CameraState(IntEnum):
     FROZEN = 1
     """The camera repeats its picture; its detections are ignored."""
     SILENT = 2
-    """The camera gives no detections where people should be seen."""
+    """The camera gives no detections for half a second, because it fails or sees nobody."""
     CONTRADICTS = 3
     """The camera contradicts the others; its detections are ignored until it agrees again."""
     DOUBTED = 4

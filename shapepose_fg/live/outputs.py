@@ -102,7 +102,8 @@ def _target(
                 stream = files.enter_context(rerun_app.written(Path(where), first))
             else:
                 if where == "rerun":
-                    note(*rerun_app.quiet_viewer())
+                    for each in rerun_app.quiet_viewer():
+                        note(each)
                 stream = files.enter_context(
                     rerun_app.shown(first, None if where == "rerun" else where)
                 )

@@ -1,13 +1,15 @@
 """The lines that `live` writes."""
 
 import json
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from shapepose_fg.io.ros.messages import COVARIANCES
-from shapepose_fg.live.outputs import line_of
+from shapepose_fg.live.notes import SparingNotes
+from shapepose_fg.live.outputs import line_of, published
 
 
 @pytest.fixture
@@ -34,3 +36,15 @@ def test_covariances_stay_positive_definite_and_far_places_exact(people):
                 each["joints"][joint], far.joints[n, joint], atol=6e-5, rtol=0
             )
             assert (np.linalg.eigvalsh(each["covariance"][joint]) > 0).all()
+
+
+@pytest.mark.parametrize("said", [[], ["a"], ["a", "b"]])
+def test_a_viewer_is_started_with_any_number_of_notes(dance, monkeypatch, said):
+    pytest.importorskip("rerun")
+    from shapepose_fg.io.export import rerun_app
+
+    monkeypatch.setattr(rerun_app, "quiet_viewer", lambda: said)
+    monkeypatch.setattr(rerun_app, "shown", lambda *_: nullcontext(rerun_app.new_stream()))
+    notes = list[str]()
+    with SparingNotes(notes.append) as note, published(["rerun"], dance.scene.rig, note):
+        assert notes == said

@@ -499,11 +499,17 @@ def _repeated(
     return beside / np.maximum(rest, 1)
 
 
+def _singular(reason: str) -> str:
+    """A reason of `CameraUse.unused` for one detection."""
+    verb, rest = reason.split(" ", 1)
+    return f"{'is' if verb == 'are' else f'{verb}s'} {rest}"
+
+
 def _unused(uses: Sequence[CameraUse]) -> Iterator[str]:
     """Warnings on cameras with mostly unused detections, with reasons."""
     for use in uses:
         why = [
-            f"{count} {words}"
+            f"{count} {_singular(words) if count == 1 else words}"
             for words, count in sorted(use.unused.items(), key=lambda each: -each[1])
         ]
         cure = (

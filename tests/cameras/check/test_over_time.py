@@ -11,7 +11,13 @@ import pytest
 
 from shapepose_fg.cameras.check.diagnosis import _small_findings
 from shapepose_fg.cameras.check.findings import Finding, Kind
-from shapepose_fg.cameras.check.report import check_setup, result_check
+from shapepose_fg.cameras.check.report import (
+    CameraUse,
+    Distances,
+    _unused,
+    check_setup,
+    result_check,
+)
 from shapepose_fg.cameras.check.small_errors import SmallErrors
 from shapepose_fg.core.detections import Detections, Recording
 from shapepose_fg.core.frame_times import FrameTimes
@@ -135,6 +141,17 @@ def test_people_who_move_as_nobody_does_are_named_with_the_rate(recording, room,
         sound, people, crowd, room, range(60)
     ).warnings  # detections beside those of people
     assert "people explain only 8" in said and "higher confidence threshold" in said
+
+
+def test_one_unused_detection_is_in_the_singular():
+    none = Distances(0, None, None, None, None)
+    unused = {"are not assigned to any person": 48, "are too far from the joint": 1}
+    (said,) = _unused(
+        [CameraUse("a", 60, 10, none, none, none, unused | {"contradict the body": 1})]
+    )
+    assert (
+        "48 are not assigned to any person, 1 is too far from the joint, 1 contradicts the" in said
+    )
 
 
 @pytest.mark.parametrize("views", [(0,), (0, 1, 2, 3)])
