@@ -115,7 +115,7 @@ def _gains(
 
     Exchanges of sides or along a limb must be significant in pictures or in space. Joints with
     biased detections may fit any other order better in one of the two, so other exchanges must be
-    significant in both.
+    significant in space, and gain in most pictures, too.
     """
 
     def gain(people: Array) -> tuple[float, float]:
@@ -131,16 +131,15 @@ def _gains(
     fits = fits[np.isfinite(fits)]
     if len(fits) < MIN_SIGHTINGS or fits.mean() < LIKE_A_BODY:
         return False
-    in_picture, share = gain(flat)
-    in_pictures = in_picture > _GAIN_2D / poses**0.5 and share > _SHARE
+    in_picture, of_pictures = gain(flat)
+    in_pictures = in_picture > _GAIN_2D / poses**0.5 and of_pictures > _SHARE
     if space is None:
         return in_pictures
-    in_space, share = gain(space)
-    in_spaces = in_space > _GAIN / poses**0.5 and share > _SHARE
-    exchanged = [(names[place], names[k]) for k, place in enumerate(order) if place != k]
-    if not all(_alike(*pair) for pair in exchanged):
-        return in_pictures and in_spaces
-    return in_picture > 0 and in_space > 0 and (in_pictures or in_spaces)
+    in_space, of_people = gain(space)
+    in_spaces = in_space > _GAIN / poses**0.5 and of_people > _SHARE
+    if all(_alike(names[place], names[k]) for k, place in enumerate(order) if place != k):
+        return in_picture > 0 and in_space > 0 and (in_pictures or in_spaces)
+    return in_spaces and in_picture > 0 and of_pictures > _SHARE
 
 
 def _alike(one: str, other: str) -> bool:

@@ -24,9 +24,12 @@ class Lag:
     gain: float = 0.0
     """Decrease of the mean residual by the offset, relative to the depth of its minimum under the
     median of all offsets."""
+    agreement: float = 0.0
+    """Share of the other cameras against which the best offset is the same, within two frames; 0 if
+    there is one only, or if the offset is the largest or smallest that was tried. Where people
+    stand still, errors of the detector decide which offset is best, differently for each camera."""
     probability: float = 0.0
-    """Probability of the offset against chance; computed where the gain is significant. Where
-    people stand still, errors of the detector decide which offset is best."""
+    """Probability of the offset against chance; computed where the gain is significant."""
 
     def exceeds(self, share: float) -> bool:
         """Whether the offset exceeds a `share` of what makes it significant."""
@@ -35,7 +38,7 @@ class Lag:
     @property
     def is_offset(self) -> bool:
         """Whether the offset is significant."""
-        return self.exceeds(1.0) and self.probability > SURE
+        return self.exceeds(1.0) and (self.agreement >= 0.75 or self.probability > SURE)
 
 
 def lags(setup: SetupHypothesis) -> list[Lag]:
@@ -69,7 +72,9 @@ def lag_of(setup: SetupHypothesis, view: int, most: int | None = None) -> Lag:
     best = int(np.nanargmin(curve))
     depth, drop = float(np.nanmedian(curve) - curve[best]), float(curve[most] - curve[best])
     lag = Lag(int(offsets[best]), drop / max(depth, LEAST_MISS))
-    if not lag.exceeds(1.0):
+    if not lag.exceeds(1.0) or best in (0, len(offsets) - 1):
         return lag
+    of_each = np.where(known, of_pairs, np.inf)[known.any(axis=1)].argmin(axis=1)
+    agreement = float((np.abs(of_each - best) <= 2).mean()) if len(of_each) > 1 else 0.0
     log_odds = likelihood(drop / GATE, independent(setup.others(view)), 1)
-    return replace(lag, probability=float(expit(log_odds)))
+    return replace(lag, agreement=agreement, probability=float(expit(log_odds)))

@@ -9,6 +9,7 @@ from shapepose_fg.cameras.check.evidence import SetupHypothesis, gather
 from shapepose_fg.cameras.check.findings import Kind
 from shapepose_fg.cameras.check.joint_order import order_of_joints
 from shapepose_fg.cameras.check.report import check_setup
+from shapepose_fg.core.camera import Rig
 from shapepose_fg.core.detections import Recording
 from shapepose_fg.core.skeleton import BODY_25
 from shapepose_fg.io.calibration import read_rig
@@ -74,7 +75,6 @@ def test_other_names_are_found_from_how_bodies_look(dance, wrong):
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_any_other_order_is_neither_a_unit_nor_an_axis(dance, seed):
     """Of all joints, so that no layout comes near: the stature is then anything."""
@@ -88,6 +88,24 @@ def test_any_other_order_is_neither_a_unit_nor_an_axis(dance, seed):
 
 def test_nothing_is_said_of_the_right_names(dance):
     assert order_findings(dance.recording, dance.scene.rig) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("frames", [range(44, 90), range(89, 134)])
+@pytest.mark.parametrize("views", [(0, 1, 3), (0, 1, 2, 3)])
+def test_one_pose_of_one_person_proves_no_other_order(shared_cases, views, frames):
+    """A second and a half of somebody who hardly moves: such arms may fit a body better with elbows
+    and wrists exchanged.
+    """
+    case = shared_cases / "caliscope_person"
+    rig = read_rig(case / "camera_array_aniposelib_4cam.toml", up="x")
+    detections = read_detections(case / "detections", rig)
+    seen = [
+        replace(each, view=np.searchsorted(views, each.view))
+        for each in (detections[n].only(np.isin(detections[n].view, views)) for n in frames)
+    ]
+    rig = Rig(tuple(rig.cameras[view] for view in views), rig.up)
+    assert check_setup(Recording(detections.skeleton, seen), rig).findings == ()
 
 
 @pytest.mark.slow
