@@ -106,6 +106,8 @@ def live(
     if report.unrefined > 0:
         out += f"; {report.unrefined} frames were not refined, because solving did not keep up"
     note(f"{report.frames} frames, {report.late} of them late; {out}")
+    if report.jumps > report.frames / 2:
+        note(f"the times jumped at {report.jumps} frames: time_s must be in seconds")
 
 
 def _check_files(detections: str | None, outputs: Sequence[str]) -> None:

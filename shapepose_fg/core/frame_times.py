@@ -141,7 +141,7 @@ def rate_words(run: Mapping[str, Any]) -> str:
     entry = run.get("time") or {}
     if entry.get("fps") is None:
         return ""
-    assumed = " (assumed; give --fps)" if entry.get("source") == "assumed" else ""
+    assumed = " (assumed; reconstruct --fps sets it)" if entry.get("source") == "assumed" else ""
     return f", {entry['fps']:.6g} Hz{assumed}"
 
 

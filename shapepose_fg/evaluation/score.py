@@ -238,13 +238,14 @@ def _scored_frames(
         frames = frames if isinstance(frames, range) else set(frames)
         scored = np.array([frame for frame in scored.tolist() if frame in frames], dtype=np.int64)
     if len(scored) == 0:
-        spans = spans_of(annotated.tolist())[:9]
+        spans = spans_of(annotated[annotated >= 0].tolist())[:9]
         listed = ", ".join(f"{span[0]}-{span[-1]}" for span in spans)
-        advice = (
-            f"reconstruct annotated frames: {listed}"
-            if listed
-            else "the truth has no people, check --truth"
-        )
+        if listed:
+            advice = f"reconstruct annotated frames: {listed}"
+        elif len(annotated) > 0:
+            advice = "all annotated frames are before frame 0, check --offset"
+        else:
+            advice = "the truth has no people, check --truth"
         raise InputError(f"none of the reconstructed frames is annotated; {advice}")
     return scored
 

@@ -123,7 +123,7 @@ def test_reconstruct_writes_results_and_says_what_it_found(recording, pipeline, 
     assert re.fullmatch(r"warning: No camera sees a person [^\n]+\n", printed.err)
     words = " ".join(printed.out.split())
     for part in (
-        "5 (0:5) of 2 cameras, 30 Hz (assumed; give --fps)",
+        "5 (0:5) of 2 cameras, 30 Hz (assumed; reconstruct --fps sets it)",
         "without identities, 2.0 a frame (2 to 2)",
         "rows 10 in all",
         "5 ok",

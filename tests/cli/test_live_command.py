@@ -84,6 +84,17 @@ def test_frames_without_people_have_a_line(tmp_path, cameras, five_cameras):
     assert all(each["people"] == [] for each in told)
 
 
+def test_times_in_milliseconds_are_said(tmp_path, cameras, five_cameras, capsys):
+    views = [(frame, name) for frame in range(4) for name in five_cameras.names]
+    given = [json.dumps({"camera": name, "time_s": 4000 * n, "people": []}) for n, name in views]
+    (tmp_path / "in.jsonl").write_text("\n".join(given))
+    options = ["--calibration", cameras, "--detections", str(tmp_path / "in.jsonl")]
+    with pytest.raises(SystemExit) as ended:
+        main(["live", *options, "--workers", "1", "--output", str(tmp_path / "out.jsonl")])
+    assert ended.value.code == 0
+    assert "time_s must be in seconds" in capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_all_frames_of_a_file_are_refined(tmp_path, cameras, five_cameras, two_people):
     """A file is read faster than its windows are solved."""

@@ -102,6 +102,9 @@ def test_only_frames_that_both_cover_are_scored(truth):
     assert score(whole, plain(truth), range(2, 10**12)).frames == 10
     with pytest.raises(InputError, match="annotated frames: 0-11"):
         score(part, plain(truth), range(20, 30))
+    early = replace(plain(truth), frame=plain(truth).frame - 100)
+    with pytest.raises(InputError, match="before frame 0, check --offset"):
+        score(part, replace(early, covered=None))
     nobody = plain(truth)
     nobody = replace(
         nobody, frame=nobody.frame[:0], person=nobody.person[:0], joints=nobody.joints[:0]

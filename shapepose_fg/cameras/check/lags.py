@@ -3,7 +3,6 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import expit
 
 from shapepose_fg.cameras.check.evidence import SetupHypothesis
 from shapepose_fg.cameras.check.findings import SURE
@@ -77,4 +76,6 @@ def lag_of(setup: SetupHypothesis, view: int, most: int | None = None) -> Lag:
     of_each = np.where(known, of_pairs, np.inf)[known.any(axis=1)].argmin(axis=1)
     agreement = float((np.abs(of_each - best) <= 2).mean()) if len(of_each) > 1 else 0.0
     log_odds = likelihood(drop / GATE, independent(setup.others(view)), 1)
-    return replace(lag, agreement=agreement, probability=float(expit(log_odds)))
+    return replace(
+        lag, agreement=agreement, probability=float(np.exp(-np.logaddexp(0.0, -log_odds)))
+    )
