@@ -3,7 +3,6 @@
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from types import TracebackType
 
 _AT_ONCE = 10
 """Number of notes that are passed on at once before the limit applies."""
@@ -35,12 +34,7 @@ class SparingNotes(AbstractContextManager["SparingNotes"]):
         self._count()
         self._note(text)
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_error: object) -> None:
         self._count()
 
     def _count(self) -> None:

@@ -3,7 +3,8 @@ picture.
 """
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -202,22 +203,30 @@ def opencv_path(path: Path) -> str:
         ) from None
 
 
+@contextmanager
+def silent_opencv() -> Iterator[None]:
+    """Context manager without OpenCV's messages about videos, which are replaced by ours."""
+    # FFmpeg reads its level when the first video is opened.
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        yield
+    finally:
+        cv2.utils.logging.setLogLevel(level)
+
+
 def _capture(path: Path) -> Any:
     """The video at `path`, opened by FFmpeg with the options for untrusted files."""
     if not path.is_file():
         raise InputError(f"{path}: there is no such video; check the path")
     name = opencv_path(path.resolve())
-    before, level = os.environ.get(_READ_OPTIONS), cv2.utils.logging.getLogLevel()
+    before = os.environ.get(_READ_OPTIONS)
     os.environ[_READ_OPTIONS] = _SAFE_READING
-    os.environ.setdefault(
-        "OPENCV_FFMPEG_LOGLEVEL", "-8"
-    )  # silent; this is read when the first video is opened
-    # Messages of OpenCV about damaged files are replaced by ours.
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
-        capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG)
+        with silent_opencv():
+            capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG)
     finally:
-        cv2.utils.logging.setLogLevel(level)
         os.environ.pop(_READ_OPTIONS)
         os.environ.update({} if before is None else {_READ_OPTIONS: before})
     if not capture.isOpened():

@@ -7,7 +7,6 @@ from contextlib import AbstractContextManager
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from types import TracebackType
 from typing import IO, Any
 
 import numpy as np
@@ -47,12 +46,7 @@ class McapWriter(AbstractContextManager["McapWriter"]):
         self._schemas: dict[str, Any] = {}
         self._topics, self._begun = PeopleTopics(rig, covariances), False
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_error: object) -> None:
         self._file.finish()
 
     def frame(self, rows: Reconstruction, time_s: float, kind: str = "settled") -> None:

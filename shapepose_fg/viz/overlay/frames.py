@@ -2,7 +2,6 @@
 images atomically.
 """
 
-import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -24,7 +23,7 @@ from shapepose_fg.core.reconstruction import (
     Status,
     with_body,
 )
-from shapepose_fg.io.footage.footage import Footage, Picture, opencv_path
+from shapepose_fg.io.footage.footage import Footage, Picture, opencv_path, silent_opencv
 from shapepose_fg.io.footage.placement import CameraFootage
 from shapepose_fg.viz.overlay import drawing
 
@@ -103,7 +102,7 @@ def write_overlay(
     names = [used.name for used, _ in over.cameras] if width is None else [_GRID]
     paths: list[Path] = []
     videos: list[Callable[[Picture], None]] = []
-    with ExitStack() as stack:
+    with silent_opencv(), ExitStack() as stack:
         for at, frame in enumerate(frames):
             drawn = over.draw(frame, cells)
             pictures = drawn if width is None else [grid(drawn, columns)]
@@ -131,10 +130,8 @@ def _video(path: Path, size: Sequence[int], fps: float) -> Iterator[Callable[[Pi
     name = str(Path(opencv_path(path)).with_name(part.name))
     path.parent.mkdir(parents=True, exist_ok=True)
     # OpenCV does not report that a picture was not written, such as on a full disk: the pictures of
-    # the file are counted. Its messages are replaced by ours.
-    level, count = cv2.utils.logging.getLogLevel(), 0
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    # the file are counted.
+    count = 0
     writer = cv2.VideoWriter(name, cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
 
     def append(picture: Picture) -> None:
@@ -157,7 +154,6 @@ def _video(path: Path, size: Sequence[int], fps: float) -> Iterator[Callable[[Pi
         part.replace(path)
     finally:
         writer.release()
-        cv2.utils.logging.setLogLevel(level)
         part.unlink(missing_ok=True)
 
 
